@@ -39,8 +39,9 @@ def image_size(path: Path) -> tuple[int, int]:
     with _opened(path) as image:
         width, height = _displayed_size(image)
     if not is_image_size(width, height):
-        most = f"at most {MAX_IMAGE_PIXELS} are read"
-        raise StgaError(f"{path}: claims {width} x {height} pixels; {most}")
+        raise StgaError(
+            f"{path}: claims {width} x {height} pixels; at most {MAX_IMAGE_PIXELS} are read"
+        )
     return width, height
 
 
@@ -151,8 +152,9 @@ def _decode(path: Path, view: View, kind: str) -> np.ndarray:
                     return numbers.astype(np.uint8)
             return _as_uint8(turned if convert is None else convert(turned))
     if size == expected:
-        more = f"more than are read ({MAX_IMAGE_PIXELS})"
-        raise StgaError(f"{path}: has {size[0]} x {size[1]} pixels, {more}")
+        raise StgaError(
+            f"{path}: has {size[0]} x {size[1]} pixels, more than are read ({MAX_IMAGE_PIXELS})"
+        )
     camera = f"the camera of {view.name} has {expected[0]} x {expected[1]}"
     if kind == "mask":
         camera = f"the image {view.image} and its camera have {expected[0]} x {expected[1]}"

@@ -77,13 +77,15 @@ def checked_mesh(path: Path, vertices: np.ndarray, faces: np.ndarray) -> Mesh:
     """The arrays as float64 and int32. Raises StgaError where they are no mesh (`read_mesh`)."""
     triples = all(own.ndim == 2 and own.shape[1] == 3 for own in (vertices, faces))
     if not triples or not len(faces):
-        expected = "expected vertices with three coordinates, and triangles"
-        raise StgaError(f"{path}: holds no triangles; {expected}")
+        raise StgaError(
+            f"{path}: holds no triangles; expected vertices with three coordinates, and triangles"
+        )
     if not np.isfinite(vertices).all():
         raise StgaError(f"{path}: vertex {np.argwhere(~np.isfinite(vertices))[0, 0]} is not finite")
     if faces.min() < 0 or faces.max() >= len(vertices):
-        outside = f"a vertex outside the {len(vertices)} that the file has"
-        raise StgaError(f"{path}: a triangle names {outside}")
+        raise StgaError(
+            f"{path}: a triangle names a vertex outside the {len(vertices)} that the file has"
+        )
     vertices = np.array(vertices, np.float64)
     check_extent(str(path), vertices)
     return vertices, np.array(faces, np.int32)
@@ -92,8 +94,9 @@ def checked_mesh(path: Path, vertices: np.ndarray, faces: np.ndarray) -> Mesh:
 def check_extent(source: str, vertices: np.ndarray) -> np.ndarray:
     """The same vertices (V, 3). Raises StgaError for a point, and for what lies far away."""
     if not np.abs(vertices).max() <= MAX_COORDINATE_M:  # also where it is not a number
-        far = f"farther than {MAX_COORDINATE_M:g} m from the origin"
-        raise StgaError(f"{source}: the mesh reaches {far}")
+        raise StgaError(
+            f"{source}: the mesh reaches farther than {MAX_COORDINATE_M:g} m from the origin"
+        )
     if np.ptp(vertices, axis=0).max() < MIN_EXTENT_M:
         raise StgaError(f"{source}: all vertices of the mesh lie in one point; expected a head")
     return vertices
@@ -143,8 +146,9 @@ def cached_meshes(mesh: Callable[[int], np.ndarray], vertices: int) -> Callable[
 def file_of(files: Mapping[int, Path], timestep: int) -> Path:
     """The timestep's file. Raises StgaError where there is none, naming the range there is."""
     if timestep not in files:
-        known = f"the capture has {min(files)} to {max(files)}"
-        raise StgaError(f"timestep {timestep} has no tracked mesh; {known}")
+        raise StgaError(
+            f"timestep {timestep} has no tracked mesh; the capture has {min(files)} to {max(files)}"
+        )
     return files[timestep]
 
 
@@ -157,8 +161,9 @@ def read_regions(path: Path, faces: np.ndarray, vertices: int) -> dict[str, np.n
     for name, value in values.items():
         ids = value if isinstance(value, list) else [None]
         if not all(type(index) is int and 0 <= index < vertices for index in ids):
-            expected = f"a list of vertex indices from 0 to {vertices - 1}"
-            raise StgaError(f"{path}: {name}: expected {expected}")
+            raise StgaError(
+                f"{path}: {name}: expected a list of vertex indices from 0 to {vertices - 1}"
+            )
     return {name: faces_within(faces, np.array(value, np.int64)) for name, value in values.items()}
 
 
@@ -166,8 +171,9 @@ def _parse_with_trimesh(path: Path, data: bytes, file_type: str) -> Mesh:
     try:
         import trimesh
     except ImportError as error:
-        needed = "needs the Python package trimesh"
-        raise StgaError(f"{path}: reading {file_type.upper()} {needed}") from error
+        raise StgaError(
+            f"{path}: reading {file_type.upper()} needs the Python package trimesh"
+        ) from error
     try:
         if file_type == "glb":
             _check_glb(data)
@@ -213,8 +219,10 @@ def _check_glb(data: bytes) -> None:
     of_mesh = [_numbers(mesh, counts) for mesh in document.get("meshes", [])]
     numbers += sum(of_mesh) + sum(of_mesh[node["mesh"]] for node in nodes if "mesh" in node)
     if numbers > allowed:
-        limit = f"more than the {allowed} allowed to a file of this size"
-        raise ValueError(f"its meshes hold {numbers} numbers, {limit}")
+        raise ValueError(
+            f"its meshes hold {numbers} numbers, more than the {allowed} allowed to a file of "
+            "this size"
+        )
 
 
 def _numbers(mesh: dict[str, Any], counts: Sequence[int]) -> int:
@@ -310,16 +318,20 @@ def find_region(capture: Capture, name: str) -> np.ndarray:
         weights = read_npz(path, ("weights",)).get("weights", np.zeros(0, int))
         if weights.dtype not in (np.float32, np.float64, np.bool_) or weights.shape != shape:
             found = f"{weights.dtype} {weights.shape}" if weights.size else "no such array"
-            expected = f"'weights', one number from 0 to 1 per triangle {shape}"
-            raise StgaError(f"{path}: expected {expected}, found {found}")
+            raise StgaError(
+                f"{path}: expected 'weights', one number from 0 to 1 per triangle {shape}, "
+                f"found {found}"
+            )
         region = np.asarray(weights >= SELECTED_WEIGHT)
     elif path.suffix.lower() == ".json":
         regions = read_regions(path, capture.faces, len(capture.neutral))
         region = np.asarray(np.any([np.zeros(shape, bool), *regions.values()], axis=0))
     else:
         known = ", ".join(dict.fromkeys([*capture.regions, *masks])) or "none"
-        neither = f"is neither a region of the capture ({known}) nor an .npz or .json file"
-        raise StgaError(f"region '{name}': {neither}")
+        raise StgaError(
+            f"region '{name}': is neither a region of the capture ({known}) nor an .npz or "
+            ".json file"
+        )
     if not region.any():
         raise StgaError(f"region '{name}': holds no triangle")
     return region

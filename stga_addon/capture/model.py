@@ -232,14 +232,17 @@ def require_same_scale(first: Capture, other: Capture) -> None:
     posed = [_extent(other.mesh(timestep)) for timestep in evenly_spread(other.timesteps, COMPARED)]
     factor = float(np.median(posed)) / _extent(other.neutral)
     if not 1 / MAX_SCALE_FACTOR <= factor <= MAX_SCALE_FACTOR:
-        large = f"{factor:.3g} times as large as the neutral mesh; expected meters"
-        raise StgaError(f"{other.root}: its tracked meshes are {large}")
+        raise StgaError(
+            f"{other.root}: its tracked meshes are {factor:.3g} times as large as the neutral "
+            "mesh; expected meters"
+        )
     factor = _share_of_images(first) / _share_of_images(other)
     if not 1 / MAX_SCALE_FACTOR <= factor <= MAX_SCALE_FACTOR:
         apart = f"{factor:.3g} times smaller" if factor > 1 else f"{1 / factor:.3g} times larger"
         apart += f" in the images than in those of {first.root}"
-        expected = "expected cameras and tracking in meters"
-        raise StgaError(f"{other.root}: its head appears {apart}; {expected}")
+        raise StgaError(
+            f"{other.root}: its head appears {apart}; expected cameras and tracking in meters"
+        )
 
 
 def _extent(vertices: np.ndarray) -> float:

@@ -74,8 +74,10 @@ def open_capture(
     any image, mask or tracked file that is missing.
     """
     if principal_point not in PRINCIPAL_POINTS:
-        one = f"is not one of {', '.join(PRINCIPAL_POINTS)}"
-        raise StgaError(f"principal point convention {shorten(principal_point)} {one}")
+        raise StgaError(
+            f"principal point convention {shorten(principal_point)} is not one of "
+            f"{', '.join(PRINCIPAL_POINTS)}"
+        )
     if folder.suffix.lower() == ".npz" and is_file(folder):
         path = folder.resolve()
         # A file that names its expressions is of the bundled head, and needs no model file.
@@ -88,20 +90,12 @@ def open_capture(
     transforms = Transforms({}, None, None)
     if transforms_files(root):
         transforms = read_splits(root, principal_point)
-    # A missing file is reported now rather than an hour into the training.
-    seen = set[Path]()
-    keys = ("file_path", "fg_mask_path", "mesh_path", "flame_param_path")
-    for frame in transforms.frames:
-        files = frame.view.image, frame.view.mask, frame.mesh, frame.flame
-        for key, file in zip(keys, files, strict=True):
-            if file is None or file in seen:
-                continue
-            if not is_file(file):
-                raise StgaError(f"{file}: does not exist, but {frame.where} names it as its {key}")
-            seen.add(file)
+    _require_files(transforms.frames)
     if distorted := distortion(transforms.frames):
-        advice = "undistort the images, as stga track does of footage, and remove these fields"
-        raise StgaError(f"{distorted}; captures are of pinholes: {advice}")
+        raise StgaError(
+            f"{distorted}; captures are of pinholes: undistort the images, as stga track does "
+            "of footage, and remove these fields"
+        )
     capture = _open_layout(root, transforms, flame)
     warnings = list(capture.warnings)
     warnings += transforms_warnings(transforms.frames, principal_point)
@@ -112,9 +106,26 @@ def open_capture(
     # Limits, thresholds and the near plane are in meters: a head in millimeters cannot be trained.
     size = float(np.ptp(capture.neutral, axis=0).max()) if len(capture.neutral) else 0.0
     if not MIN_HEAD_EXTENT_M <= size <= MAX_HEAD_EXTENT_M:
-        expected = f"expected a head of {TYPICAL_HEAD_EXTENT_M} m"
-        warnings.append(f"{root}: the neutral mesh measures {size:.3g} m; {expected}")
+        warnings.append(
+            f"{root}: the neutral mesh measures {size:.3g} m; expected a head of "
+            f"{TYPICAL_HEAD_EXTENT_M} m"
+        )
     return replace(capture, fps=transforms.fps, warnings=tuple(warnings))
+
+
+def _require_files(frames: Sequence[Frame]) -> None:
+    """A missing file is reported now rather than an hour into the training."""
+    seen = set[Path | None]()
+    for frame in frames:
+        for key, file in (
+            ("file_path", frame.view.image),
+            ("fg_mask_path", frame.view.mask),
+            ("mesh_path", frame.mesh),
+            ("flame_param_path", frame.flame),
+        ):
+            if file is not None and file not in seen and not is_file(file):
+                raise StgaError(f"{file}: does not exist, but {frame.where} names it as its {key}")
+            seen.add(file)
 
 
 def _open_layout(root: Path, transforms: Transforms, flame: Path | None) -> Capture:
@@ -173,9 +184,11 @@ def _principal_point_warning(
     best = min(share, key=lambda convention: share[convention])
     if share[chosen] < 2 * share[best] + MIN_SHARE_DIFFERENCE:
         return None
-    outside_masks = f"{share[chosen]:.1%} of the mesh falls outside the masks"
-    read_so = f"with the principal point read as {chosen!r}, but {share[best]:.1%} with {best!r}"
-    return f"{outside_masks} {read_so}: the capture was probably written that way"
+    return (
+        f"{share[chosen]:.1%} of the mesh falls outside the masks with the principal point "
+        f"read as {chosen!r}, but {share[best]:.1%} with {best!r}: the capture was probably "
+        "written that way"
+    )
 
 
 def _mask_warnings(frames: Sequence[Frame]) -> list[str]:
@@ -212,8 +225,10 @@ def _unnamed_images(frames: Sequence[Frame]) -> list[str]:
         if left_out:
             names = ", ".join(path.name for path in left_out[:NAMES_IN_WARNING])
             more = ", …" if len(left_out) > NAMES_IN_WARNING else ""
-            count = f"{len(left_out)} of {len(images)} images are named by no frame"
-            found.append(f"{folder}: {count}: {names}{more}")
+            found.append(
+                f"{folder}: {len(left_out)} of {len(images)} images are named by no frame: "
+                f"{names}{more}"
+            )
     return found
 
 
@@ -225,8 +240,9 @@ def _open_mesh_folder(root: Path, listed: Sequence[Path]) -> Capture:
     canonical = next((path for path in listed if path.stem.lower() in NEUTRAL), None)
     tracked = [path for path in listed if path != canonical]
     if not tracked:
-        expected = f"holds no tracked mesh besides {canonical}; expected one file per timestep"
-        raise StgaError(f"{root}: {expected}")
+        raise StgaError(
+            f"{root}: holds no tracked mesh besides {canonical}; expected one file per timestep"
+        )
     numbers = [re.search(r"(\d+)$", path.stem, re.ASCII) for path in tracked]
     numbered = {int(match[1]): path for match, path in zip(numbers, tracked, strict=True) if match}
     files = dict(sorted(numbered.items()))
@@ -252,8 +268,10 @@ def _mesh_capture(
         )
     neutral, faces = read(canonical)
     if any(path.suffix.lower() == ".stl" for path in (canonical, *files.values())):
-        checked = "of the topology, only the number of triangles can be checked"
-        warnings.append(f"STL has no shared vertices: {checked}")
+        warnings.append(
+            "STL has no shared vertices: of the topology, only the number of triangles can be "
+            "checked"
+        )
     regions = {} if regions_file is None else meshes.read_regions(regions_file, faces, len(neutral))
     empty = [name for name, members in regions.items() if not members.any()]
     if empty:
@@ -293,8 +311,10 @@ def _open_release(root: Path, transforms: Transforms) -> Capture:
     timesteps = sorted({frame.view.timestep for frame in transforms.frames})
     files = {timestep: root / "meshes" / f"mesh_{timestep:04d}.json" for timestep in timesteps}
     if not files:
-        expected = f"expected a keyframe for each mesh in {root / 'meshes'}"
-        raise StgaError(f"{root}: its transforms hold no frame; {expected}")
+        raise StgaError(
+            f"{root}: its transforms hold no frame; expected a keyframe for each mesh in "
+            f"{root / 'meshes'}"
+        )
     bare = replace(transforms, canonical_mesh=None, regions=None)
     capture = _mesh_capture(root, "release", files, bare, read_soup)
     chosen = {t: root / "training_faces" / f"{t:04d}.npy" for t in timesteps}
@@ -312,8 +332,10 @@ def read_soup(path: Path) -> meshes.Mesh:
     except (KeyError, TypeError, ValueError, OverflowError):
         corners = np.zeros(0)
     if corners.ndim != 3 or corners.shape[1:] != (3, 3):
-        points = "three Vertices with three coordinates each"
-        raise StgaError(f"{path}: triangles: expected a list of objects with {points}")
+        raise StgaError(
+            f"{path}: triangles: expected a list of objects with three Vertices with three "
+            "coordinates each"
+        )
     faces = np.arange(3 * len(corners)).reshape(-1, 3)
     return meshes.checked_mesh(path, corners.reshape(-1, 3), faces)
 
@@ -325,8 +347,9 @@ def read_face_ids(path: Path, faces: int) -> np.ndarray:
     if ids.dtype.kind not in "iu" or ids.ndim != 1:
         raise StgaError(f"{path}: expected a list of triangle numbers")
     if ids.size and not 0 <= int(ids.min()) <= int(ids.max()) < faces:
-        named = f"names triangles {ids.min()} to {ids.max()}"
-        raise StgaError(f"{path}: {named}, but the mesh has 0 to {faces - 1}")
+        raise StgaError(
+            f"{path}: names triangles {ids.min()} to {ids.max()}, but the mesh has 0 to {faces - 1}"
+        )
     selected = np.zeros(faces, bool)
     selected[ids] = True
     return selected
@@ -349,8 +372,9 @@ def _open_flame_capture(root: Path, transforms: Transforms, model_file: Path | N
         listed = [p for p in matching(folder, "*.npz") if re.fullmatch(r"\d+", p.stem, re.ASCII)]
         files = dict(sorted((int(path.stem), path) for path in listed))
     if not files:
-        expected = "expected one .npz per timestep, such as 00000.npz"
-        raise StgaError(f"{folder}: holds no parameters; {expected}")
+        raise StgaError(
+            f"{folder}: holds no parameters; expected one .npz per timestep, such as 00000.npz"
+        )
     shape, static_offset = read_identity(files[min(files)], model)
 
     def frame(timestep: int) -> FlameFrame:
@@ -409,8 +433,9 @@ def _model_file(root: Path, given: Path | None) -> Path:
     beside = (root / name for name in OWN_MODELS)
     found = given or next((path for path in beside if path.is_file()), None)
     if found is None:
-        given_by = "with --flame or in the preferences of the add-on"
-        advice = f"{given_by}, or put it into the folder as {OWN_MODELS[0]}"
-        model = "give the FLAME model file (.pkl or .npz)"
-        raise StgaError(f"{root}: is tracked with FLAME; {model} {advice}")
+        raise StgaError(
+            f"{root}: is tracked with FLAME; give the FLAME model file (.pkl or .npz) with "
+            "--flame or in the preferences of the add-on, or put it into the folder as "
+            f"{OWN_MODELS[0]}"
+        )
     return found

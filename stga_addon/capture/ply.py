@@ -104,8 +104,9 @@ def ply_header(path: Path, data: bytes) -> tuple[list[Element], str, int]:
                 case _:
                     raise ValueError(line)
     except (ValueError, KeyError) as error:
-        problem = f"PLY header cannot be understood ({shorten(str(error))})"
-        raise StgaError(f"{path}: {problem}") from error
+        raise StgaError(
+            f"{path}: PLY header cannot be understood ({shorten(str(error))})"
+        ) from error
     if not order:
         raise StgaError(f"{path}: PLY header cannot be understood (no format)")
     return list(elements.values()), order, end.end()
@@ -144,8 +145,9 @@ def ply_rows(path: Path, data: bytes, names: Sequence[str]) -> dict[str, Rows]:
 def _require(path: Path, element: Element, most: int) -> None:
     """Raise StgaError where the file has not as many rows as the header says."""
     if element.count > most:
-        rows = f"{element.count} rows of {shorten(element.name)}"
-        raise StgaError(f"{path}: is truncated: it cannot hold {rows}")
+        raise StgaError(
+            f"{path}: is truncated: it cannot hold {element.count} rows of {shorten(element.name)}"
+        )
 
 
 def _binary_rows(element: Element, order: str, data: bytes, position: int) -> tuple[Rows, int]:
@@ -235,8 +237,9 @@ def _ascii_rows(element: Element, lines: Sequence[bytes]) -> Rows:
             lengths[column].append(length)
             place += 1 + length
         if place != len(words):
-            expected = f"a row of {shorten(element.name)} has {len(words)} numbers"
-            raise ValueError(f"{expected}, expected {place}")
+            raise ValueError(
+                f"a row of {shorten(element.name)} has {len(words)} numbers, expected {place}"
+            )
     return _as_rows(element, values, lengths)
 
 

@@ -214,11 +214,14 @@ def tracked_files(frames: Iterable[Frame], field: str) -> dict[int, Path]:
         path = getattr(frame, field)
         timestep = frame.view.timestep
         if path is None:
-            expected = f"expected the tracked file of timestep {timestep}"
-            raise StgaError(f"{frame.where}.{key}: is missing; {expected}")
+            raise StgaError(
+                f"{frame.where}.{key}: is missing; expected the tracked file of timestep {timestep}"
+            )
         if files.setdefault(timestep, path) != path:
-            other = f"timestep {timestep} already has {files[timestep]}"
-            raise StgaError(f"{frame.where}.{key}: is {path}, but {other}")
+            raise StgaError(
+                f"{frame.where}.{key}: is {path}, but timestep {timestep} already has "
+                f"{files[timestep]}"
+            )
     return dict(sorted(files.items()))
 
 
@@ -332,19 +335,24 @@ def _image_size(record: Record, shared: Record, image: Path) -> tuple[int, int]:
     source = next((s for s in (record, shared) if s.has("w") and s.has("h")), None)
     if source is None:
         if not is_file(image):
-            missing = f"w and h are missing, and so is the image {image} to take them from"
-            raise StgaError(f"{record.where('w')}: {missing}")
+            raise StgaError(
+                f"{record.where('w')}: w and h are missing, and so is the image {image} to "
+                "take them from"
+            )
         try:
             from .images import image_size
         except ImportError as error:
-            needed = "w and h are missing; to take them from the image needs Pillow, which Blender"
-            raise StgaError(f"{record.where('w')}: {needed} lacks: write them") from error
+            raise StgaError(
+                f"{record.where('w')}: w and h are missing; to take them from the image needs "
+                "Pillow, which Blender lacks: write them"
+            ) from error
         return image_size(image)
     width = source.number("w", low=0)
     height = source.number("h", low=0)
     if not is_image_size(width, height):
-        expected = f"expected an image size in pixels, not {width:g} x {height:g}"
-        raise StgaError(f"{source.where('w')}: {expected}")
+        raise StgaError(
+            f"{source.where('w')}: expected an image size in pixels, not {width:g} x {height:g}"
+        )
     return int(width), int(height)
 
 
@@ -365,8 +373,9 @@ def _focal(record: Record, shared: Record, width: int, height: int) -> tuple[flo
         fl_y = of_angle("camera_angle_y", height)
     for name, value in (("fl_x", fl_x), ("fl_y", fl_y)):
         if not 1 <= value <= MAX_FOCAL_PIXELS:
-            expected = f"expected a focal length of 1 to 1e7 pixels, not {value:g}"
-            raise StgaError(f"{record.where(name)}: {expected}")
+            raise StgaError(
+                f"{record.where(name)}: expected a focal length of 1 to 1e7 pixels, not {value:g}"
+            )
     return fl_x, fl_y
 
 
@@ -382,8 +391,9 @@ def _pose(record: Record, matrix: np.ndarray) -> tuple[np.ndarray, bool]:
     if not finite or not np.allclose(matrix[3], [0, 0, 0, 1], atol=1e-6):
         raise StgaError(f"{where}: expected {MATRIX} that ends in the row 0 0 0 1")
     if np.abs(matrix).max() > MAX_COORDINATE_M:
-        far = f"farther than {MAX_COORDINATE_M:g} from the origin"
-        raise StgaError(f"{where}: the camera lies {far}")
+        raise StgaError(
+            f"{where}: the camera lies farther than {MAX_COORDINATE_M:g} from the origin"
+        )
     lengths = np.linalg.norm(matrix[:3, :3], axis=0)
     is_scaled = bool(lengths.min() > 0 and np.abs(lengths - 1).max() >= ROTATION_TOLERANCE / 2)
     if is_scaled:
@@ -391,8 +401,9 @@ def _pose(record: Record, matrix: np.ndarray) -> tuple[np.ndarray, bool]:
     rotation = matrix[:3, :3]
     orthonormal = np.abs(rotation @ rotation.T - np.eye(3)).max() < ROTATION_TOLERANCE
     if not orthonormal or np.linalg.det(rotation) < 0:
-        expected = "a rotation without shear or mirroring in its upper left 3x3 part"
-        raise StgaError(f"{where}: expected {expected}")
+        raise StgaError(
+            f"{where}: expected a rotation without shear or mirroring in its upper left 3x3 part"
+        )
     return matrix, is_scaled
 
 
@@ -422,9 +433,10 @@ def transforms_warnings(frames: Sequence[Frame], principal_point: str) -> list[s
     doubtful = [f for f in frames if NUMBERED in f.repairs and f.view.mask is None]
     height = doubtful[0].view.camera.height if doubtful else 0
     if principal_point == "vhap" and doubtful and abs(2 * doubtful[0].principal[1] - height) > 1:
-        read = "cy is counted from the bottom, as VHAP writes it"
-        other = "if another program wrote it, give --principal-point opencv"
-        found.append(f"{doubtful[0].where}: {read}; {other}")
+        found.append(
+            f"{doubtful[0].where}: cy is counted from the bottom, as VHAP writes it; if "
+            "another program wrote it, give --principal-point opencv"
+        )
     unread = dict[str, Frame]()
     for frame in frames:
         for key in frame.record.values:

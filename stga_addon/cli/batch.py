@@ -95,8 +95,10 @@ def batch_plan(options: Namespace) -> Plan:
         raise StgaError("--out: is missing; expected the folder of the batch")
     missing = next((path for path in sources if not path.is_dir()), None)
     if missing is not None:
-        expected = f"expected that of a capture, or a plan that ends in {PLAN_SUFFIX}"
-        raise StgaError(f"{missing}: is not a folder; {expected}")
+        raise StgaError(
+            f"{missing}: is not a folder; expected that of a capture, or a plan that ends in "
+            f"{PLAN_SUFFIX}"
+        )
     named = ("preset", "seconds", "iterations", "seed")
     settings: dict[str, Any] = {name: given.pop(name) for name in named if name in given}
     if not {"preset", "seconds", "iterations"} & settings.keys():
@@ -145,5 +147,7 @@ def carry_out_plan(plan: Plan, engine_name: str = "local", address: str = "") ->
             print(f"{summary_line(batch)}\nreport: {path}")
     failures = batch.failures
     if failures:
-        count = f"{len(failures)} of {len(plan.jobs)} jobs failed"
-        raise StgaError(f"{count}; {failures[0].job.name}: {failures[0].error}")
+        raise StgaError(
+            f"{len(failures)} of {len(plan.jobs)} jobs failed; {failures[0].job.name}: "
+            f"{failures[0].error}"
+        )

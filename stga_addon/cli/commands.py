@@ -193,8 +193,9 @@ def _settings(options: Namespace) -> TrainingSettings:
     settings = make_settings(**given)
     selection = given_options(options, SelectionOptions)
     if selection and settings.strategy != "selective":
-        problem = "has no effect without --strategy selective, or --schedule paper"
-        raise StgaError(f"--threshold: {problem}")
+        raise StgaError(
+            "--threshold: has no effect without --strategy selective, or --schedule paper"
+        )
     return replace(settings, selection=replace(settings.selection, **selection))
 
 
@@ -232,8 +233,10 @@ def _avatar(options: Namespace, head: OpenHead | None) -> None:
     if options.no_blend:
         return
     if find_spec("bpy") is None:
-        hint = "(install bpy, or run the command in Blender)"
-        print(f"warning: no .blend file: this Python has no bpy {hint}")
+        print(
+            "warning: no .blend file: this Python has no bpy (install bpy, or run the command "
+            "in Blender)"
+        )
         return
     from ..training.run.folder import with_refined_tracking
 

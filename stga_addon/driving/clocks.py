@@ -105,8 +105,9 @@ def seconds_of(where: str, texts: list[str]) -> np.ndarray:
     for row, text in enumerate(texts):
         found = TIMECODE.fullmatch(text.strip())
         if found is None:
-            problem = f"row {row + 1}: Timecode is {shorten(text)}, expected HH:MM:SS:FF.sub"
-            raise StgaError(f"{where}: {problem}")
+            raise StgaError(
+                f"{where}: row {row + 1}: Timecode is {shorten(text)}, expected HH:MM:SS:FF.sub"
+            )
         hours, minutes, whole, separator, frame, part = found.groups()
         clock = int(hours), int(minutes), int(whole)
         fields.append((*clock, int(frame or 0), float(f"0.{part or 0}"), separator == ";"))

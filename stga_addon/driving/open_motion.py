@@ -331,12 +331,16 @@ def prepared_performance(
 ) -> Performance:
     """Evenly sampled, relative to its neutral, smoothed, `corrected`, at the strength."""
     if fps is not None and not MIN_FPS <= fps <= MAX_FPS:
-        problem = f"cannot be resampled to {fps:g} frames per second"
-        raise StgaError(f"a performance {problem}, expected {MIN_FPS:g} to {MAX_FPS:g}")
+        raise StgaError(
+            f"a performance cannot be resampled to {fps:g} frames per second, expected "
+            f"{MIN_FPS:g} to {MAX_FPS:g}"
+        )
     rate = fps or performance.fps
     if performance.times[-1] * rate > MAX_ROWS:
-        length = f"{performance.times[-1]:.0f} s at {rate:g} frames per second"
-        raise StgaError(f"a performance of {length} is too long")
+        raise StgaError(
+            f"a performance of {performance.times[-1]:.0f} s at {rate:g} frames per second is "
+            "too long"
+        )
     weights = performance.weights[0]
     rest = None
     if options.neutral == "quiet":
@@ -388,5 +392,6 @@ def _with_frames(
 
 def _check_faces(path: Path, model: FlameModel, faces: np.ndarray) -> None:
     if not np.array_equal(model.faces, faces):
-        problem = "its mesh has other triangles than the one this avatar was trained on"
-        raise StgaError(f"{path}: {problem}")
+        raise StgaError(
+            f"{path}: its mesh has other triangles than the one this avatar was trained on"
+        )

@@ -61,8 +61,10 @@ def columns_of(where: str, names: Iterable[str]) -> dict[int, int]:
     found = {COLUMN[name]: spelled.index(name) for name in spelled if name is not None}
     missing = [name for name in ARKIT_SHAPES if COLUMN[name] not in found and name not in OPTIONAL]
     if len(missing) > COUNT // 2:
-        problem = f"names {len(found)} of ARKit's {COUNT} blend shapes, expected all but tongueOut"
-        raise StgaError(f"{where}: {problem}")
+        raise StgaError(
+            f"{where}: names {len(found)} of ARKit's {COUNT} blend shapes, expected all but "
+            "tongueOut"
+        )
     if missing:
         more = f" and {len(missing) - MAX_NAMED} more" if len(missing) > MAX_NAMED else ""
         # What stands there instead: mistyped names, most likely.

@@ -92,8 +92,10 @@ def csv_performance(path: Path) -> Performance:
             try:
                 found[number] = float(row[index])
             except ValueError:
-                problem = f"{shorten(header[index])} is {shorten(row[index])}, expected a number"
-                raise StgaError(f"{path}: row {number + 1}: {problem}") from None
+                raise StgaError(
+                    f"{path}: row {number + 1}: {shorten(header[index])} is "
+                    f"{shorten(row[index])}, expected a number"
+                ) from None
         return found
 
     weights = np.zeros((len(body), COUNT))
@@ -125,8 +127,10 @@ def packet_performance(path: Path) -> Performance:
     packets = [parse_packet(line.encode()) for line in lines]
     known = [packet for packet in packets if packet is not None]
     if not known:
-        problem = "such as jawOpen-12|mouthSmile_L-5|=head#0,0,0,0,0,0|"
-        raise StgaError(f"{path}: has no line of iFacialMocap, {problem}")
+        raise StgaError(
+            f"{path}: has no line of iFacialMocap, such as "
+            "jawOpen-12|mouthSmile_L-5|=head#0,0,0,0,0,0|"
+        )
     columns_of(str(path), known[0].names)
     weights = np.stack([packet.weights for packet in known if packet.weights is not None])
     heads = [packet.head for packet in known if packet.head is not None]

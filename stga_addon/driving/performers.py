@@ -84,8 +84,10 @@ def read_performance(path: Path, report: Report = ignore) -> Performance:
         path = own[0]
     performer = performer_of(path)
     if performer is None:
-        problem = f"is no performance; expected {', '.join(READ_SUFFIXES)} or the folder of a take"
-        raise StgaError(f"{path}: {problem}")
+        raise StgaError(
+            f"{path}: is no performance; expected {', '.join(READ_SUFFIXES)} or the folder of "
+            "a take"
+        )
     return performer.read(path, report)
 
 

@@ -63,5 +63,6 @@ def playback_fps(
 def check_rate(path: Path, fps: float) -> None:
     """Raise StgaError naming `path` unless `fps` is from MIN_FPS to MAX_FPS."""
     if not MIN_FPS <= fps <= MAX_FPS:
-        expected = f"must be from {MIN_FPS:g} to {MAX_FPS:g}"
-        raise StgaError(f"{path}: the frame rate (--fps) {expected}, got {fps:g}")
+        raise StgaError(
+            f"{path}: the frame rate (--fps) must be from {MIN_FPS:g} to {MAX_FPS:g}, got {fps:g}"
+        )

@@ -82,9 +82,10 @@ def read_ply(path: Path, say: Say = warn) -> Splats:
     names = vertices.dtype.names or ()
     binding = next((name for name in names if name.startswith("binding")), None)
     if binding is not None:
-        where = "these splats lie in the frames of a head's triangles, not in the world"
-        advice = "render the run, or export it as --format ply"
-        raise StgaError(f"{path}: has the property {binding}: {where}; {advice}")
+        raise StgaError(
+            f"{path}: has the property {binding}: these splats lie in the frames of a head's "
+            "triangles, not in the world; render the run, or export it as --format ply"
+        )
     return splats_of(path, vertices, say)
 
 
@@ -146,8 +147,10 @@ def _columns(path: Path, vertices: np.ndarray, names: Sequence[str]) -> np.ndarr
     for i, name in enumerate(names):
         given = vertices.dtype.names or ()
         if name not in given:
-            problem = f"has no property {name!r}, as a PLY of 3D Gaussians must"
-            raise StgaError(f"{path}: {problem}; it has {', '.join(given):.200}")
+            raise StgaError(
+                f"{path}: has no property {name!r}, as a PLY of 3D Gaussians must; it has "
+                f"{', '.join(given):.200}"
+            )
         columns[:, i] = converted(vertices[name], np.float32)
     return columns
 
@@ -171,8 +174,10 @@ def read_vertices(path: Path) -> np.ndarray:
     if rows is None or not names:
         raise StgaError(f"{path}: PLY header describes no vertices")
     if any(name.startswith("packed_") for name in names):
-        packed = "is a compressed PLY (packed_position, …), as SuperSplat writes them"
-        raise StgaError(f"{path}: {packed}; save it there as a plain PLY")
+        raise StgaError(
+            f"{path}: is a compressed PLY (packed_position, …), as SuperSplat writes them; "
+            "save it there as a plain PLY"
+        )
     return rows.scalars
 
 
@@ -190,9 +195,11 @@ def write_gaussian_avatars(
     if sequence is None:
         raise StgaError(f"{folder}: GaussianAvatars needs the FLAME parameters of a FLAME capture")
     if not np.array_equal(sequence.model.faces, avatar.faces):
-        counts = f"{len(avatar.faces)} and {len(sequence.model.faces)} triangles"
-        problem = f"the avatar's mesh is not the FLAME model's ({counts})"
-        raise StgaError(f"{folder}: {problem}, expected an avatar trained on this model's meshes")
+        raise StgaError(
+            f"{folder}: the avatar's mesh is not the FLAME model's ({len(avatar.faces)} and "
+            f"{len(sequence.model.faces)} triangles), expected an avatar trained on this "
+            "model's meshes"
+        )
     splats = in_convention(avatar, "gaussian_avatars")
     columns = np.column_stack([splat_columns(splats), splats.face.astype(np.float32)])
     files = [folder / "point_cloud.ply", folder / "flame_param.npz"]

@@ -73,8 +73,10 @@ def read_splat(path: Path, say: Say = warn) -> Splats:
     """The splats of a .splat file, without harmonics above degree 0. Raises StgaError."""
     data = read_bytes(path, MAX_SPLAT_BYTES)
     if not data or len(data) % SPLAT_ROW.itemsize:
-        rows = f"has {len(data)} bytes, which are no rows of {SPLAT_ROW.itemsize}"
-        raise StgaError(f"{path}: is not a readable .splat file: {rows}; expected {READ_FILES}")
+        raise StgaError(
+            f"{path}: is not a readable .splat file: has {len(data)} bytes, which are no rows "
+            f"of {SPLAT_ROW.itemsize}; expected {READ_FILES}"
+        )
     table = np.frombuffer(data, SPLAT_ROW)
     share = table["color"].astype(np.float32) / 255
     with np.errstate(divide="ignore", invalid="ignore"):

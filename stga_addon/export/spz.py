@@ -77,8 +77,9 @@ def read_spz(path: Path, say: Say = warn) -> Splats:
     except (ValueError, struct.error, zlib.error, EOFError) as error:
         reason = "it ends within its header" if isinstance(error, struct.error) else error
         problem = CHANGED_LINE_ENDS if line_ends_changed(data) else f"({reason})"
-        unread = f"is not a readable SPZ file {problem}; expected {READ_FILES}"
-        raise StgaError(f"{path}: {unread}") from error
+        raise StgaError(
+            f"{path}: is not a readable SPZ file {problem}; expected {READ_FILES}"
+        ) from error
 
 
 def _unpacked(path: Path, data: bytes, say: Say) -> Splats:

@@ -42,8 +42,9 @@ def write_usd(
         import pxr.UsdGeom
         import pxr.Vt
     except ImportError as error:
-        problem = "USD files need the package usd-core, which this Python lacks"
-        raise StgaError(f"{path}: {problem}") from error
+        raise StgaError(
+            f"{path}: USD files need the package usd-core, which this Python lacks"
+        ) from error
     is_package = path.suffix.lower() == ".usdz"
     with replacing(path) as partial:
         layer = partial.with_name(f".layer{partial.name}") if is_package else partial

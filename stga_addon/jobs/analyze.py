@@ -94,8 +94,10 @@ def time_each_preset(request: TimePresets, report: Report, say: Say) -> Analyzed
     say(why)
     timings = time_presets(capture, device=device)
     for timing in timings:
-        time = f"about {format_duration(timing.seconds):<10}"
-        say(f"{timing.preset:<9} {timing.iterations:6d} iterations  {time}  {timing.purpose}")
+        say(
+            f"{timing.preset:<9} {timing.iterations:6d} iterations  about "
+            f"{format_duration(timing.seconds):<10}  {timing.purpose}"
+        )
     return Analyzed((), {timing.preset: timing.seconds for timing in timings})
 
 

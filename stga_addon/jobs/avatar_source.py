@@ -84,13 +84,13 @@ def open_avatar(request: Posed) -> tuple[Avatar, Capture | None]:
     if capture is None and given is not None:
         capture = open_capture(given, request.flame, avatar.principal_point)
         if avatar.settings.get("tracking"):
-            what = "was trained on refined meshes, which only its run's folder has"
-            warn(f"{source}: {what}")
+            warn(f"{source}: was trained on refined meshes, which only its run's folder has")
     if capture is None:
         return avatar, None
     if not np.array_equal(capture.faces, avatar.faces):
-        message = "its mesh has other triangles than the one this avatar was trained on"
-        raise StgaError(f"{capture.root}: {message}")
+        raise StgaError(
+            f"{capture.root}: its mesh has other triangles than the one this avatar was trained on"
+        )
     return avatar, capture if request.played is None else _as_played(capture, request.played)
 
 
@@ -133,8 +133,10 @@ def _as_played(capture: Capture, played: Played) -> Capture:
     ):
         for frame, array in arrays.items():
             if array.dtype.kind != kind or array.shape != shape or not np.isfinite(array).all():
-                found = f"expected {expected} {shape}, got {array.dtype} {array.shape}"
-                raise StgaError(f"played: {name} {frame}: {found}")
+                raise StgaError(
+                    f"played: {name} {frame}: expected {expected} {shape}, got {array.dtype} "
+                    f"{array.shape}"
+                )
     flame = None
     count = len(played.meshes)
     if capture.flame is not None and played.motion is not None:
@@ -168,8 +170,10 @@ def open_avatar_motion(request: Posed, avatar: Avatar, say: Say) -> Motion:
                 raise
             say(f"{error}; the motion is put on the head without expression, not its quiet face")
     if options.stay_trained is not None and trained is None:
-        what = "is no run with a FLAME capture, whose motion would be the range"
-        raise StgaError(f"--stay-trained: {source} {what}")
+        raise StgaError(
+            f"--stay-trained: {source} is no run with a FLAME capture, whose motion would be "
+            "the range"
+        )
     head = avatar.neutral, avatar.faces
     motion = open_motion(request.motion, flame, head, options, trained, request.fps)
     for line in findings(motion):

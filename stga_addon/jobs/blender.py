@@ -191,8 +191,10 @@ def _rendered(request: RenderBlend, first: int, last: int, say: Say) -> Iterator
     if expected <= last:
         lines = [line for line in printed if line] or ["it printed nothing"]
         said = ([line for line in lines if "error" in line.lower()] or lines)[-1]
-        ended = f"Blender ended with exit status {code}: {said}"
-        raise StgaError(f"{request.blend}: frame {expected} was not rendered: {ended}")
+        raise StgaError(
+            f"{request.blend}: frame {expected} was not rendered: Blender ended with exit "
+            f"status {code}: {said}"
+        )
 
 
 def blender_command() -> list[str]:
@@ -219,6 +221,7 @@ def _start(command: list[str]) -> subprocess.Popen[str]:
             preexec_fn=end_with_this_process(),
         )
     except OSError as error:
-        expected = f"expected it on PATH, or the command that starts it in {BLENDER_VARIABLE}"
-        message = f"Blender cannot be started ({error.strerror or error}); {expected}"
-        raise StgaError(f"{command[0]}: {message}") from error
+        raise StgaError(
+            f"{command[0]}: Blender cannot be started ({error.strerror or error}); expected it "
+            f"on PATH, or the command that starts it in {BLENDER_VARIABLE}"
+        ) from error

@@ -196,8 +196,10 @@ def _shapes_of_motion(request: ConvertMotion) -> Performance:
     source = request.source
     neutral = request.options.neutral
     if not request.writes_shapes:
-        instead = f"--out takes a {SHAPES_SUFFIX} of ARKit's shapes"
-        raise StgaError(f"{source}: holds FLAME parameters already; {instead}")
+        raise StgaError(
+            f"{source}: holds FLAME parameters already; --out takes a {SHAPES_SUFFIX} of "
+            "ARKit's shapes"
+        )
     if request.head is not None:
         raise StgaError(f"--head: has no effect on {source}, which has its own identity")
     capture = open_capture(source, request.flame)

@@ -91,8 +91,9 @@ class Export:
         for name, formats in held.items():
             if getattr(self, name) not in (None, False) and self.file_format not in formats:
                 flag = flag_of(type(self).__dataclass_fields__[name])
-                only = f"only with {', '.join(formats)}"
-                raise StgaError(f"{flag} cannot be combined with {chosen}, {only}")
+                raise StgaError(
+                    f"{flag} cannot be combined with {chosen}, only with {', '.join(formats)}"
+                )
         is_frame = self.file_format in held["timestep"]
         if self.motion is not None and is_frame and self.timestep is None:
             raise StgaError(f"--motion: has no effect with {chosen} without --timestep")
@@ -137,8 +138,10 @@ def _say_size(request: Export, avatar: Avatar, frames: int, say: Say) -> None:
     """Say how large the file will be. Raises StgaError where the disk has too little free space."""
     size = FORMATS[request.file_format].size(Content(avatar), frames)
     check_free_space(request.output, size)
-    count = f"{frames} frame{'' if frames == 1 else 's'}"
-    say(f"{count} of {len(avatar.splats)} splats: about {format_bytes(size)}")
+    say(
+        f"{frames} frame{'' if frames == 1 else 's'} of {len(avatar.splats)} splats: about "
+        f"{format_bytes(size)}"
+    )
 
 
 # Web pages

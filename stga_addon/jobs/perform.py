@@ -88,8 +88,10 @@ def _read(path: Path, kinds: Any) -> Any:
     values = read_json(path)
     named = isinstance(values, dict) and (values.pop("format", 0), values.pop("version", 0))
     if named != (FORMAT, VERSION):
-        known = f"(format '{FORMAT}', version {VERSION})"
-        raise StgaError(f"{path}: is not a request that this version reads {known}")
+        raise StgaError(
+            f"{path}: is not a request that this version reads (format '{FORMAT}', version "
+            f"{VERSION})"
+        )
     arrays_path = path.with_suffix(".npz")
     arrays = read_npz(arrays_path) if os.path.exists(arrays_path) else {}
     try:

@@ -58,8 +58,9 @@ def finish_check(
     except (ValueError, IndexError, KeyError, TypeError) as error:
         with suppress(OSError):  # the stream may be closed
             print(output + errors, file=sys.stderr, flush=True)
-        problem = f"is not a Python that runs this add-on (exit status {process.returncode})"
-        raise StgaError(f"{python}: {problem}") from error
+        raise StgaError(
+            f"{python}: is not a Python that runs this add-on (exit status {process.returncode})"
+        ) from error
 
 
 def describe_check(python: str, report: dict[str, Any]) -> str:
@@ -73,10 +74,13 @@ def describe_check(python: str, report: dict[str, Any]) -> str:
     if missing:
         whys = [text for text in failures.values() if not text.startswith("ModuleNotFoundError")]
         failed = f" ({whys[0]})" if whys else ""
-        problem = f"Python {version} lacks {', '.join(missing)}{failed}; install that there"
-        raise StgaError(f"{python}: {problem}")
-    known = f"torch {versions['torch']}, numba {versions['numba']}"
-    return f"Python {version}, {known}, {report['device']}"
+        raise StgaError(
+            f"{python}: Python {version} lacks {', '.join(missing)}{failed}; install that there"
+        )
+    return (
+        f"Python {version}, torch {versions['torch']}, numba {versions['numba']}, "
+        f"{report['device']}"
+    )
 
 
 def main() -> None:

@@ -123,8 +123,9 @@ class Render:
         if self.cameras is None and not self.is_film:
             raise StgaError("--out needs --cameras, which says what to render, or --turntable")
         if self.frames is not None and self.turntable is not None:
-            problem = "has no effect with --turntable, which plays all of the motion"
-            raise StgaError(f"--frames: {problem}")
+            raise StgaError(
+                "--frames: has no effect with --turntable, which plays all of the motion"
+            )
 
 
 def render(request: Render, report: Report, say: Say) -> Written:
@@ -245,9 +246,10 @@ def _turntable_images(request: Render, fps: float) -> int:
     """Images of --seconds. Raises StgaError for more than MAX_TURNTABLE_IMAGES."""
     images = request.seconds * fps
     if images > MAX_TURNTABLE_IMAGES:
-        asked = f"is {images:.0f} images at {fps:g} frames per second"
-        limit = f"expected up to {MAX_TURNTABLE_IMAGES}"
-        raise StgaError(f"--seconds {request.seconds:g}: {asked}; {limit}")
+        raise StgaError(
+            f"--seconds {request.seconds:g}: is {images:.0f} images at {fps:g} frames per "
+            f"second; expected up to {MAX_TURNTABLE_IMAGES}"
+        )
     return round(images)
 
 
@@ -285,13 +287,16 @@ def _subject(request: Render, composer: Composer, say: Say) -> _Subject:
         )
     avatar, capture = avatar_source.open_avatar(request)
     if capture is None:
-        problem = "an avatar needs the meshes of a capture to follow; give --capture"
-        raise StgaError(f"{source}: {problem}")
+        raise StgaError(
+            f"{source}: an avatar needs the meshes of a capture to follow; give --capture"
+        )
 
     def mesh(view: View) -> np.ndarray:
         if view.timestep not in capture.timesteps:
-            problem = f"has no mesh for timestep {view.timestep}, which {view.name} asks for"
-            raise StgaError(f"{capture.root}: {problem}")
+            raise StgaError(
+                f"{capture.root}: has no mesh for timestep {view.timestep}, which {view.name} "
+                "asks for"
+            )
         return capture.mesh(view.timestep)
 
     return _Subject(
@@ -313,8 +318,10 @@ def _pictured(
     if request.world:
         path = avatar_source.avatar_path(request.source).with_name(WORLD_FILE)
         if not path.is_file():
-            shown = "--world shows what a training with --effect world=on has written"
-            raise StgaError(f"{path}: is missing; {shown}")
+            raise StgaError(
+                f"{path}: is missing; --world shows what a training with --effect world=on has "
+                "written"
+            )
         behind = [PosedSplats(read_splats(path))]
     colors = None if request.light is None else _lit_colors(request, request.light, avatar)
 

@@ -161,8 +161,9 @@ class MakeAvatar:
         """Raise StgaError where the two do not belong together."""
         wanted = self.out / CAPTURE_FOLDER, self.out / CAPTURE_FOLDER, self.out / RUN_FOLDER
         if (self.track.out, self.train.capture, self.train.run) != wanted:
-            problem = f"expected a capture in {CAPTURE_FOLDER}, and its run in {RUN_FOLDER}"
-            raise StgaError(f"{self.out}: {problem}")
+            raise StgaError(
+                f"{self.out}: expected a capture in {CAPTURE_FOLDER}, and its run in {RUN_FOLDER}"
+            )
 
 
 WRITER = "tracking is writing this capture"  # Who holds its lock
@@ -249,8 +250,9 @@ def _track_held(request: Track, report: Report, say: Say) -> Written:
         lines.append(f"avatar: does not explain {share:.0%} of the head's pixels (median)")
         if share > MAX_MISFIT:
             lines.append("warning: the avatar does not look like the person of this footage")
-    error = f"reprojection error: {pixels:.2f} px (median)"
-    lines.append(f"{error}; by camera and timestep in tracking.json")
+    lines.append(
+        f"reprojection error: {pixels:.2f} px (median); by camera and timestep in tracking.json"
+    )
     report(Progress(1.0, "Tracked", f"Reprojection error {pixels:.1f} px (median)"))
     return Written(out, (*lines, f"capture: {out}"))
 
@@ -327,8 +329,9 @@ def make_avatar(request: MakeAvatar, report: Report, say: Say) -> Written:
         lines.append(f"footage: cameras {len(errors)}, timesteps {len(timesteps)}")
         median = f"{values['median_reprojection_px']:.2f} px (median)"
     except (KeyError, TypeError, ValueError, AttributeError) as error:
-        problem = f"is not the report of a tracking ({error!s:.100})"
-        raise StgaError(f"{capture / REPORT_FILE}: {problem}") from error
+        raise StgaError(
+            f"{capture / REPORT_FILE}: is not the report of a tracking ({error!s:.100})"
+        ) from error
     files = [capture / SHEET_FILE, capture / REPORT_FILE, run / CURVE]
     lines += [
         f"tracking: reprojection error {median}",
@@ -369,8 +372,7 @@ def check_inputs(track: Track) -> None:
         for name, value in inputs.items():
             before = stored.get(name, getattr(Track, name, None))  # an older version noted less
             if before != value:
-                began = f"{out} began with {shorten(before)}"
-                raise StgaError(f"{name}: {began}; give another --out")
+                raise StgaError(f"{name}: {out} began with {shorten(before)}; give another --out")
     elif is_written(track.out) or (out / RUN_FOLDER).exists():
         raise StgaError(f"{out}: holds something else ({INPUTS} is missing); give another --out")
 

@@ -146,8 +146,9 @@ class Refine(_Continue):
     def check(self) -> None:
         """Raise StgaError unless there is one region and one budget."""
         if not self.region and self.weights is None:
-            problem = "is missing; expected the name of a region or a file of triangle weights"
-            raise StgaError(f"--region: {problem}")
+            raise StgaError(
+                "--region: is missing; expected the name of a region or a file of triangle weights"
+            )
         if self.region and self.weights is not None:
             raise StgaError("region: expected its name, its file or painted weights")
         super().check()
@@ -253,16 +254,19 @@ def train_and_finish(request: Training, report: Report, say: Say) -> Written:
             lines.append(_world_of(prepared, report_world))
     lines.append(f"avatar: {avatar}")
     if prepared.run.settings.tracking:
-        refined = f"refined meshes: {folder / run_folder.TRACKING}"
-        lines.append(f"{refined} (in Blender: Apply Motion, Own Offsets)")
+        lines.append(
+            f"refined meshes: {folder / run_folder.TRACKING} (in Blender: Apply Motion, Own "
+            "Offsets)"
+        )
     return Written(avatar, tuple(lines))
 
 
 def _light_of(prepared: Prepared, avatar: Path, report: Report) -> tuple[str, ...]:
     """Write the light of the capture into the avatar; what there is to say, or why it has none."""
     if any(decision.effect == RELIGHT and not decision.on for decision in prepared.run.effect_plan):
-        why = "the effect relight is off"
-        return (f"light: not estimated ({why}); `stga relight RUN` estimates it",)
+        return (
+            "light: not estimated (the effect relight is off); `stga relight RUN` estimates it",
+        )
     from .finished_run import add_light
 
     capture = run_folder.with_refined_tracking(prepared.capture, prepared.request.run)
@@ -376,8 +380,7 @@ def _refinement(request: Refine, report: Report, say: Say) -> Prepared:
         region = weights >= SELECTED_WEIGHT
         name = "painted"
     else:
-        expected = f"one for each triangle ({count},)"
-        raise StgaError(f"weights: expected {expected}, got {weights.shape}")
+        raise StgaError(f"weights: expected one for each triangle ({count},), got {weights.shape}")
     face = read_avatar(parent / AVATAR).splats.face
     if not region[face].any():
         raise StgaError(f"region '{name}': the avatar has no splats there")
@@ -434,8 +437,9 @@ def _joined_takes(request: Extend, say: Say) -> tuple[OpenedRun, Capture, Select
         take = open_capture(path, run.flame, run.principal_point)
         capture_model.require_same_head(opened.capture, take)
         if not take.views.get("train"):
-            problem = "has no training views, so there is nothing to extend the avatar with"
-            raise StgaError(f"{take.root}: {problem}")
+            raise StgaError(
+                f"{take.root}: has no training views, so there is nothing to extend the avatar with"
+            )
         capture_model.require_same_scale(opened.takes[0], take)
         if any(take.root == old.root for old in opened.takes):
             raise StgaError(f"{take.root}: is a take of this run already")

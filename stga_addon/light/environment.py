@@ -129,8 +129,9 @@ def read_lighting(path: Path) -> Lighting:
         world, suns = split_environment(read_hdr(path))
         return Lighting(world, suns)
     if suffix != ".toml":
-        expected = "expected light as an environment (.hdr) or a list of lights (.toml)"
-        raise StgaError(f"{path}: {expected}")
+        raise StgaError(
+            f"{path}: expected light as an environment (.hdr) or a list of lights (.toml)"
+        )
     values = read_toml(path)
     try:
         entries = values.get("lights", [])

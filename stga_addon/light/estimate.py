@@ -135,8 +135,9 @@ def estimate_light(
     for view in capture.views.get("train", ()):
         by_time.setdefault(view.timestep, []).append(view)
     if not by_time:
-        problem = "has no training views, from which its light could be estimated"
-        raise StgaError(f"{capture.root}: {problem}")
+        raise StgaError(
+            f"{capture.root}: has no training views, from which its light could be estimated"
+        )
     chosen = evenly_spread(sorted(by_time), MAX_TIMESTEPS)
     faces = capture.faces
     times = {time: evenly_spread(by_time[time], MAX_CAMERAS) for time in chosen}

@@ -86,8 +86,9 @@ class Relighter:
 
     def __init__(self, avatar: Avatar) -> None:
         if avatar.light is None:
-            problem = "the avatar does not know the light of its capture"
-            raise StgaError(f"{problem}; `stga relight RUN` estimates it")
+            raise StgaError(
+                "the avatar does not know the light of its capture; `stga relight RUN` estimates it"
+            )
         self.avatar = avatar
         self.light = avatar.light
         self.face, self.weights = surface_points(avatar)

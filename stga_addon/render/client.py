@@ -88,11 +88,10 @@ class RenderClient:
             try:
                 python = self._find_python()
             except StgaError as error:
-                this = f"{sys.executable}, {sys.version.split()[0]}"
                 raise StgaError(
-                    f"Rendering splats needs {' and '.join(missing_packages())} in Blender's own "
-                    f"Python ({this}), or another Python with them, which is chosen in the "
-                    "add-on's preferences"
+                    f"Rendering splats needs {' and '.join(missing_packages())} in Blender's "
+                    f"own Python ({sys.executable}, {sys.version.split()[0]}), or another "
+                    "Python with them, which is chosen in the add-on's preferences"
                 ) from error
             self._server_device = self._find_device()
             arguments = ["stga_addon.render.client", self._server_device]
@@ -110,8 +109,9 @@ class RenderClient:
             ) from error
         self.failure = str(reply.get("failure", ""))
         if "error" in reply:
-            reason = f"could not render the image ({reply['error']})"
-            raise StgaError(f"{python}: the render server {reason}")
+            raise StgaError(
+                f"{python}: the render server could not render the image ({reply['error']})"
+            )
         return ComposedImage(reply["rgb"], reply["alpha"], reply["depth"] if with_depth else None)
 
 

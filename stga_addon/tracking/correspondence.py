@@ -111,8 +111,10 @@ def calibrate(
         places, pupils = _with_pupils(model, places, located.position)
         reliable[pupils] = True
     if reliable.sum() < MIN_LANDMARKS:
-        few = f"{reliable.sum()} of {len(reliable)} landmarks that are found in its pictures"
-        raise StgaError(f"{name}: {few} lie on its surface, expected at least {MIN_LANDMARKS}")
+        raise StgaError(
+            f"{name}: {reliable.sum()} of {len(reliable)} landmarks that are found in its "
+            f"pictures lie on its surface, expected at least {MIN_LANDMARKS}"
+        )
     return places, reliable
 
 

@@ -50,13 +50,15 @@ def read_glb(path: Path) -> MorphMesh:
                 names = ", ".join(sorted(map(str, unknown)))
                 raise StgaError(f"{path}: needs {names}; export it without compression")
             if any("uri" in buffer for buffer in document.get("buffers", ())):
-                other = "refers to other files; export a GLB that holds its buffers"
-                raise StgaError(f"{path}: {other}")
+                raise StgaError(
+                    f"{path}: refers to other files; export a GLB that holds its buffers"
+                )
             placed = _placed_primitives(path, document, len(content))
             parts = [_part(document, data, *each) for each in placed]
     except UNREADABLE as error:
-        reason = f"{type(error).__name__}: {error!s:.100}"
-        raise StgaError(f"{path}: is not a readable GLB ({reason})") from error
+        raise StgaError(
+            f"{path}: is not a readable GLB ({type(error).__name__}: {error!s:.100})"
+        ) from error
     if not parts:
         raise StgaError(f"{path}: its scene has no triangle mesh")
     return _joined(parts)
@@ -88,8 +90,10 @@ def _placed_primitives(path: Path, document: Json, size: int) -> list[Placed]:
             names.update(name for name, _ in named)
             numbers = 3 * vertices * (1 + len(names)) + corners
             if numbers > allowed:
-                limit = f"more than the {allowed} allowed to a file of this size"
-                raise StgaError(f"{path}: its meshes hold {numbers} numbers, {limit}")
+                raise StgaError(
+                    f"{path}: its meshes hold {numbers} numbers, more than the {allowed} "
+                    "allowed to a file of this size"
+                )
             placed.append((primitive, named, matrix))
     return placed
 

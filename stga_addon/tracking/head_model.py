@@ -155,8 +155,10 @@ def checked(path: Path, head: HeadModel) -> HeadModel:
             raise StgaError(f"{path}: {name} reaches {largest:.3g}, expected at most {limit:.0f}")
     extent = float(np.ptp(model.v_template, axis=0).max())
     if not MIN_EXTENT_M <= extent <= MAX_EXTENT_M:
-        expected = f"{MIN_EXTENT_M} to {MAX_EXTENT_M} meters"
-        raise StgaError(f"{path}: the head measures {extent:.3g}, expected {expected}")
+        raise StgaError(
+            f"{path}: the head measures {extent:.3g}, expected {MIN_EXTENT_M} to "
+            f"{MAX_EXTENT_M} meters"
+        )
     return head
 
 

@@ -120,8 +120,10 @@ def read_camera(path: Path, camera: FootageCamera) -> CameraLandmarks:
     timesteps = arrays["timesteps"]
     listed = timesteps.tolist() if timesteps.ndim == 1 and timesteps.dtype.kind in "iu" else [None]
     if not set(listed) <= set(camera.timesteps) or len(set(listed)) < len(listed):
-        expected = f"timesteps of camera {camera.name}, each once, whole numbers (any,)"
-        raise StgaError(f"{path}: timesteps: expected {expected}")
+        raise StgaError(
+            f"{path}: timesteps: expected timesteps of camera {camera.name}, each once, whole "
+            "numbers (any,)"
+        )
     shape = len(timesteps), None, 2
     points = floats(path, arrays, "points", shape, "f", "floating-point numbers")
     arrays = {"confidence": np.isfinite(points).all(2), **arrays}
@@ -133,8 +135,10 @@ def read_camera(path: Path, camera: FootageCamera) -> CameraLandmarks:
     if not np.isfinite(seen).all():
         raise StgaError(f"{path}: points: expected finite pixels where confidence is not 0")
     if not (np.abs(seen) <= MAX_PIXELS).all():
-        far = f"at most {MAX_PIXELS:.0f}, as far as no image reaches"
-        raise StgaError(f"{path}: points: expected pixels of {far}")
+        raise StgaError(
+            f"{path}: points: expected pixels of at most {MAX_PIXELS:.0f}, as far as no image "
+            "reaches"
+        )
     known = np.where(confidence[..., None] > 0, points, 0.0)
     return CameraLandmarks(timesteps.astype(np.int64), known, confidence)
 
@@ -164,8 +168,9 @@ def read_places(path: Path, triangles: int) -> tuple[SurfacePoints, np.ndarray]:
         raise StgaError(f"{path}: face: expected {expected}")
     used = face >= 0
     if used.sum() < MIN_LANDMARKS:
-        few = f"uses {used.sum()} landmarks, expected at least {MIN_LANDMARKS}"
-        raise StgaError(f"{path}: face: {few}")
+        raise StgaError(
+            f"{path}: face: uses {used.sum()} landmarks, expected at least {MIN_LANDMARKS}"
+        )
     barycentric = floats(path, arrays, "barycentric", (len(face), 3), "biuf")
     if not np.isfinite(barycentric).all():
         raise StgaError(f"{path}: barycentric: expected finite numbers")
@@ -184,8 +189,9 @@ def check_count(found: Mapping[str, CameraLandmarks], places: SurfacePoints) -> 
     for name, camera in found.items():
         count = camera.points.shape[1]
         if camera.confidence.any() and count != len(places):
-            other = f"the head model's file has {len(places)}"
-            raise StgaError(f"camera {name}: has {count} landmarks, but {other}")
+            raise StgaError(
+                f"camera {name}: has {count} landmarks, but the head model's file has {len(places)}"
+            )
 
 
 def write_places(path: Path, places: SurfacePoints, used: np.ndarray) -> None:

@@ -85,8 +85,9 @@ def begin_landmarks(opened: OpenedFootage) -> None:
     """Record what the landmarks in the folder are of. Raises StgaError for other footage's."""
     path = opened.out / folder.FOOTAGE_FILE
     if path.exists() and read_json(path) != opened.source:
-        other = "holds landmarks of other footage; give another --out, or delete it"
-        raise StgaError(f"{opened.out}: {other}")
+        raise StgaError(
+            f"{opened.out}: holds landmarks of other footage; give another --out, or delete it"
+        )
     write_json(path, opened.source)
 
 

@@ -67,12 +67,14 @@ def record(opened: OpenedFootage, crew: Crew) -> RecordedFootage:
     neutral = _neutral(opened, take)
     if np.ptp(neutral[take.reliable], axis=0).max() < head_fit.MIN_FACE_M:
         places = (given or opened.out / folder.LANDMARKS_FOLDER) / folder.PLACES_FILE
-        problem = "its landmarks lie in one point of the head model; expected a face"
-        raise StgaError(f"{places}: face: {problem}")
+        raise StgaError(
+            f"{places}: face: its landmarks lie in one point of the head model; expected a face"
+        )
     found = _with_timesteps(RecordedFootage(opened, detected, take))
     if not found.take.landmarks:
-        few = "shows too few landmarks of a face in each of its frames"
-        raise StgaError(f"{opened.footage.root}: {few}")
+        raise StgaError(
+            f"{opened.footage.root}: shows too few landmarks of a face in each of its frames"
+        )
     return found
 
 

@@ -124,8 +124,9 @@ class Helpers:
                 while (message := _Unpickler(process.stdout).load())[0] == STEP:
                     steps.append(None)
             except (EOFError, OSError, pickle.UnpicklingError) as error:
-                problem = f"before its work did (exit status {process.poll()})"
-                raise StgaError(f"a helping process ended {problem}") from error
+                raise StgaError(
+                    f"a helping process ended before its work did (exit status {process.poll()})"
+                ) from error
             idle.put(process)
             if message[0] == ERROR:
                 raise message[1]

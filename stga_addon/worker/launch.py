@@ -113,8 +113,9 @@ def start_python(
         return subprocess.Popen([python, "-m", *arguments], env=environment, **options)
     except (OSError, ValueError) as error:  # ValueError: a null character in the path
         reason = getattr(error, "strerror", None) or error
-        problem = f"cannot be started as a Python interpreter ({reason})"
-        raise StgaError(f"{python}: {problem}") from error
+        raise StgaError(
+            f"{python}: cannot be started as a Python interpreter ({reason})"
+        ) from error
 
 
 def end_with_this_process() -> Callable[[], None] | None:

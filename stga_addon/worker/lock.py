@@ -53,8 +53,7 @@ def hold_folder(
                 leased = True
             lease = held.enter_context(_hold_lease(_lease_of(path))) if leased else None
         except BlockingIOError as error:
-            problem = f"another {holder} (process {lock_owner(path)})"
-            raise StgaError(f"{folder}: {problem}") from error
+            raise StgaError(f"{folder}: another {holder} (process {lock_owner(path)})") from error
         except OSError as error:
             raise StgaError(f"{folder}: cannot be written ({error.strerror or error})") from error
         yield lease

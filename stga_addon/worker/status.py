@@ -132,8 +132,10 @@ def _why_lost(folder: Path, exit_code: int | None) -> str:
         last = log_lines(folder, 1) or ["its log is empty"]
         return f"Worker exited with status {exit_code}: {last[0].strip()}"
     signal = f" (signal {-exit_code})" if exit_code else ""
-    why = f"it was killed or may have run out of memory. Log: {folder / LOG_FILE}"
-    return f"Worker exited unexpectedly{signal}; {why}"
+    return (
+        f"Worker exited unexpectedly{signal}; it was killed or may have run out of memory. "
+        f"Log: {folder / LOG_FILE}"
+    )
 
 
 def read_status(folder: Path) -> WorkerStatus | None:
@@ -176,8 +178,9 @@ def request_cancel(folder: Path) -> None:
 def refuse_running_worker(folder: Path) -> None:
     """Raises StgaError while a worker is running in the folder."""
     if is_locked(folder / LOCK_FILE):
-        problem = f"another worker is running here (process {lock_owner(folder / LOCK_FILE)})"
-        raise StgaError(f"{folder}: {problem}")
+        raise StgaError(
+            f"{folder}: another worker is running here (process {lock_owner(folder / LOCK_FILE)})"
+        )
 
 
 def remove_status_folder(folder: Path, other_files: Iterable[str] = ()) -> None:

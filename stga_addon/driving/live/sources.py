@@ -98,9 +98,11 @@ class Receiver:
             self._socket.bind((str(where), self.port))
         except OSError as error:
             self._socket.close()
-            problem = f"port {self.port} of {where} cannot be opened ({error.strerror or error})"
-            reason = "another program may be listening on it, or this computer has no such address"
-            raise StgaError(f"{source.label}: {problem}; {reason}") from error
+            raise StgaError(
+                f"{source.label}: port {self.port} of {where} cannot be opened "
+                f"({error.strerror or error}); another program may be listening on it, or this "
+                "computer has no such address"
+            ) from error
         self.port = self._socket.getsockname()[1]
 
     def read(self) -> list[tuple[str, bytes]]:

@@ -65,8 +65,9 @@ def _input_digest(path: Path, written: Set[str]) -> str:
         else:
             lines = [_line(path.name, path.stat())]
     except OSError as error:
-        problem = f"cannot be read ({error.strerror or error})"
-        raise StgaError(f"{error.filename or path}: {problem}") from error
+        raise StgaError(
+            f"{error.filename or path}: cannot be read ({error.strerror or error})"
+        ) from error
     return hashlib.sha256("\n".join(lines).encode("utf-8", "surrogateescape")).hexdigest()
 
 
@@ -169,8 +170,9 @@ def prepare(job: Job, digest: str, forecast_s: float) -> Path | None:
     if record is None:
         held = job.folder.iterdir() if job.folder.is_dir() else ()
         if any(path.name != job.request_folder.name for path in held):
-            foreign = "holds files that no job of a batch wrote; choose another 'out'"
-            raise StgaError(f"{job.folder}: {foreign}")
+            raise StgaError(
+                f"{job.folder}: holds files that no job of a batch wrote; choose another 'out'"
+            )
         write_record(job, JobRecord(digest, forecast_s))
     if record is None or not has_request(job.request_folder):
         write_request(job.request_folder, job.request)

@@ -223,8 +223,9 @@ def make_plan(values: Mapping[str, Any], base: Path, source: str) -> Plan:
 def _require_keys(where: str, values: Mapping[str, Any], allowed: Sequence[str]) -> None:
     unknown = next((key for key in values if key not in allowed), None)
     if unknown is not None:
-        problem = f"{unknown}: is not a key of it; expected one of {', '.join(allowed)}"
-        raise StgaError(f"{where}: {problem}")
+        raise StgaError(
+            f"{where}: {unknown}: is not a key of it; expected one of {', '.join(allowed)}"
+        )
 
 
 def _job(source: str, name: str, table: Any, base: Path, out: Path, shared: Resources) -> Job:
@@ -336,8 +337,9 @@ def _with_inputs(source: str, jobs: Sequence[Job]) -> Iterator[Job]:
         for name, paths in input_paths(job.request).items():
             for path in paths:
                 if path == job.folder.parent:
-                    problem = f"{name}: {path} is the batch's own folder; choose another 'out'"
-                    raise StgaError(f"{where}: {problem}")
+                    raise StgaError(
+                        f"{where}: {name}: {path} is the batch's own folder; choose another 'out'"
+                    )
                 makers = (by_folder.get(folder) for folder in (path, *path.parents))
                 maker = next(filter(None, makers), None)
                 if maker is None and not path.exists():

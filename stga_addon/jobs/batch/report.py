@@ -268,8 +268,10 @@ def _pictures(runs: Sequence[Run]) -> str:
             source = f"data:image/jpeg;base64,{base64.b64encode(out.getvalue()).decode()}"
             name = html.escape(run.entry.job.name)
             psnr = f", {run.figures['psnr']:.2f} dB" if "psnr" in run.figures else ""
-            image = f'<img alt="{name}" height="{PICTURE_HEIGHT_PX}" src="{source}">'
-            shown.append(f"<figure>{image}<figcaption>{name}{psnr}</figcaption></figure>")
+            shown.append(
+                f'<figure><img alt="{name}" height="{PICTURE_HEIGHT_PX}" '
+                f'src="{source}"><figcaption>{name}{psnr}</figcaption></figure>'
+            )
     title = "<h2>Held-out views: image and avatar, from the lowest PSNR</h2>"
     return title + "".join(shown) if shown else ""
 

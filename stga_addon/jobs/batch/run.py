@@ -128,8 +128,9 @@ class BatchRun:
         try:
             self._work()
         except KeyboardInterrupt:
-            said = "the running jobs save what they have; Ctrl-C again leaves them to it"
-            self._say(f"Stopping: {said}")
+            self._say(
+                "Stopping: the running jobs save what they have; Ctrl-C again leaves them to it"
+            )
             self._stop()
             raise
         finally:
@@ -143,8 +144,10 @@ class BatchRun:
                 self._say(f"{name}: goes on in the worker of an earlier start")
         while self._batch.unfinished:
             if self._lease.compromise is not None:
-                problem = "another batch has taken this folder; this one has ended"
-                raise StgaError(f"{self._batch.plan.out}: {problem}")
+                raise StgaError(
+                    f"{self._batch.plan.out}: another batch has taken this folder; this one "
+                    "has ended"
+                )
             begun = self._begin()
             ended = self._collect()
             self._look()

@@ -88,8 +88,10 @@ class SplatRenderer:
         try:
             trial.check(drawn, hidden=shaders.BLOCK_SPLATS)
         except trial.WrongPicture as error:
-            device = f"{gpu.platform.backend_type_get()}, {gpu.platform.renderer_get()}"
-            return f"Blender {bpy.app.version_string} draws splats wrong ({device}): {error}"
+            return (
+                f"Blender {bpy.app.version_string} draws splats wrong "
+                f"({gpu.platform.backend_type_get()}, {gpu.platform.renderer_get()}): {error}"
+            )
         return ""
 
     def draw(self, layers: Sequence[SceneLayer], view: View) -> None:

@@ -368,6 +368,7 @@ def light_hint(scene: Any) -> str | None:
         frame = shown.data.get(tags.RELIT_FRAME) if RELIT_COLOR in shown.data.attributes else None
         if frame != scene.frame_current:
             now = "colors as recorded" if frame is None else f"the light of frame {frame}"
-            remedy = "Relight Frame gives them the light of this frame"
-            return f"EEVEE and Cycles render {now}; {remedy}"
+            return (
+                f"EEVEE and Cycles render {now}; Relight Frame gives them the light of this frame"
+            )
     return None

@@ -57,8 +57,7 @@ def find_calibration(root: Path) -> tuple[Path | None, tuple[str, ...]]:
     heads = {path: _head(path) for path in listed_files}
     files = [path for path, head in heads.items() if _is_read(path, head)]
     if len(files) > 1 and not found:
-        both = f"{files[0].name} and {files[1].name}"
-        raise StgaError(f"{root}: {both} are calibrations; choose one")
+        raise StgaError(f"{root}: {files[0].name} and {files[1].name} are calibrations; choose one")
     found += files
     names = [own.relative_to(root).as_posix() for own in found]
     if xmp := xmp_files(root):
@@ -68,8 +67,10 @@ def find_calibration(root: Path) -> tuple[Path | None, tuple[str, ...]]:
     others += incomplete_models(root)
     if not found:
         if others:
-            looks = "looks like a calibration, but is not understood"
-            raise StgaError(f"{others[0]}: {looks}; expected {EXPECTED}, or none in the folder")
+            raise StgaError(
+                f"{others[0]}: looks like a calibration, but is not understood; expected "
+                f"{EXPECTED}, or none in the folder"
+            )
         return None, ()
     names += [path.relative_to(root).as_posix() for path in others]
     unused = (f"{found[0]}: is the calibration; not used: {listed(names[1:])}",)

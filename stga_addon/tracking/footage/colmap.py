@@ -120,8 +120,10 @@ def read_colmap(folder: Path) -> Calibrated:
             raise StgaError(f"{where}: names camera {camera}, which {cameras_file} does not have")
         model, size, values = cameras[camera]
         if model not in LENSES:
-            unknown = f"model {shorten(model)} is not one of {', '.join(LENSES)}"
-            raise StgaError(f"{cameras_file}: camera {camera}: {unknown}")
+            raise StgaError(
+                f"{cameras_file}: camera {camera}: model {shorten(model)} is not one of "
+                f"{', '.join(LENSES)}"
+            )
         _, focals, count, lens = LENSES[model]
         if len(values) != focals + 2 + count:
             expected = f"expected {focals + 2 + count} parameters of {model}, not {len(values)}"
@@ -164,8 +166,9 @@ def _text_cameras(path: Path) -> Iterator[_Camera]:
         if not words:
             continue
         if len(words) < 5:
-            expected = "number, model, width, height and parameters of a camera"
-            raise StgaError(f"{where}: expected {expected}")
+            raise StgaError(
+                f"{where}: expected number, model, width, height and parameters of a camera"
+            )
         identity, width, height = (_whole(word, where) for word in (words[0], *words[2:4]))
         yield identity, (words[1], (width, height), numbers(words[4:], where))
 

@@ -105,8 +105,9 @@ def _sensor(sensor: Element, where: str) -> tuple[Pair, float, Pair, Lens]:
     adjusted = (c for c in found if c.get("class") == "adjusted")
     calibration = next(adjusted, found[-1] if found else None)
     if calibration is None or calibration.find("f") is None:
-        missing = "no calibration with f; align the cameras and export them again"
-        raise StgaError(f"{where}: has {missing}")
+        raise StgaError(
+            f"{where}: has no calibration with f; align the cameras and export them again"
+        )
     kind = calibration.get("type") or sensor.get("type")
     if kind not in PROJECTIONS:
         raise StgaError(f"{where}: type {shorten(kind)} is not one of {', '.join(PROJECTIONS)}")
@@ -121,8 +122,10 @@ def _sensor(sensor: Element, where: str) -> tuple[Pair, float, Pair, Lens]:
         return numbers([calibration.findtext(name, "0")], f"{where}: {name}", 1)[0]
 
     if value("p3") or value("p4"):
-        unknown = "p3 and p4 are not supported"
-        raise StgaError(f"{where}: {unknown}; optimize the cameras without them and export again")
+        raise StgaError(
+            f"{where}: p3 and p4 are not supported; optimize the cameras without them and "
+            "export again"
+        )
     focal = value("f")
     if not 1 <= focal <= MAX_FOCAL_PIXELS:
         raise StgaError(f"{where}: f: expected a focal length of 1 to 1e7 pixels, not {focal:g}")

@@ -55,8 +55,9 @@ def _lens(record: Record) -> Lens:
     model = record.values.get("camera_model") or usual
     known = PERSPECTIVES + FISHEYE_MODELS
     if model not in known:
-        one = f"{shorten(model)} is not one of {', '.join(known)}"
-        raise StgaError(f"{record.where('camera_model')}: {one}")
+        raise StgaError(
+            f"{record.where('camera_model')}: {shorten(model)} is not one of {', '.join(known)}"
+        )
     if model in PINHOLES:
         return Lens()
     names = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")

@@ -130,11 +130,15 @@ def _calibrated(
         found: dict[str, Shot] = {}
         for shot, name in zip(shots, names, strict=True):
             if name is None:
-                missing = "has no folder or video of this camera, though it has of others"
-                raise StgaError(f"{shot.where}: {sources.root} {missing}")
+                raise StgaError(
+                    f"{shot.where}: {sources.root} has no folder or video of this camera, "
+                    "though it has of others"
+                )
             if name in found:
-                same = f"are both of camera {name}; expected different names"
-                raise StgaError(f"{shot.where}: and {found[name].where} {same}")
+                raise StgaError(
+                    f"{shot.where}: and {found[name].where} are both of camera {name}; "
+                    "expected different names"
+                )
             found[name] = shot
         files = {name: sequence_files(sources, name) for name in found}
         sequences = {name: open_sequence(own) for name, own in files.items()}
@@ -145,8 +149,9 @@ def _calibrated(
         footage = _rig(sources, found, sequences, frames)
         return replace(footage, warnings=(*footage.warnings, *_unused(sources, calibration, used)))
     if frames.offsets or frames.sync != "none":
-        lists = "lists images, which offsets do not apply to; expected none"
-        raise StgaError(f"{calibration}: {lists}")
+        raise StgaError(
+            f"{calibration}: lists images, which offsets do not apply to; expected none"
+        )
     fps = next((shot.fps for shot in shots if timed and shot.fps is not None), None)
     shots = shots if timed else _with_stills(shots, sources)
     unused = _unused(sources, calibration, [shot.image for shot in shots if shot.image is not None])
@@ -244,8 +249,9 @@ def _camera(name: str, shot: Shot, frames: Frames) -> FootageCamera:
     height = shot.camera.height
     for path, size in frames.sizes():
         if size != (width, height):
-            expected = f"but {shot.where} has {width} x {height}"
-            raise StgaError(f"{path}: has {size[0]} x {size[1]} pixels, {expected}")
+            raise StgaError(
+                f"{path}: has {size[0]} x {size[1]} pixels, but {shot.where} has {width} x {height}"
+            )
     found = undistortion(shot.camera, shot.lens, shot.where)
     return FootageCamera(name, shot.camera if found is None else found.camera, frames, found)
 
@@ -261,8 +267,9 @@ def _single_camera(sources: Sources, frames: FrameRange, focal: float | None) ->
             found = f"{len(names)} cameras ({listed(several)})"
         elif sources.unread:
             found += f" that are read (not {sources.unread[0].name})"
-        expected = f"expected {EXPECTED}, or one camera"
-        raise StgaError(f"{root}: has {found} and no calibration; {expected}")
+        raise StgaError(
+            f"{root}: has {found} and no calibration; expected {EXPECTED}, or one camera"
+        )
     sequence = open_sequence(sequence_files(sources, names[0]))
     known = "given"
     width, height = sequence_size(sequence)
@@ -300,8 +307,10 @@ def _with_stills(shots: Iterable[Shot], sources: Sources) -> list[Shot]:
     for shot in shots:
         other = poses.setdefault(_pose(shot), shot)
         if other is not shot:
-            expected = "expected a timestep_index, or one image of each camera"
-            raise StgaError(f"{shot.where}: has the pose of {other.label}; {expected}")
+            raise StgaError(
+                f"{shot.where}: has the pose of {other.label}; expected a timestep_index, or "
+                "one image of each camera"
+            )
         listed = shot.image if shot.image is not None and is_file(shot.image) else None
         image = listed or still_image(sources, shot.label, shot.where)
         inside = image.is_relative_to(sources.root)
@@ -335,16 +344,18 @@ def _listed_cameras(shots: list[Shot], calibration: Path) -> tuple[FootageCamera
     for name, group in zip(names, groups.values(), strict=True):
         unique = name if names.count(name) == 1 else f"{name} at timestep {group[0].timestep}"
         if unique in (camera.name for camera in cameras):
-            same = f"two cameras are named {unique}; expected different names"
-            raise StgaError(f"{group[0].where}: {same}")
+            raise StgaError(
+                f"{group[0].where}: two cameras are named {unique}; expected different names"
+            )
         views: dict[int, View] = {}
         for shot in sorted(group, key=lambda shot: shot.timestep or 0):
             timestep = shot.timestep or 0
             if shot.image is None:
                 raise StgaError(f"{shot.where}: names no image")
             if timestep in views and views[timestep].image != shot.image:
-                two = f"camera {unique} has two images at timestep {timestep}"
-                raise StgaError(f"{shot.where}: {two}")
+                raise StgaError(
+                    f"{shot.where}: camera {unique} has two images at timestep {timestep}"
+                )
             for path in filter(None, (shot.image, shot.mask)):
                 if not is_file(path):
                     raise StgaError(f"{path}: does not exist, but {shot.where} names it")

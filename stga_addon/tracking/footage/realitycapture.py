@@ -68,8 +68,10 @@ def read_realitycapture_csv(path: Path, image_size: ImageSize) -> Calibrated:
     columns = _columns(rows[first][1]) if rows else []
     missing = [name for name in REQUIRED_COLUMNS if name not in columns]
     if missing:
-        expected = "expected internal and external camera parameters"
-        raise StgaError(f"{path}: has no column {', '.join(missing)}; {expected}")
+        raise StgaError(
+            f"{path}: has no column {', '.join(missing)}; expected internal and external "
+            "camera parameters"
+        )
     shots = []
     for number, line in rows[first + 1 :]:
         where = f"{path}: line {number}"
@@ -150,9 +152,11 @@ def _xmp_shot(path: Path, label: str, fields: dict[str, str], size: tuple[int, i
     coefficients += [0.0] * (6 - len(coefficients))
     model = fields.get("DistortionModel", "perspective")
     if model not in XMP_MODELS and any(coefficients):
-        unknown = f"xcr:DistortionModel {shorten(model)} is not one of {', '.join(XMP_MODELS)}"
-        advice = "choose one of these in RealityCapture's alignment settings and export again"
-        raise StgaError(f"{path}: {unknown}; {advice}")
+        raise StgaError(
+            f"{path}: xcr:DistortionModel {shorten(model)} is not one of "
+            f"{', '.join(XMP_MODELS)}; choose one of these in RealityCapture's alignment "
+            "settings and export again"
+        )
     if "FocalLength35mm" not in fields:
         raise StgaError(f"{path}: xcr:FocalLength35mm is missing")
     scale = max(size)

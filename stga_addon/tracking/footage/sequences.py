@@ -47,8 +47,10 @@ class FrameRange:
     def __post_init__(self) -> None:
         if self.start < 0 or self.step < 1 or (self.stop is not None and self.stop <= self.start):
             stop = "the end" if self.stop is None else self.stop
-            none = f"Frames {self.start} to {stop} in steps of {self.step} are none"
-            raise StgaError(f"{none}; expected at least one")
+            raise StgaError(
+                f"Frames {self.start} to {stop} in steps of {self.step} are none; expected at "
+                "least one"
+            )
 
     def selects(self, timestep: int) -> bool:
         before_stop = self.stop is None or timestep < self.stop
@@ -86,8 +88,10 @@ def synchronized(
     if frames.sync != "none":
         videos = {name: own for name, own in sequences.items() if isinstance(own, Video)}
         if len(videos) < max(2, len(sequences)) or fps is None:
-            several = "a video of each of several cameras, whose clocks --sync compares"
-            raise StgaError(f"{sources.root}: expected {several}")
+            raise StgaError(
+                f"{sources.root}: expected a video of each of several cameras, whose clocks "
+                "--sync compares"
+            )
         found, sentences = clock_offsets(videos, fps, frames.sync)
         frames = replace(frames, offsets={**found, **frames.offsets})
     unknown = set(frames.offsets) - set(sequences)
@@ -126,8 +130,10 @@ def _frames_per_second(sequences: Mapping[str, Sequence]) -> float | None:
     first, usual = next(iter(rates.items()), ("", None))
     for name, rate in rates.items():
         if usual is not None and abs(rate - usual) > 0.01 * usual:
-            other = f"that of camera {first} {usual:g}; expected one rate"
-            raise StgaError(f"The video of camera {name} has {rate:g} frames a second, {other}")
+            raise StgaError(
+                f"The video of camera {name} has {rate:g} frames a second, that of camera "
+                f"{first} {usual:g}; expected one rate"
+            )
     return usual
 
 
@@ -147,8 +153,10 @@ def _common_range(
             raise StgaError(f"{has}; expected all up to {frames.stop} and its offset")
         if frames.stop is None and not frames.offsets and length != lengths[longest]:
             has += f" and camera {longest} {lengths[longest]}"
-            same = "recordings of the same length, offsets, or the number of the last frame"
-            raise StgaError(f"{has}; expected {same}")
+            raise StgaError(
+                f"{has}; expected recordings of the same length, offsets, or the number of the "
+                "last frame"
+            )
     first = max(0, *(-offset for offset in offsets.values()))
     return first, min(length - offsets[name] for name, length in lengths.items())
 
@@ -169,10 +177,11 @@ def _require_same_gaps(
         first = next(iter(patterns))
         for path, own, other in zip(paths, patterns[name], patterns[first], strict=True):
             if own != other:
-                here = f"is {own} frames after the first of camera {name}"
-                there = f"where camera {first} has one {other} after its first"
-                same = "expected no missing frames, or the same ones"
-                raise StgaError(f"{path}: {here}, {there}; {same}")
+                raise StgaError(
+                    f"{path}: is {own} frames after the first of camera {name}, where camera "
+                    f"{first} has one {other} after its first; expected no missing frames, or "
+                    "the same ones"
+                )
 
 
 def clock_offsets(
@@ -197,12 +206,16 @@ def clock_offsets(
         signal, begins = read(videos[name])
         lag, correlation, distinction = best_lag(reference, signal, rate)
         if correlation < MIN_CORRELATION or distinction < MIN_DISTINCTION:
-            silent = f"its {by} does not say when camera {first} recorded the same"
-            raise StgaError(f"{videos[name].path}: {silent}; give --offset")
+            raise StgaError(
+                f"{videos[name].path}: its {by} does not say when camera {first} recorded the "
+                "same; give --offset"
+            )
         offsets[name] = round((lag / rate + begins - start) * fps)
-        frames = f"{abs(offsets[name])} frames {'later' if offsets[name] >= 0 else 'earlier'}"
-        found = f"{frames} than that of camera {first}, by their {by}"
-        sentences.append(f"camera {name}: its recording is {found} (correlation {correlation:.2f})")
+        sentences.append(
+            f"camera {name}: its recording is {abs(offsets[name])} frames "
+            f"{'later' if offsets[name] >= 0 else 'earlier'} than that of camera {first}, by "
+            f"their {by} (correlation {correlation:.2f})"
+        )
     return offsets, tuple(sentences)
 
 

@@ -114,12 +114,15 @@ def undistortion(recorded: Camera, lens: Lens, where: str) -> Undistortion | Non
     try:
         import cv2  # noqa: F401
     except ImportError as error:
-        needed = "undistorting needs opencv-python-headless"
-        raise StgaError(f"{where}: its lens is distorted; {needed}") from error
+        raise StgaError(
+            f"{where}: its lens is distorted; undistorting needs opencv-python-headless"
+        ) from error
     low, high = ZOOM_RANGE
     if not _is_inside(recorded, lens, high):
-        folds = "the distortion of its lens folds the image"
-        raise StgaError(f"{where}: {folds}; expected coefficients of this camera")
+        raise StgaError(
+            f"{where}: the distortion of its lens folds the image; expected coefficients of "
+            "this camera"
+        )
     for _ in range(ZOOM_STEPS):
         middle = (low + high) / 2
         low, high = (low, middle) if _is_inside(recorded, lens, middle) else (middle, high)
@@ -227,8 +230,10 @@ def numbers(words: Iterable[str], where: str, count: int | None = None) -> list[
         values = [math.nan]
     if not all(math.isfinite(value) for value in values) or count not in (None, len(values)):
         some = "" if count is None else f"{count} "
-        expected = f"{some}finite number{'' if count == 1 else 's'}"
-        raise StgaError(f"{where}: expected {expected}, not {shorten(' '.join(words))}")
+        raise StgaError(
+            f"{where}: expected {some}finite number{'' if count == 1 else 's'}, not "
+            f"{shorten(' '.join(words))}"
+        )
     return values
 
 

@@ -94,8 +94,9 @@ def find_sources(root: Path, containers: Sequence[str] = CONTAINERS) -> Sources:
         names[:] = sorted(name for name in names if not name.startswith(".") and depth < MAX_DEPTH)
         count += len(files)
         if count > MAX_FILES:
-            many = f"more than {MAX_FILES} files; expected a folder of footage"
-            raise StgaError(f"{root}: holds {many}")
+            raise StgaError(
+                f"{root}: holds more than {MAX_FILES} files; expected a folder of footage"
+            )
         visible = (name for name in files if not name.startswith("."))
         for path in (Path(folder, name) for name in sorted(visible, key=natural_order)):
             key = sources.name_of(path)
@@ -166,11 +167,13 @@ def still_image(sources: Sources, label: str, where: str) -> Path:
     if not found and tails:
         found = sources.images_by_name.get(tails[-1], [])
     if not found:
-        missing = f"no image, folder or video of the name {shorten(label)}"
-        raise StgaError(f"{where}: {sources.root} has {missing}")
+        raise StgaError(
+            f"{where}: {sources.root} has no image, folder or video of the name {shorten(label)}"
+        )
     if len(found) > 1:
-        both = f"{found[0]} and {found[1]} are both named {shorten(label)}"
-        raise StgaError(f"{where}: {both}; expected one")
+        raise StgaError(
+            f"{where}: {found[0]} and {found[1]} are both named {shorten(label)}; expected one"
+        )
     return found[0]
 
 
@@ -180,8 +183,10 @@ def sequence_files(sources: Sources, name: str) -> Path | list[Path]:
     images = sources.folders.get(name, [])
     if len(videos) > 1 or (videos and images):
         other = videos[1] if len(videos) > 1 else images[0].parent
-        both = f"{videos[0]} and {other} are both named {shorten(name)}"
-        raise StgaError(f"{both}; expected one video or folder a camera")
+        raise StgaError(
+            f"{videos[0]} and {other} are both named {shorten(name)}; expected one video or "
+            "folder a camera"
+        )
     return videos[0] if videos else images
 
 

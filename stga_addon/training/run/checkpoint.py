@@ -78,8 +78,10 @@ def read_selection(folder: Path, faces: int, identity: str | None = None) -> dic
     for name, mask in arrays.items():
         named = re.fullmatch(r"\d{1,18}", name, re.ASCII)
         if not named or mask.dtype != bool or mask.shape != (faces,):
-            expected = f"expected bool ({faces},) by timestep"
-            raise StgaError(f"{path}: '{name}' is {mask.dtype} {mask.shape}, {expected}")
+            raise StgaError(
+                f"{path}: '{name}' is {mask.dtype} {mask.shape}, expected bool ({faces},) by "
+                "timestep"
+            )
     return {int(name): mask for name, mask in arrays.items()}
 
 
@@ -186,8 +188,9 @@ def _check_state(path: Path, state: TrainState) -> None:
     for field, kind in ARRAYS.items():
         size = getattr(state.parameters, field).shape[1] if kind.sizes else 0
         if kind.sizes and size not in kind.sizes:
-            text = f"parameters/{field} has {size} coefficients, expected one of {kind.sizes}"
-            raise StgaError(f"{path}: {text}")
+            raise StgaError(
+                f"{path}: parameters/{field} has {size} coefficients, expected one of {kind.sizes}"
+            )
         tails[field] = tuple(size if axis < 0 else axis for axis in kind.shape)
     whole = {"steps": "int32", "face": "int32", "unbound": "bool"}
     for name, array in arrays_of(state).items():
@@ -260,8 +263,9 @@ def strain_range_of(folder: Path, capture: Capture, run: Run) -> np.ndarray | No
     shape = len(capture.faces), *TRAINED_RANGE.shape
     check_array(path, "strain_range", found, "float32", shape)
     if not _is_trained_range(found):
-        text = "is not within the range that is trained; remove it"
-        raise StgaError(f"{path}: 'strain_range' {text}")
+        raise StgaError(
+            f"{path}: 'strain_range' is not within the range that is trained; remove it"
+        )
     return found
 
 

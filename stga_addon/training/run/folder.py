@@ -68,8 +68,9 @@ class Continuation:
     def check(self) -> None:
         """Raise StgaError where there is no timestep from first to last."""
         if self.first > self.last:
-            text = f"its last timestep {self.last} is before its first, {self.first}"
-            raise StgaError(f"continuation: {text}")
+            raise StgaError(
+                f"continuation: its last timestep {self.last} is before its first, {self.first}"
+            )
 
     def includes(self, timestep: int) -> bool:
         return self.first <= timestep <= self.last
@@ -194,8 +195,10 @@ def open_run(
     """
     run = read_run(folder)
     if principal_point not in (None, run.principal_point):
-        trained = f"was trained with principal point '{run.principal_point}'"
-        raise StgaError(f"{folder}: {trained}, not '{principal_point}'")
+        raise StgaError(
+            f"{folder}: was trained with principal point '{run.principal_point}', not "
+            f"'{principal_point}'"
+        )
     flame = run.flame if flame is None else flame.resolve()
     first = open_capture(run.capture if capture is None else capture, flame, run.principal_point)
     run = replace(run, capture=first.root, flame=flame)
@@ -205,8 +208,10 @@ def open_run(
         given = identity_of(takes[-1], run.principal_point, run.settings)
         changed = difference(take.identity, given)
         if changed is not None:
-            text = f"{take.capture} ({take.identity.summary}), but it now {changed}"
-            raise StgaError(f"{folder}: was extended with {text}")
+            raise StgaError(
+                f"{folder}: was extended with {take.capture} ({take.identity.summary}), but it "
+                f"now {changed}"
+            )
     opened = join_takes(takes)
     check_identity(folder, run, opened)
     if run.continuation is not None:  # it was trained on the meshes that the run before has refined
@@ -271,11 +276,14 @@ def device_of(run: Run, requested: str = "auto") -> tuple[str, str]:
     except StgaError as error:
         if requested != "auto":
             raise
-        advice = "give --device cpu to continue on the CPU"
-        raise StgaError(f"this run was trained on {trained_on}: {error}; {advice}") from error
+        raise StgaError(
+            f"this run was trained on {trained_on}: {error}; give --device cpu to continue on "
+            "the CPU"
+        ) from error
     if run.settings.tracking and device != "cpu":
-        text = "this run refines the tracking, which works on the CPU only"
-        raise StgaError(f"--device {requested}: {text}")
+        raise StgaError(
+            f"--device {requested}: this run refines the tracking, which works on the CPU only"
+        )
     return device, reason
 
 
@@ -353,6 +361,7 @@ def read_residuals(folder: Path, faces: int) -> np.ndarray:
     path = folder / RESIDUALS
     found = read_npz(path).get("residual", np.zeros(0))
     if found.dtype != np.float32 or found.shape != (faces,):
-        text = f"expected 'residual', float32 {(faces,)}, found {found.dtype} {found.shape}"
-        raise StgaError(f"{path}: {text}")
+        raise StgaError(
+            f"{path}: expected 'residual', float32 {(faces,)}, found {found.dtype} {found.shape}"
+        )
     return found

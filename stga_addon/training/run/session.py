@@ -121,8 +121,9 @@ def train_run(
     if not capture.views.get("train"):
         raise StgaError(f"{capture.root}: has no training views, so there is nothing to train on")
     if run.settings.target_psnr is not None and not capture.views.get("val"):
-        text = f"{capture.root} has no held-out views (split 'val') to measure it on"
-        raise StgaError(f"--target-psnr: {text}")
+        raise StgaError(
+            f"--target-psnr: {capture.root} has no held-out views (split 'val') to measure it on"
+        )
     if out.resolve() == capture.root:
         raise StgaError(f"{out}: is the folder of the capture; train into another one")
     with folders.locked(out):
@@ -654,8 +655,9 @@ def _resume(capture: Capture, folder: Path, run: Run, report: Report) -> _Sessio
     if tracking is not None:
         wanted = tracking.parameters.shape
     if wanted != (None if refined is None else refined.shape):
-        text = "its checkpoint's refined tracking does not fit the capture or the settings"
-        raise StgaError(f"{folder}: {text}")
+        raise StgaError(
+            f"{folder}: its checkpoint's refined tracking does not fit the capture or the settings"
+        )
     trainer.iteration = found.iteration
     trainer.visit = found.visit
     trainer.last_timestep = found.last_timestep
@@ -712,8 +714,9 @@ def _asked_interval_s() -> float | None:
     with suppress(ValueError):
         if not text or 0 <= float(text) < math.inf:
             return float(text) if text else None
-    expected = "expected seconds between checkpoints"
-    raise StgaError(f"{CHECKPOINT_VARIABLE}: {expected}, got {shorten(text)}")
+    raise StgaError(
+        f"{CHECKPOINT_VARIABLE}: expected seconds between checkpoints, got {shorten(text)}"
+    )
 
 
 @contextmanager
