@@ -2,12 +2,12 @@
 
 import math
 import os
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from time import perf_counter
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -23,6 +23,11 @@ from ..training.run.folder import AVATAR
 from ..worker.helpers import Helpers
 from ..worker.lock import hold_folder
 from .train import AFTER_S, Train, resumed, train_and_finish
+
+if TYPE_CHECKING:
+    from ..tracking.footage.model import Footage
+    from ..tracking.opened import TrackingOptions
+    from ..tracking.track import TrackingReport
 
 WORLDS = {
     "auto": "the cameras' own where they were exported from a Blender scene, else head",
@@ -158,7 +163,9 @@ class MakeAvatar:
         return self.track.out.parent
 
     def check(self) -> None:
-        """Raise StgaError where the two do not belong together."""
+        """Raise StgaError where the two do not belong together, or an avatar is there already."""
+        if self.track.avatar is not None:
+            raise StgaError("avatar: an avatar of its own is made; expected none to track by")
         wanted = self.out / CAPTURE_FOLDER, self.out / CAPTURE_FOLDER, self.out / RUN_FOLDER
         if (self.track.out, self.train.capture, self.train.run) != wanted:
             raise StgaError(
@@ -202,58 +209,76 @@ def track(request: Track, report: Report, say: Say) -> Written:
     """Track the head into a capture; cancelled, the same request continues. Raises StgaError, also
     while another process writes the capture."""
     with hold_folder(request.out, LOCK_FILE, WRITER):
-        return _track_held(request, report, say)
+        if request.avatar is None:
+            return _track_head(request, report)
+        return _track_by_avatar(request, request.avatar, report)
 
 
-def _track_held(request: Track, report: Report, say: Say) -> Written:
+def _track_head(request: Track, report: Report) -> Written:
+    from ..tracking.track import track as track_footage
+
+    steps = _Steps(report)
+    footage = _open(request, steps)
+    options = _options(request)
+    found = track_footage(footage, request.model, request.out, options, steps.report, steps.show)
+    return _written(request.out, found, report)
+
+
+def _track_by_avatar(request: Track, run: Path, report: Report) -> Written:
+    """A run's avatar in place of a head model: it is posed such that it looks like the images."""
     from ..tracking.correct import report_errors
-    from ..tracking.footage.open import open_footage
-    from ..tracking.footage.sequences import FrameRange
-    from ..tracking.opened import TrackingOptions
     from ..tracking.track import end_tracking
     from ..tracking.track import track as track_footage
     from ..training.run.recording import avatar_person, track_recording
 
-    steps = _Steps(report, 1.0 if request.avatar is None else TRACKING_SHARE)
+    steps = _Steps(report, TRACKING_SHARE)
     out = request.out
+    footage = _open(request, steps)
+    person, model = avatar_person(run)
+    options = replace(_options(request), person=person)
+    found = track_footage(footage, model, out, options, steps.report, steps.show)
+    keeps_world = footage.keeps(request.world)
+    report_avatar = partial(steps.report, Stage.AVATAR)
+    with Helpers(folder=out / KEPT_FOLDER) as helpers:
+        tracked = track_recording(run, out, helpers, report_avatar, keeps_world)
+    found = replace(found, median_px=report_errors(out, model))
+    end_tracking(out)
+    share = float(np.median(tracked.misfit))
+    lines = [f"avatar: does not explain {share:.0%} of the head's pixels (median)"]
+    if share > MAX_MISFIT:
+        lines.append("warning: the avatar does not look like the person of this footage")
+    return _written(out, found, report, lines)
+
+
+def _open(request: Track, steps: "_Steps") -> "Footage":
+    from ..tracking.footage.open import open_footage
+    from ..tracking.footage.sequences import FrameRange
+
     steps.report(Stage.OPENING, 0, 1)
     offset = dict(request.offset or {})
     frames = FrameRange(request.start, request.stop, request.step, offset, request.sync)
-    given = None if request.mattes in MATTES else Path(request.mattes)
-    footage = open_footage(request.footage, request.cameras, frames, request.focal, mattes=given)
-    person = None
-    model = request.model
-    if request.avatar is not None:
-        person, model = avatar_person(request.avatar)
-    options = TrackingOptions(
-        request.landmarks, request.meshes, request.world, request.mattes == "auto", person
-    )
-    found = track_footage(footage, model, out, options, steps.report, steps.show)
+    mattes = None if request.mattes in MATTES else Path(request.mattes)
+    return open_footage(request.footage, request.cameras, frames, request.focal, mattes=mattes)
+
+
+def _options(request: Track) -> "TrackingOptions":
+    from ..tracking.opened import TrackingOptions
+
+    makes_mattes = request.mattes == "auto"
+    return TrackingOptions(request.landmarks, request.meshes, request.world, makes_mattes)
+
+
+def _written(
+    out: Path, found: "TrackingReport", report: Report, told: Sequence[str] = ()
+) -> Written:
     lines = [f"warning: {warning}" for warning in found.warnings]
-    pixels = found.median_px
     if found.focal_px is not None:
         lines.append(f"focal length: {found.focal_px:.0f} px, {FOCAL_SOURCES[found.focal]}")
     if found.torso is not None:
         lines.append(f"torso: {found.torso.description}")
-    if request.avatar is not None:
-        with Helpers(folder=out / KEPT_FOLDER) as helpers:
-            tracked = track_recording(
-                request.avatar,
-                out,
-                helpers,
-                partial(steps.report, Stage.AVATAR),
-                footage.keeps(request.world),
-            )
-        pixels = report_errors(out, model)
-        end_tracking(out)
-        share = float(np.median(tracked.misfit))
-        lines.append(f"avatar: does not explain {share:.0%} of the head's pixels (median)")
-        if share > MAX_MISFIT:
-            lines.append("warning: the avatar does not look like the person of this footage")
-    lines.append(
-        f"reprojection error: {pixels:.2f} px (median); by camera and timestep in tracking.json"
-    )
-    report(Progress(1.0, "Tracked", f"Reprojection error {pixels:.1f} px (median)"))
+    error = f"{found.median_px:.2f} px (median)"
+    report(Progress(1.0, "Tracked", f"Reprojection error {error}"))
+    lines += [*told, f"reprojection error: {error}; by camera and timestep in tracking.json"]
     return Written(out, (*lines, f"capture: {out}"))
 
 
@@ -348,8 +373,9 @@ def _track(request: Track, report: Report, say: Say) -> None:
     new = not out.exists()
     write_json(out / INPUTS, _inputs(request))
     try:
-        for line in track(request, report, say).lines:
-            say(line)
+        with hold_folder(request.out, LOCK_FILE, WRITER):
+            for line in _track_head(request, report).lines:
+                say(line)
     except (StgaError, OSError):
         if not request.out.exists():  # nothing was tracked yet, so that the inputs may be mended
             (out / INPUTS).unlink()

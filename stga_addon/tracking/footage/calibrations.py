@@ -2,11 +2,12 @@
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import NamedTuple
 
 from ...capture.transforms import WHOLE_FILE, transforms_files
 from ...errors import StgaError
-from ...files import decoded_text, is_file, is_folder
-from .colmap import colmap_models, incomplete_models, model_suffix, read_colmap
+from ...files import decoded_text, is_file, is_folder, matching
+from .colmap import colmap_models, incomplete_models, read_colmap
 from .metashape import is_metashape, read_metashape
 from .nerfstudio import is_transforms, read_nerfstudio
 from .realitycapture import (
@@ -15,7 +16,7 @@ from .realitycapture import (
     read_realitycapture_csv,
     read_realitycapture_xmp,
 )
-from .shots import Calibrated, ImageSize, Shot, listed
+from .shots import Calibrated, ImageSize, listed
 
 EXPECTED = (
     "transforms.json, a COLMAP model (sparse/0), Metashape's cameras.xml, "
@@ -36,34 +37,104 @@ UNREAD_MARKS: dict[str, tuple[str, ...]] = {
     ".yaml": ("camera_matrix",),
     ".xml": ("<opencv_storage", "<BlocksExchange", "<calibration", "<camera"),
     ".json": tuple(f'"{word}"' for word in (*OF_JSON, "img_name", "camera_angle_x")),
-    ".csv": (),
 }
 """Suffix -> words in the beginning of calibrations that are not read."""
+
+
+class Program(NamedTuple):
+    """Whose calibrations are read.
+
+    find      those in a folder, files or folders that stand for several, the best first
+    read      shots of one of them, and sentences about what it lists and is left out
+    suffixes  of the files that it reads wherever they are
+    """
+
+    find: Callable[[Path], list[Path]]
+    read: Callable[[Path, ImageSize], Calibrated]
+    suffixes: tuple[str, ...] = ()
+
+
+def _transforms(root: Path) -> list[Path]:
+    files = transforms_files(root)
+    return [files[0] if files[0].name == WHOLE_FILE else root] if files else []
+
+
+def _read_transforms(path: Path, _: ImageSize) -> Calibrated:
+    parts = [read_nerfstudio(own) for own in (transforms_files(path) or [path])]
+    return [shot for shots, _ in parts for shot in shots], sum((told for _, told in parts), ())
+
+
+def _exports(suffix: str, is_one: Callable[[Path], bool]) -> Callable[[Path], list[Path]]:
+    """What finds the files of any name that are a program's."""
+    return lambda root: [
+        path for path in _files(root) if path.suffix.lower() == suffix and is_one(path)
+    ]
+
+
+def _files(root: Path) -> list[Path]:
+    return [path for path in matching(root, "[!.]*") if is_file(path)]
+
+
+def _head(path: Path) -> str:
+    with path.open("rb") as stream:
+        return decoded_text(stream.read(HEAD_BYTES), "replace")
+
+
+def _xmp_files(root: Path) -> list[Path]:
+    """RealityCapture's XMP files of a folder and those in it, of the images beside them."""
+    files = (path for pattern in ("*.xmp", "*/*.xmp", "*/*/*.xmp") for path in root.glob(pattern))
+    return sorted(path for path in files if is_file(path) and is_xmp(path))
+
+
+def _xmp_folder(root: Path) -> list[Path]:
+    files = _xmp_files(root)
+    above = [files[0].parent, *files[0].parents] if files else []
+    return [own for own in above if all(path.is_relative_to(own) for path in files)][:1]
+
+
+def _read_xmp(path: Path, image_size: ImageSize) -> Calibrated:
+    if is_file(path):
+        return read_realitycapture_xmp([path], image_size, path.parent)
+    return read_realitycapture_xmp(_xmp_files(path), image_size, path)
+
+
+PROGRAMS = (
+    Program(_transforms, _read_transforms, (".json",)),
+    Program(colmap_models, lambda path, _: read_colmap(path), (".bin", ".txt")),
+    Program(
+        _exports(
+            ".json", lambda path: is_transforms(path) and path not in transforms_files(path.parent)
+        ),
+        _read_transforms,
+    ),
+    Program(
+        _exports(".xml", lambda path: is_metashape(_head(path))),
+        lambda path, _: read_metashape(path),
+        (".xml",),
+    ),
+    Program(
+        _exports(".csv", lambda path: is_table_of_cameras(_head(path))),
+        read_realitycapture_csv,
+        (".csv",),
+    ),
+    Program(_xmp_folder, _read_xmp, (".xmp",)),
+)
+"""In the order in which the calibration of a folder is looked for."""
 
 
 def find_calibration(root: Path) -> tuple[Path | None, tuple[str, ...]]:
     """The calibration of a folder, None without, and a sentence about others that it holds.
 
-    It is the first of: transforms files, the COLMAP model of most images, Metashape,
-    RealityCapture's CSV and XMP. A folder stands for transforms_train.json and its like, for a
-    COLMAP model or for XMP files. Raises StgaError for two files, and where there is none but a
-    file that looks like one.
+    It is the first that one of PROGRAMS finds: of COLMAP the model of most images. A folder stands
+    for transforms_train.json and its like, for a COLMAP model or for XMP files. Raises StgaError
+    for two files, and where there is none but a file that looks like one.
     """
-    transforms = transforms_files(root)
-    found = [transforms[0] if transforms[0].name == WHOLE_FILE else root] if transforms else []
-    found += colmap_models(root)
-    visible = sorted(path for path in root.iterdir() if not path.name.startswith("."))
-    listed_files = [path for path in visible if _may_be_one(path) and path not in transforms]
-    heads = {path: _head(path) for path in listed_files}
-    files = [path for path, head in heads.items() if _is_read(path, head)]
-    if len(files) > 1 and not found:
-        raise StgaError(f"{root}: {files[0].name} and {files[1].name} are calibrations; choose one")
-    found += files
-    names = [own.relative_to(root).as_posix() for own in found]
-    if xmp := xmp_files(root):
-        found.append(_common_folder(xmp))
-        names.append(f"{xmp[0].relative_to(root).as_posix()} and its like")
-    others = [path for path, head in heads.items() if path not in files and _is_unread(path, head)]
+    found = [own for program in PROGRAMS for own in program.find(root)]
+    files = [own.name for own in found if is_file(own)]
+    if len(files) > 1 and found[0].name in files and files[0] != WHOLE_FILE:
+        raise StgaError(f"{root}: {files[0]} and {files[1]} are calibrations; choose one")
+    named = transforms_files(root)
+    others = [path for path in _files(root) if path not in (*found, *named) and _is_unread(path)]
     others += incomplete_models(root)
     if not found:
         if others:
@@ -72,93 +143,38 @@ def find_calibration(root: Path) -> tuple[Path | None, tuple[str, ...]]:
                 f"{EXPECTED}, or none in the folder"
             )
         return None, ()
-    names += [path.relative_to(root).as_posix() for path in others]
-    unused = (f"{found[0]}: is the calibration; not used: {listed(names[1:])}",)
-    return found[0], unused if len(names) > 1 else ()
+    unused = [own.relative_to(root).as_posix() for own in (*found[1:], *others) if own != root]
+    unused += ["*.xmp"] if root in found[1:] else []
+    told = f"{found[0]}: is the calibration; not used: {listed(unused)}"
+    return found[0], (told,) if unused else ()
 
 
 def read_calibration(path: Path, image_size: ImageSize) -> Calibrated:
     """Shots of a calibration file or folder, and sentences about what it lists and is left out.
     image_size: size of the images of a label, which RealityCapture does not write. Raises StgaError
     that names file and field."""
-    read: Callable[[Path], Calibrated] | None
-    suffix = path.suffix.lower()
-    parts = [path]
     if is_folder(path):
-        splits = transforms_files(path)
-        xmp = xmp_files(path)
-        if splits:
-            read = read_nerfstudio
-            parts = splits
-        elif model_suffix(path):
-            read = read_colmap
-        elif xmp and _common_folder(xmp) == path:
-            read = _xmp_reader(xmp, image_size)
-        else:
+        chosen = [program for program in PROGRAMS if path in program.find(path)]
+        if not chosen:
             inside, unused = find_calibration(path)
-            if inside is None or inside == path:
+            if inside is None:
                 raise StgaError(f"{path}: holds no calibration; expected {EXPECTED}")
-            shots, more = read_calibration(inside, image_size)
-            return shots, (*unused, *more)
+            shots, told = read_calibration(inside, image_size)
+            return shots, (*unused, *told)
     elif not is_file(path):
         raise StgaError(f"{path}: does not exist; expected {EXPECTED}")
-    elif suffix in (".bin", ".txt") and model_suffix(path.parent):
-        read = read_colmap
-        parts = [path.parent]
     else:
-        read = {
-            ".json": read_nerfstudio,
-            ".xml": read_metashape,
-            ".csv": lambda own: read_realitycapture_csv(own, image_size),
-            ".xmp": _xmp_reader([path], image_size),
-        }.get(suffix)
-        if read is None:
+        chosen = [program for program in PROGRAMS if path.suffix.lower() in program.suffixes]
+        if not chosen:
             raise StgaError(f"{path}: is no calibration; expected {EXPECTED}")
-    shots = list[Shot]()
-    sentences = list[str]()
-    for part in parts:
-        own, told = read(part)
-        shots += own
-        sentences += [f"{part}: {sentence}" for sentence in told]
+    shots, told = chosen[0].read(path, image_size)
     if not shots:
         raise StgaError(f"{path}: has no camera with a pose")
-    return shots, tuple(sentences)
+    return shots, tuple(f"{path}: {sentence}" for sentence in told)
 
 
-def xmp_files(root: Path) -> list[Path]:
-    """RealityCapture's XMP files of a folder and those in it, of the images beside them."""
-    files = (path for pattern in ("*.xmp", "*/*.xmp", "*/*/*.xmp") for path in root.glob(pattern))
-    return sorted(path for path in files if is_file(path) and is_xmp(path))
-
-
-def _xmp_reader(paths: list[Path], image_size: ImageSize) -> Callable[[Path], Calibrated]:
-    folder = _common_folder(paths)
-    return lambda _: read_realitycapture_xmp(paths, image_size, folder)
-
-
-def _common_folder(paths: list[Path]) -> Path:
-    first = paths[0].parent
-    return next(own for own in (first, *first.parents) if all(p.is_relative_to(own) for p in paths))
-
-
-def _may_be_one(path: Path) -> bool:
-    name = path.name.lower()
-    return is_file(path) and (path.suffix.lower() in UNREAD_MARKS or name in UNREAD_NAMES)
-
-
-def _head(path: Path) -> str:
-    with path.open("rb") as stream:
-        return decoded_text(stream.read(HEAD_BYTES), "replace")
-
-
-def _is_read(path: Path, head: str) -> bool:
-    """Whether a file is a calibration by its beginning, of a name that is not looked for."""
-    suffix = path.suffix.lower()
-    if suffix == ".csv":
-        return is_table_of_cameras(head)
-    return (suffix == ".xml" and is_metashape(head)) or (suffix == ".json" and is_transforms(path))
-
-
-def _is_unread(path: Path, head: str) -> bool:
+def _is_unread(path: Path) -> bool:
+    """Whether a file looks like a calibration of another program."""
     marks = UNREAD_MARKS.get(path.suffix.lower(), ())
-    return path.name.lower() in UNREAD_NAMES or any(mark in head for mark in marks)
+    is_named = path.name.lower() in UNREAD_NAMES
+    return is_named or (bool(marks) and any(mark in _head(path) for mark in marks))
