@@ -4,6 +4,7 @@ import codecs
 import csv
 import ctypes
 import errno
+import hashlib
 import json
 import math
 import os
@@ -456,12 +457,29 @@ def read_json(path: Path) -> Any:
     return _parsed(path, "JSON", MAX_JSON_BYTES, parse_json)
 
 
+def read_document(path: Path, kind: str, form: str, version: int) -> dict[str, Any]:
+    """What `write_document` wrote. Raises StgaError for another format or version."""
+    values = read_json(path)
+    if not isinstance(values, dict) or values.pop("format", None) != form:
+        raise StgaError(f"{path}: is not a {kind} of this add-on (format is not '{form}')")
+    check_version(path, kind, values.pop("version", None), version)
+    return values
+
+
+def write_document(path: Path, form: str, version: int, values: Mapping[str, Any]) -> None:
+    """Raises StgaError on a full disk."""
+    write_json(path, {"format": form, "version": version, **values})
+
+
+def file_digest(path: Path) -> str:
+    """SHA-256 of a file. Raises StgaError where it cannot be read."""
+    with naming(path, "read"), path.open("rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()
+
+
 def read_toml(path: Path) -> dict[str, Any]:
     """Parse a TOML file of up to 16 MiB. Raises StgaError naming the file."""
-    found: dict[str, Any] = _parsed(
-        path, "TOML", MAX_TOML_BYTES, lambda data: tomllib.loads(data.decode("utf-8"))
-    )
-    return found
+    return _parsed(path, "TOML", MAX_TOML_BYTES, lambda data: tomllib.loads(data.decode("utf-8")))
 
 
 def _parsed(path: Path, form: str, limit: int, parse: Callable[[bytes], Any]) -> Any:

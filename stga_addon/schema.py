@@ -183,13 +183,16 @@ def _joined(name: str, part: str) -> str:
 
 
 def from_json(
-    kind: Any, values: Any, where: str = "", arrays: Mapping[str, np.ndarray] | None = None
+    kind: Any, values: Any, source: object = "", arrays: Mapping[str, np.ndarray] | None = None
 ) -> Any:
     """A dataclass (or one of several: a union) from plain values of JSON and the arrays beside
-    them. Raises StgaError naming the field, after `where`, unless each object has exactly the
+    them. Raises StgaError naming the field, after `source`, unless each object has exactly the
     fields of its dataclass and `validate` allows them."""
-    value = _parsed(kind, values, where, arrays or {})
-    validate(value)
+    try:
+        value = _parsed(kind, values, "", arrays or {})
+        validate(value)
+    except StgaError as error:
+        raise StgaError(f"{source}: {error}" if source else str(error)) from error
     return value
 
 

@@ -148,19 +148,19 @@ def test_limits():
 
 
 OTHER_FORMS: list[tuple[dict[str, Any], str]] = [
-    ({"frames": {"x": {}}}, "setting d.frames: expected whole numbers as names, got 'x'"),
-    ({"frames": {"1": {"side": 1}}}, "d.frames.1: fields are missing or unknown (points)"),
-    ({"main": {"side": 1, "points": None}}, f"setting d.main.kind: {KINDS}, got None"),
-    ({"main": {"kind": "Cube"}}, f"setting d.main.kind: {KINDS}, got 'Cube'"),
-    ({"main": {"kind": "Circle", "side": 1}}, "d.main: fields are missing or unknown (radius, si"),
-    ({"main": None}, f"setting d.main.kind: {KINDS}, got None"),
-    ({"others": [{"kind": "Circle"}]}, "d.others.0: fields are missing or unknown (radius)"),
-    ({"last": 3}, "d.last: fields are missing or unknown (points, side)"),
+    ({"frames": {"x": {}}}, "d: setting frames: expected whole numbers as names, got 'x'"),
+    ({"frames": {"1": {"side": 1}}}, "d: frames.1: fields are missing or unknown (points)"),
+    ({"main": {"side": 1, "points": None}}, f"d: setting main.kind: {KINDS}, got None"),
+    ({"main": {"kind": "Cube"}}, f"d: setting main.kind: {KINDS}, got 'Cube'"),
+    ({"main": {"kind": "Circle", "side": 1}}, "d: main: fields are missing or unknown (radius, si"),
+    ({"main": None}, f"d: setting main.kind: {KINDS}, got None"),
+    ({"others": [{"kind": "Circle"}]}, "d: others.0: fields are missing or unknown (radius)"),
+    ({"last": 3}, "d: last: fields are missing or unknown (points, side)"),
     (
         {"last": {"side": 1, "points": {"array": "nowhere"}, "more": 1}},
-        "d.last: fields are missing or unknown (more)",
+        "d: last: fields are missing or unknown (more)",
     ),
-    ({"last": {"side": 0, "points": None}}, f"setting last.side: {SIDE}, got 0"),
+    ({"last": {"side": 0, "points": None}}, f"d: setting last.side: {SIDE}, got 0"),
     ({"more": 1}, "d: fields are missing or unknown (more)"),
 ]
 

@@ -267,7 +267,7 @@ def read_head(folder: Path) -> OpenHead:
     """The head that `write_head` wrote. Raises StgaError where there is none or it is damaged."""
     path = folder / HEAD
     try:
-        stored: _Stored = from_json(_Stored, read_json(path), arrays=read_npz(folder / ARRAYS))
+        stored: _Stored = from_json(_Stored, read_json(path), "", read_npz(folder / ARRAYS))
     except StgaError as error:
         raise StgaError(f"{path}: is not the head of an open .blend file ({error})") from error
     given = {**vars(stored), "played": lambda: stored.played or Played({})}

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import StgaError, telling_refusals
-from ..files import read_json, read_npz, write_json, write_npz
+from ..files import read_document, read_npz, write_document, write_npz
 from ..options import refuse_useless
 from ..progress import Cancelled, Progress, Report, Say, ignore
 from ..schema import Arrays, from_json, to_json, validate
@@ -50,8 +50,7 @@ def read_request(folder: Path) -> Request:
     """Raises StgaError where the folder holds no request, or a damaged one."""
     if not has_request(folder):
         raise StgaError(f"{folder}: holds no request ({REQUEST} is missing)")
-    request: Request = _read(folder / REQUEST, request_hint())
-    return request
+    return _read(folder / REQUEST, request_hint())
 
 
 def has_request(folder: Path) -> bool:
@@ -72,8 +71,7 @@ def write_result(folder: Path, result: Result) -> None:
 
 def read_result(folder: Path) -> Result:
     """Raises StgaError where the folder holds no result, or a damaged one."""
-    result: Result = _read(folder / RESULT, Result)
-    return result
+    return _read(folder / RESULT, Result)
 
 
 def _write(path: Path, value: Any, kinds: Any) -> None:
@@ -81,23 +79,14 @@ def _write(path: Path, value: Any, kinds: Any) -> None:
     values = to_json(value, arrays, kinds)
     if arrays:
         write_npz(path.with_suffix(".npz"), arrays, compressed=True)
-    write_json(path, {"format": FORMAT, "version": VERSION, **values})
+    write_document(path, FORMAT, VERSION, values)
 
 
 def _read(path: Path, kinds: Any) -> Any:
-    values = read_json(path)
-    named = isinstance(values, dict) and (values.pop("format", 0), values.pop("version", 0))
-    if named != (FORMAT, VERSION):
-        raise StgaError(
-            f"{path}: is not a request that this version reads (format '{FORMAT}', version "
-            f"{VERSION})"
-        )
+    values = read_document(path, "request", FORMAT, VERSION)
     arrays_path = path.with_suffix(".npz")
     arrays = read_npz(arrays_path) if os.path.exists(arrays_path) else {}
-    try:
-        return from_json(kinds, values, arrays=arrays)
-    except StgaError as error:
-        raise StgaError(f"{path}: {error}") from error
+    return from_json(kinds, values, path, arrays)
 
 
 def perform(request: Request, report: Report = ignore, say: Say = print) -> Result:

@@ -16,6 +16,7 @@ from ..capture.open import open_capture
 from ..capture.transforms import DEFAULT_PRINCIPAL_POINT, PRINCIPAL_POINTS
 from ..errors import StgaError
 from ..export.ply import write_ply
+from ..files import file_digest
 from ..format import format_table
 from ..options import like, option
 from ..progress import Cancelled, Progress, Report, Say, Written
@@ -25,7 +26,7 @@ from ..schema import setting
 from ..training.effect_catalog import RELIGHT, WORLD
 from ..training.run import folder as run_folder
 from ..training.run.folder import AVATAR, Continuation, OpenedRun, Run
-from ..training.run.identity import file_digest, identity_of
+from ..training.run.identity import identity_of
 from ..training.settings import MAX_GROWTH, TrainingSettings, with_budget
 
 MAX_NAMED_VIEWS = 6  # Views that a warning names

@@ -133,13 +133,10 @@ def read_lighting(path: Path) -> Lighting:
             f"{path}: expected light as an environment (.hdr) or a list of lights (.toml)"
         )
     values = read_toml(path)
-    try:
-        entries = values.get("lights", [])
-        if isinstance(entries, list):
-            values["lights"] = [_completed(LightEntry, entry) for entry in entries]
-        found: LightFile = from_json(LightFile, _completed(LightFile, values))
-    except StgaError as error:
-        raise StgaError(f"{path}: {error}") from error
+    entries = values.get("lights", [])
+    if isinstance(entries, list):
+        values["lights"] = [_completed(LightEntry, entry) for entry in entries]
+    found: LightFile = from_json(LightFile, _completed(LightFile, values), path)
     lights = []
     for entry in found.lights:
         own = {**vars(entry), "color": entry.strength * np.array(entry.color)}

@@ -110,6 +110,11 @@ class TorsoMotion:
     shift_mm: float = setting(0.0, minimum=0)
     bend_mm: float = setting(0.0, minimum=0)
 
+    def check(self) -> None:
+        """Raise StgaError where a motion's misfit is missing."""
+        if set(self.misfit) != set(MOTIONS):
+            raise StgaError(f"misfit: expected {', '.join(MOTIONS)}")
+
     @property
     def description(self) -> str:
         """A clause with the figures that decided."""
@@ -134,16 +139,10 @@ def read_torso_motion(capture: Path) -> TorsoMotion | None:
     found = report.get(TORSO_KEY) if isinstance(report, dict) else None
     if found is None:
         return None
-    try:
-        if isinstance(found, dict):
-            # of a capture that was tracked before there were any
-            found = {"shift_mm": 0.0, "bend_mm": 0.0, **found}
-        motion: TorsoMotion = from_json(TorsoMotion, found)
-        if set(motion.misfit) != set(MOTIONS):
-            raise StgaError(f"misfit: expected {', '.join(MOTIONS)}")
-    except StgaError as error:
-        raise StgaError(f"{path}: {TORSO_KEY}: {error}") from error
-    return motion
+    if isinstance(found, dict):
+        # of a capture that was tracked before there were any
+        found = {"shift_mm": 0.0, "bend_mm": 0.0, **found}
+    return from_json(TorsoMotion, found, f"{path}: {TORSO_KEY}")
 
 
 @dataclass(frozen=True)

@@ -140,12 +140,10 @@ def _why_lost(folder: Path, exit_code: int | None) -> str:
 
 def read_status(folder: Path) -> WorkerStatus | None:
     """The latest status; None where status.json is missing or malformed."""
-    try:
+    with suppress(StgaError, TypeError):
         values = {**asdict(WorkerStatus()), **read_json(folder / STATUS_FILE)}
-        status: WorkerStatus = from_json(WorkerStatus, values)
-    except (StgaError, TypeError):
-        return None
-    return status
+        return from_json(WorkerStatus, values)
+    return None
 
 
 def log_lines(folder: Path, count: int) -> list[str]:

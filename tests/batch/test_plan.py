@@ -117,10 +117,12 @@ MISTAKES = {
     r".*got 'fly'",
     'out = "r"\n[job.a]\n': r"\[job.a\]: request: expected one of",
     'out = "r"\n' + ONE + 'capturee = "x"\n': r"\[job.one\]: capturee: is not a key",
-    'out = "r"\n' + ONE + "device = 3\n": r"\[job.one\]: device: expected a text",
-    'out = "r"\n' + ONE + 'device = "abacus"\n': r"\[job.one\]: device: expected auto, cpu, gpu",
-    'out = "r"\n' + ONE + "flame = 3\n": r"\[job.one\]: flame: expected a path",
-    'out = "r"\n' + ONE + "flame = 1979-05-27\n": r"\[job.one\]: flame: expected a path",
+    'out = "r"\n' + ONE + "device = 3\n": r"\[job.one\]: setting device: expected a text",
+    'out = "r"\n'
+    + ONE
+    + 'device = "abacus"\n': r"\[job.one\]: setting device: expected auto, cpu, gpu",
+    'out = "r"\n' + ONE + "flame = 3\n": r"\[job.one\]: setting flame: expected a path",
+    'out = "r"\n' + ONE + "flame = 1979-05-27\n": r"\[job.one\]: setting flame: expected a path",
     'out = "footage/anna"\n'
     + ONE: r"\[job.one\]: capture: .*anna is the batch's own folder; choose another 'out'",
     'out = "r"\n' + ONE + 'flame = "none.pkl"\n': r"\[job.one\]: flame: .*none.pkl does not exist",

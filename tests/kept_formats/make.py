@@ -121,14 +121,14 @@ def checkpoint() -> Checkpoint:
     tracking = ramp(2, 23).astype(np.float64)
     digest = IDENTITY.digest
     return Checkpoint(
-        state(),
+        state=state(),
         iteration=34,
         visit=7,
         last_timestep=12,
         initial_count=4,
         elapsed_s=12.5,
         evaluations=2,
-        losses=[0.5, 0.25],
+        losses=(0.5, 0.25),
         lines=3,
         tracking_gain=0.125,
         tracking=tracking,

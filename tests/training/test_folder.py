@@ -5,6 +5,7 @@ import math
 import os
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -31,7 +32,18 @@ def make_run(**changes: Any) -> Run:
 
 
 def make_checkpoint() -> Checkpoint:
-    return Checkpoint(random_state(12, FACES), 34, 7, 3, 10, 12.5, 4, [0.5, 0.25], 5, 0.5)
+    return Checkpoint(
+        state=random_state(12, FACES),
+        iteration=34,
+        visit=7,
+        last_timestep=3,
+        initial_count=10,
+        elapsed_s=12.5,
+        evaluations=4,
+        losses=(0.5, 0.25),
+        lines=5,
+        tracking_gain=0.5,
+    )
 
 
 def edit_json(path: Path, **changes: Any) -> None:
@@ -117,7 +129,8 @@ def test_checkpoint_round_trip(tmp_path):
     assert all(array.flags.c_contiguous for array in arrays_of(state).values())
     largest = (1 << 53) - 1
     for counts in ((0, -1, None), (0, -1, 0), (largest, largest, largest)):
-        extreme = Checkpoint(random_state(3, FACES), *counts, 0, 0.0, 0, [])
+        names = ("iteration", "visit", "last_timestep")
+        extreme = replace(make_checkpoint(), **dict(zip(names, counts, strict=True)))
         checkpoint_files.write_checkpoint(tmp_path, extreme)
         limited = checkpoint_files.read_checkpoint(tmp_path)
         assert (limited.iteration, limited.visit, limited.last_timestep) == counts
@@ -141,11 +154,12 @@ def strain_position(**changes: np.ndarray) -> dict[str, np.ndarray]:
 
 METAS: dict[str, dict[str, Any]] = {
     "has checkpoint format version 3, this add-on reads 4; train it again": {"version": 3},
-    "malformed .*color": {"color": 3},
-    "iteration is -1, expected a whole number from 0 up": {"iteration": -1},
-    "iteration is 9007199254740992": {"iteration": 1 << 53},  # beyond what is exact
-    "elapsed_s is inf": {"elapsed_s": math.inf},
-    "elapsed_s is -1.0": {"elapsed_s": -1.0},
+    r"fields are missing or unknown \(color\)": {"color": 3},
+    "setting iteration: expected a whole number from 0 up to .*, got -1": {"iteration": -1},
+    "setting iteration: .*, got 9007199254740992": {"iteration": 1 << 53},  # beyond what is exact
+    "setting elapsed_s: .*, got inf": {"elapsed_s": math.inf},
+    "setting elapsed_s: .*, got -1.0": {"elapsed_s": -1.0},
+    "tracking_gain is 'x'": {"tracking_gain": "x"},
 }
 """What is said of counts and other values -> them."""
 SHAPES = r"first is float32 \(4, 3, 3\), expected float32 \(5, 3, 3\)"
@@ -155,7 +169,7 @@ DAMAGES: dict[str, dict[str, np.ndarray | None]] = {
     "a field is missing or malformed": {"meta": None},
     r"/xyz is .* \(11, 3\), expected .* \(12, 3\)": {"first/xyz": np.zeros((11, 3), np.float32)},
     "an array has no rows": {"opacity": np.zeros((), np.float32)},
-    "meta is no object": {"meta": np.frombuffer(b"[]", np.uint8)},
+    "field is missing or malformed .*": {"meta": np.frombuffer(b"[]", np.uint8)},
     "parameters/xyz is float64": {"parameters/xyz": np.zeros((12, 3), np.float64)},
     f"strain_position/{SHAPES}": strain_position(first=np.zeros((4, 3, 3), np.float32)),
     "strain_position/steps is int64": strain_position(steps=np.zeros(FACES, np.int64)),

@@ -8,7 +8,7 @@ import hashlib
 import json
 import os
 from collections.abc import Iterator, Set
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from itertools import count
 from pathlib import Path
@@ -16,10 +16,9 @@ from pathlib import Path
 from filelock import SoftFileLease
 
 from ...errors import StgaError
-from ...files import naming, read_json, write_json
+from ...files import file_digest, naming, read_document, write_document
 from ...schema import from_json, setting, to_json
 from ...training.run.folder import AVATAR, RUN, has_run
-from ...training.run.identity import file_digest
 from ...worker.launch import prepare_status_folder
 from ...worker.lock import hold_folder, is_locked
 from ...worker.status import LOCK_FILE, WorkerState, read_status
@@ -120,19 +119,15 @@ class JobRecord:
 
 def write_record(job: Job, record: JobRecord) -> None:
     """Raises StgaError on a full disk."""
-    values = {"format": FORMAT, "version": VERSION, **to_json(record)}
-    write_json(job.request_folder / JOB_FILE, values)
+    write_document(job.request_folder / JOB_FILE, FORMAT, VERSION, to_json(record))
 
 
 def read_record(job: Job) -> JobRecord | None:
     """None where the job was never prepared, or by another version."""
-    try:
-        values = read_json(job.request_folder / JOB_FILE)
-        named = isinstance(values, dict) and (values.pop("format", 0), values.pop("version", 0))
-        record: JobRecord = from_json(JobRecord, values)
-    except StgaError:
-        return None
-    return record if named == (FORMAT, VERSION) else None
+    with suppress(StgaError):
+        path = job.request_folder / JOB_FILE
+        return from_json(JobRecord, read_document(path, "job", FORMAT, VERSION))
+    return None
 
 
 def _is_record_of(job: Job, digest: str) -> bool:

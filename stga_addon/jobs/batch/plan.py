@@ -257,11 +257,7 @@ def _resources(where: str, values: Any, shared: Resources) -> Resources:
     if not isinstance(values, dict):
         raise StgaError(f"{where}: expected a table, got {shorten(values)}")
     _require_keys(where, values, [spec.name for spec in fields(Resources)])
-    try:
-        found: Resources = from_json(Resources, {**to_json(shared), **values})
-    except StgaError as error:
-        raise StgaError(f"{where}: {error}") from error
-    return found
+    return from_json(Resources, {**to_json(shared), **values}, where)
 
 
 def _request(
@@ -285,11 +281,7 @@ def _request(
             raise StgaError(f"{where}: {name}: is missing")
         elif value is None:
             values[name] = list(spec.default) if isinstance(spec.default, tuple) else spec.default
-    try:
-        request: Request = from_json(kind, values)
-    except StgaError as error:
-        raise StgaError(f"{where}: {str(error).removeprefix('setting ')}") from error
-    return request
+    return from_json(kind, values, where)
 
 
 def _resolved(base: Path, value: Any) -> Any:

@@ -1,6 +1,5 @@
 """LPIPS, a perceptual image distance (Zhang et al. 2018), version 0.1 with AlexNet features."""
 
-import hashlib
 import os
 from dataclasses import dataclass
 from functools import cache
@@ -10,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ...errors import StgaError
-from ...files import file_size
+from ...files import file_digest, file_size
 from ...flame.unpickle import read_pickled_arrays
 
 if TYPE_CHECKING:  # imported where there are weights: torch takes seconds to load
@@ -72,11 +71,7 @@ def read_network(path: Path) -> Network:
     import torch
 
     file_size(path)
-    try:
-        with path.open("rb") as stream:
-            found = hashlib.file_digest(stream, "sha256").hexdigest()
-    except OSError as error:
-        raise StgaError(f"{path}: cannot be read ({error.strerror or error})") from error
+    found = file_digest(path)
     if found != WEIGHTS_SHA256:
         raise StgaError(
             f"{path}: is not the weights file that {WEIGHTS_VARIABLE} must name, alexnet.ckpt "

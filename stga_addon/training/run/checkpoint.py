@@ -2,12 +2,10 @@
 has trained on, within which its avatar's colors and positions follow it, as files in its folder."""
 
 import json
-import math
 import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -24,6 +22,7 @@ from ...avatar.strain import (
 from ...capture.model import Capture
 from ...errors import StgaError, shorten
 from ...files import check_version, read_npz, write_npz
+from ...schema import from_json, setting
 from ..optimize.state import OffsetState, TrainState, arrays_of, state_of
 from ..settings import TrainingSettings
 from .folder import AVATAR, CHECKPOINT, SELECTION, Continuation, Run
@@ -33,36 +32,44 @@ TRACKING = "tracking/parameters"
 IDENTITY = "identity"
 STRAIN_RANGE = "strain_range.npz"
 """`strain_range` (F, 2, 6) float32 of a run, and `identity`."""
-MAX_COUNT = 1 << 53
+MAX_COUNT = (1 << 53) - 1
 """Largest iteration or timestep that a checkpoint may hold."""
 OTHER_RUN = "belongs to another run than run.json; remove it, or train into another folder"
 
 
-@dataclass
-class Checkpoint:
-    """State of training between two iterations: of the trainer, the session and the evaluator.
+@dataclass(frozen=True, kw_only=True)
+class Counts:
+    """What a checkpoint holds beside arrays, of the trainer, the session and the evaluator.
 
     lines      of metrics.jsonl that were written so far; None in earlier checkpoints: those up to
                the iteration
-    tracking_gain  that the next evaluation is to tell, if any
-    tracking   (T, P + 3) float64 `RefinedTracking.parameters`; None where they are not refined
-    rounds     in which they were
+    rounds     in which tracking was refined
     identity   digest of the run's identity
     """
 
+    iteration: int = setting(minimum=0, maximum=MAX_COUNT)
+    visit: int = setting(minimum=-1, maximum=MAX_COUNT)
+    last_timestep: int | None = setting(minimum=0, maximum=MAX_COUNT)
+    initial_count: int = setting(minimum=0, maximum=MAX_COUNT)
+    elapsed_s: float = setting(minimum=0)
+    evaluations: int = setting(minimum=0, maximum=MAX_COUNT)
+    losses: tuple[float, ...] = ()
+    lines: int | None = setting(None, 0, MAX_COUNT)
+    rounds: int = setting(0, 0, MAX_COUNT)
+    identity: str = ""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Checkpoint(Counts):
+    """State of training between two iterations.
+
+    tracking_gain  that the next evaluation is to tell, if any; NaN: nothing was left out
+    tracking   (T, P + 3) float64 `RefinedTracking.parameters`; None where they are not refined
+    """
+
     state: TrainState
-    iteration: int
-    visit: int
-    last_timestep: int | None
-    initial_count: int
-    elapsed_s: float
-    evaluations: int
-    losses: list[float]
-    lines: int | None = None
     tracking_gain: float | None = None
     tracking: np.ndarray | None = None
-    rounds: int = 0
-    identity: str = ""
 
 
 def write_selection(folder: Path, selection: Mapping[int, np.ndarray], identity: str) -> None:
@@ -112,9 +119,12 @@ def read_checkpoint(folder: Path) -> Checkpoint:
     path = folder / CHECKPOINT
     arrays = read_npz(path)
     try:
-        meta = _meta(arrays.pop("meta"))
+        meta = json.loads(arrays.pop("meta").tobytes())
         check_version(path, "checkpoint", meta.pop("version"), VERSION)
-        _check_counts(meta)
+        gain = meta.pop("tracking_gain")
+        counts: Counts = from_json(Counts, meta, path)
+        if type(gain) not in (float, type(None)):
+            raise StgaError(f"{path}: tracking_gain is {shorten(gain)}, expected a number")
         tracking = arrays.pop(TRACKING, None)
         if tracking is not None:
             timesteps, parameters = tracking.shape
@@ -137,48 +147,13 @@ def read_checkpoint(folder: Path) -> Checkpoint:
         state = state_of({name: np.ascontiguousarray(array) for name, array in arrays.items()})
         _check_state(path, state)
         state.driven_offsets = offsets
-        return Checkpoint(state=state, tracking=tracking, **meta)
-    except (KeyError, IndexError, TypeError, ValueError, RecursionError) as error:
+        return Checkpoint(state=state, tracking_gain=gain, tracking=tracking, **vars(counts))
+    except (AttributeError, KeyError, IndexError, TypeError, ValueError, RecursionError) as error:
         raise StgaError(f"{path}: a field is missing or malformed ({error!s:.200})") from error
 
 
 def _packed(text: str) -> np.ndarray:
     return np.frombuffer(text.encode(), np.uint8)
-
-
-def _meta(packed: np.ndarray) -> dict[str, Any]:
-    """Everything of a checkpoint that is no array. Raises ValueError."""
-    stored = json.loads(packed.tobytes())
-    if not isinstance(stored, dict):
-        raise ValueError("meta is no object")
-    return stored
-
-
-def _check_counts(meta: Mapping[str, Any]) -> None:
-    """Raise ValueError for a value that none of a checkpoint is."""
-    lowest = {"iteration": 0, "visit": -1, "initial_count": 0, "evaluations": 0, "rounds": 0}
-    last, seconds, losses = (meta[name] for name in ("last_timestep", "elapsed_s", "losses"))
-    lines = meta["lines"]
-    gain = meta["tracking_gain"]
-
-    def is_count(value: Any, low: int = 0) -> bool:
-        return type(value) is int and low <= value < MAX_COUNT
-
-    def is_number(value: Any) -> bool:
-        return is_count(value, -MAX_COUNT) or (isinstance(value, float) and not math.isnan(value))
-
-    checks = {
-        **{n: (is_count(meta[n], m), f"a whole number from {m} up") for n, m in lowest.items()},
-        "last_timestep": (last is None or is_count(last), "a timestep"),
-        "elapsed_s": (is_number(seconds) and 0 <= seconds < math.inf, "seconds from 0 up"),
-        "lines": (lines is None or is_count(lines), "a whole number from 0 up"),
-        "tracking_gain": (gain is None or type(gain) is float, "a number"),
-        "losses": (isinstance(losses, list) and all(map(is_number, losses)), "a list of numbers"),
-        "identity": (isinstance(meta["identity"], str), "a text"),
-    }
-    for name, (fits, expected) in checks.items():
-        if not fits:
-            raise ValueError(f"{name} is {shorten(meta[name])}, expected {expected}")
 
 
 def _check_state(path: Path, state: TrainState) -> None:

@@ -13,6 +13,7 @@ import numpy as np
 from ...avatar.file import read_avatar
 from ...capture.model import Capture, View, evenly_spread, views_by_timestep
 from ...errors import StgaError
+from ...files import file_digest
 from ...raster.cpu.layout import Parameters
 from ...schema import validate
 from ...selection import select_capture
@@ -24,7 +25,6 @@ from ..schedule import learning_rates, view_order
 from ..settings import TrainingSettings
 from .checkpoint import read_checkpoint
 from .folder import AVATAR, CHECKPOINT, Continuation, Run
-from .identity import file_digest
 
 START_SHARE = 0.5
 """Share of the run's schedule of learning rates that has passed when its continuation begins."""

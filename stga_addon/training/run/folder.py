@@ -14,12 +14,11 @@ from ...capture.open import open_capture, with_sequence
 from ...capture.transforms import PRINCIPAL_POINTS
 from ...errors import StgaError
 from ...files import (
-    check_version,
     naming,
-    read_json,
+    read_document,
     read_npz,
     remove_leftovers,
-    write_json,
+    write_document,
     write_npz,
 )
 from ...flame.forward import FlameFrame, frame_of
@@ -108,7 +107,7 @@ class Run:
 
 
 def write_run(folder: Path, run: Run) -> None:
-    write_json(folder / RUN, {"format": FORMAT, "version": VERSION, **to_json(run)})
+    write_document(folder / RUN, FORMAT, VERSION, to_json(run))
 
 
 def has_run(folder: Path) -> bool:
@@ -120,15 +119,7 @@ def read_run(folder: Path) -> Run:
     path = folder / RUN
     if not path.exists():
         raise StgaError(f"{folder}: holds no run ({RUN} is missing)")
-    values = read_json(path)
-    if not isinstance(values, dict) or values.pop("format", None) != FORMAT:
-        raise StgaError(f"{path}: is not a run of this add-on (format is not '{FORMAT}')")
-    check_version(path, "run", values.pop("version", None), VERSION)
-    try:
-        run: Run = from_json(Run, values)
-    except StgaError as error:
-        raise StgaError(f"{path}: {error}") from error
-    return run
+    return from_json(Run, read_document(path, "run", FORMAT, VERSION), path)
 
 
 def next_folder(run: Path) -> Path:

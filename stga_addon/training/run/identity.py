@@ -3,13 +3,12 @@
 import hashlib
 import json
 from dataclasses import asdict, dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from ...capture.model import Capture
-from ...errors import StgaError
+from ...files import file_digest
 from ...schema import to_json
 from ..settings import TrainingSettings
 
@@ -97,15 +96,6 @@ def _settings_digest(settings: dict[str, Any]) -> str:
 
 def _digest(data: bytes) -> str:
     return hashlib.sha256(data).hexdigest()
-
-
-def file_digest(path: Path) -> str:
-    """SHA-256 of a file. Raises StgaError where it cannot be read."""
-    try:
-        with path.open("rb") as file:
-            return hashlib.file_digest(file, "sha256").hexdigest()
-    except OSError as error:
-        raise StgaError(f"{path}: cannot be read ({error.strerror or error})") from error
 
 
 def _quantized(values: np.ndarray) -> bytes:

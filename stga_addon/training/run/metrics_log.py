@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from ...errors import StgaError, shorten
-from ...files import file_size, replacing
+from ...files import file_size, naming, replacing
 
 METRICS = "metrics.jsonl"
 REQUIRED = ("iteration", "seconds", "splats", "evaluation_s", "wall_s")
@@ -29,11 +29,9 @@ def read_metrics(folder: Path) -> list[dict[str, Any]]:
         return lines
     try:
         file_size(path)
-        with path.open("rb") as texts:
+        with naming(path, "read"), path.open("rb") as texts:
             for text in texts:
                 lines.append(json.loads(text.decode("utf-8")))
-    except OSError as error:
-        raise StgaError(f"{path}: cannot be read ({error.strerror or error})") from error
     except (ValueError, RecursionError):
         pass
     for number, line in enumerate(lines, 1):
@@ -44,11 +42,9 @@ def read_metrics(folder: Path) -> list[dict[str, Any]]:
 
 
 def append_metrics(folder: Path, line: Mapping[str, Any]) -> None:
-    try:
-        with (folder / METRICS).open("a", encoding="utf-8") as out:
-            out.write(json.dumps(line) + "\n")
-    except OSError as error:
-        raise StgaError(f"{folder / METRICS}: cannot be written ({error.strerror})") from error
+    path = folder / METRICS
+    with naming(path), path.open("a", encoding="utf-8") as out:
+        out.write(json.dumps(line) + "\n")
 
 
 def cut_metrics(folder: Path, iteration: int, count: int | None = None) -> None:

@@ -574,19 +574,19 @@ class _Session:
         evaluator = self.evaluator
         self._require_folder()
         checkpoint = checkpoints.Checkpoint(
-            trainer.state,
-            trainer.iteration,
-            trainer.visit,
-            trainer.last_timestep,
-            trainer.initial_count,
-            self.elapsed_s,
-            evaluator.count,
-            list(self.losses),
-            len(evaluator.lines),
-            self.tracking_gain,
-            None if tracking is None else tracking.parameters,
-            0 if tracking is None else tracking.rounds,
-            self.run.digest,
+            state=trainer.state,
+            iteration=trainer.iteration,
+            visit=trainer.visit,
+            last_timestep=trainer.last_timestep,
+            initial_count=trainer.initial_count,
+            elapsed_s=self.elapsed_s,
+            evaluations=evaluator.count,
+            losses=tuple(self.losses),
+            lines=len(evaluator.lines),
+            tracking_gain=self.tracking_gain,
+            tracking=None if tracking is None else tracking.parameters,
+            rounds=0 if tracking is None else tracking.rounds,
+            identity=self.run.digest,
         )
         checkpoints.write_checkpoint(self.folder, checkpoint)
 

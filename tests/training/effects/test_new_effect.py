@@ -15,6 +15,7 @@ from stga_addon.capture.model import Capture
 from stga_addon.errors import StgaError
 from stga_addon.export.formats import FORMATS, export_avatar
 from stga_addon.export.ply import read_ply
+from stga_addon.files import file_digest
 from stga_addon.training.effect_catalog import EFFECTS, Effect
 from stga_addon.training.effects.plan import (
     RULES,
@@ -26,7 +27,6 @@ from stga_addon.training.optimize.trainer import Trainer
 from stga_addon.training.run.checkpoint import read_checkpoint
 from stga_addon.training.run.continuation import starting_state
 from stga_addon.training.run.folder import Continuation, Run
-from stga_addon.training.run.identity import file_digest
 from stga_addon.training.run.session import train_run
 
 from ..test_driven_offsets import squeezed
