@@ -8,7 +8,7 @@ from ...capture.model import Capture, evenly_spread
 from .backend import Backend
 from .change import Turn
 
-MIN_WEIGHT_PX = 0.35
+MIN_WEIGHT_PX = 0.5
 """A splat that fills less in every view serves the rays of a few pixels, and hangs in the air for
 all other cameras."""
 TURNS = (0.6, 0.8)
