@@ -70,7 +70,7 @@ def test_what_the_open_head_plays(stga, here, tmp_path):
     bpy.ops.stga.show_avatar(filepath=str(tmp_path / "a.npz"))
     keys = bpy.context.scene.stga.head.data.shape_keys
     keys.animation_data.action = None
-    keys.key_blocks["expr_001"].value = 9.0
+    keys.key_blocks["expr_001"].value = 2.5
     save_and_open(tmp_path / "head.blend")
     assert stga("export", "--format", "ply-sequence", "--out", tmp_path / "plys") == 0
     pair = ("--format", "gaussian-avatars", "--out", tmp_path / "pair")
@@ -82,7 +82,7 @@ def test_what_the_open_head_plays(stga, here, tmp_path):
     expected = to_world(avatar.splats, frames).xyz
     np.testing.assert_allclose(read_ply(tmp_path / "plys/00002.ply").xyz, expected, atol=1e-6)
     with np.load(tmp_path / "pair/flame_param.npz") as pair:
-        np.testing.assert_allclose(pair["expr"][:, 1], 9.0)
+        np.testing.assert_allclose(pair["expr"][:, 1], 2.5)
         assert len(pair["expr"]) == 4
     cameras = ("--cameras", folder / "transforms_val.json", "--out")
     assert here("render", *cameras, tmp_path / "here") == 0

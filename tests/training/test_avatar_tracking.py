@@ -582,9 +582,7 @@ def test_a_run_and_its_checkpoint_must_agree(lost: Made, run_folder: Path, tmp_p
     run = shutil.copytree(run_folder, tmp_path / "run")
     with pytest.raises(StgaError, match="was begun with other settings"):
         train_run(lost[0], run, make_run(lost[0], tracking=False), resume=True)
-    checkpoint = read_checkpoint(run)
-    checkpoint.tracking = None
-    write_checkpoint(run, checkpoint)
+    write_checkpoint(run, replace(read_checkpoint(run), tracking=None))
     with pytest.raises(StgaError, match="its checkpoint's refined tracking does not fit"):
         train_run(lost[0], run, make_run(lost[0]), resume=True)
 

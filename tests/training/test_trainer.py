@@ -15,7 +15,11 @@ from stga_addon.capture.model import Capture, View
 from stga_addon.capture.open import open_capture
 from stga_addon.training.optimize.backend import RenderOptions
 from stga_addon.training.optimize.cpu_backend import CpuBackend
-from stga_addon.training.optimize.frames import FrameStore
+from stga_addon.training.optimize.frames import (
+    UNSEEN_COSINE,
+    UNSEEN_LIMIT_SHARE,
+    FrameStore,
+)
 from stga_addon.training.optimize.initial_splats import initial_splats, unseen_share
 from stga_addon.training.optimize.trainer import Trainer
 from stga_addon.training.settings import MAX_FINE_TRIANGLES
@@ -247,11 +251,15 @@ def test_render_shows_the_average(toy):
 
 @pytest.mark.parametrize("convention", ["stga", "gaussian_avatars"])
 def test_scale_limits_in_meters(toy, convention):
-    """Catches bound and unbound limits mixed up, and triangles taken for meters."""
+    """Catches bound and unbound limits mixed up, triangles taken for meters, and large splats on
+    triangles that no camera faces."""
     settings = quick_settings(convention=convention, scale_limit=3.0, unbound_scale_limit=2.0)
     store = FrameStore(toy, convention)
     bound, unbound = store.scale_limits(settings)
-    np.testing.assert_allclose(bound, 3 * store.units, rtol=1e-6)
+    share = np.where(store.facing < UNSEEN_COSINE, UNSEEN_LIMIT_SHARE, 1)
+    assert 0 < (share < 1).mean() < 0.6
+    np.testing.assert_allclose(bound, 3 * share * store.units, rtol=1e-6)
     diagonal = np.linalg.norm(toy.neutral.max(0) - toy.neutral.min(0))
     frames = face_frames(toy.neutral, toy.faces, toy.neutral, convention)
-    np.testing.assert_allclose(unbound * frames.scale, 2 * max(0.004, diagonal / 200), rtol=1e-5)
+    expected = 2 * max(0.004, diagonal / 200) * share
+    np.testing.assert_allclose(unbound * frames.scale, expected, rtol=1e-5)

@@ -130,8 +130,12 @@ def test_a_glance_counts(from_one_side):
     center[:3, 3] = capture.mesh(view.timestep).mean(0)
     back = view.camera.world_to_camera @ center @ half_turn @ np.linalg.inv(center)
     glance = replace(view, camera=replace(view.camera, world_to_camera=back))
-    views = [view] * 900 + [glance] * 15 + [view] * 885
-    facing = FrameStore(replace(capture, views={"train": tuple(views)}), "stga").facing
+    views = [
+        replace(glance if 900 <= number < 915 else view, timestep=number) for number in range(1800)
+    ]
+    posed = capture.mesh(view.timestep)
+    video = replace(capture, views={"train": tuple(views)}, mesh=lambda _: posed)
+    facing = FrameStore(video, "stga").facing
     both = FrameStore(replace(capture, views={"train": (view, glance)}), "stga").facing
     np.testing.assert_array_equal(facing, both)
 

@@ -10,7 +10,7 @@ import numpy as np
 from ...avatar.embedding import MIN_DIVISOR, FaceFrames, face_areas, face_frames
 from ...avatar.offsets import SIGNALS, moved_frames
 from ...avatar.strain import strain_basis, trained_range
-from ...capture.model import Capture, evenly_spread
+from ...capture.model import Capture, evenly_spread, views_by_timestep
 from ..settings import TrainingSettings
 from .initial_splats import voxel_size
 
@@ -19,9 +19,10 @@ BYTES_PER_TRIANGLE = 170
 """Of the timesteps kept in memory; of a triangle's frame, deformation, signals and corners in one.
 Posing a mesh anew takes a seventh of an iteration."""
 
-FACING_VIEWS = 300
-"""Training views that are looked at, spread over all, so that a glance of half a second counts in a
-recording of minutes."""
+FACING_TIMESTEPS = 300
+FACING_MESHES = 48
+"""Timesteps of the training views that are looked at, spread over all, so that a glance of half a
+second counts in a recording of minutes; fewer where each one's mesh is a file, which takes long."""
 UNSEEN_COSINE = -0.1
 """Of the angle between a triangle and a camera: below it, the triangle faces away so far that not
 even its hair stands in the outline."""
@@ -80,16 +81,19 @@ class FrameStore:
     @cached_property
     def facing(self) -> np.ndarray:
         """(F,) cosine of the angle between each triangle's normal and the camera of the training
-        views that it faces most; -1 at least."""
+        views that it faces most."""
         capture = self.capture
+        by_timestep = views_by_timestep(capture.views["train"])
+        limit = FACING_TIMESTEPS if capture.flame is not None else FACING_MESHES
         cosine = np.full(len(capture.faces), -1.0)
-        for view in evenly_spread(capture.views["train"], FACING_VIEWS):
-            a, b, c = np.asarray(capture.mesh(view.timestep))[capture.faces].swapaxes(0, 1)
+        for timestep in evenly_spread(list(by_timestep), limit):
+            a, b, c = np.asarray(capture.mesh(timestep))[capture.faces].swapaxes(0, 1)
             normal = np.cross(b - a, c - a)
-            towards = view.camera.position - (a + b + c) / 3
-            length = np.linalg.norm(normal, axis=1) * np.linalg.norm(towards, axis=1)
-            found = (normal * towards).sum(1) / np.maximum(length, 1e-20)
-            np.maximum(cosine, found, out=cosine)
+            normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-20)
+            for view in by_timestep[timestep]:
+                towards = view.camera.position - (a + b + c) / 3
+                length = np.maximum(np.linalg.norm(towards, axis=1), 1e-20)
+                np.maximum(cosine, (normal * towards).sum(1) / length, out=cosine)
         return cosine
 
     def of(self, timestep: int) -> FaceFrames:
