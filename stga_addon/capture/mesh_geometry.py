@@ -1,6 +1,5 @@
 """Triangle meshes: normals, parts, rigid alignment, and which triangle a camera's pixels show."""
 
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -10,7 +9,7 @@ from .camera import Camera
 ArrayPair = tuple[np.ndarray, np.ndarray]
 MAX_ITERATIONS = 100
 MIN_RESIDUAL = 1e-7  # Share of the mesh's size below which residuals are rounding
-CHUNK_PIXELS = 1 << 17  # Candidate pixels that are tested at a time, to stay in the cache
+CHUNK_PIXELS = 1 << 21  # Candidate pixels that are tested at a time, to bound the memory
 MIN_DEPTH_M = 0.01  # Triangles nearer to the camera's plane, or behind it, are not drawn
 
 
@@ -148,11 +147,25 @@ def rasterize(vertices: np.ndarray, faces: np.ndarray, camera: Camera) -> ArrayP
     inverse_depth = 1 / np.where(depth > 0, depth, np.nan)[faces]
     rows = np.flatnonzero(np.isfinite(inverse_depth).all(1) & np.isfinite(flat[faces]).all((1, 2)))
     corners = flat[faces[rows]]
-    slopes = barycentric_slopes(corners)
+    slopes = _barycentric_slopes(corners)
     closeness_slopes = (slopes * inverse_depth[rows][:, :, None]).sum(1)
     nearest = np.zeros(camera.width * camera.height)
     owner = np.full(len(nearest), -1)
-    for face, pixel, closeness in fragments(corners, closeness_slopes, camera.width, camera.height):
+    # triangles that may show a pixel, in groups whose bounding boxes hold about CHUNK_PIXELS
+    low = corners.min(1)
+    high = corners.max(1)
+    size = np.minimum(high, [camera.width, camera.height]) - np.maximum(low, 0)
+    drawn = np.flatnonzero((size >= 0).all(1))
+    groups = np.cumsum(np.ceil(size[drawn] + 1).prod(1)) // CHUNK_PIXELS
+    for group in np.split(drawn, np.flatnonzero(np.diff(groups)) + 1):
+        # pixel by pixel along the lines of the image that cross a triangle, between its edges
+        face, line = _counted(group, *_whole(low[group, 1], high[group, 1], camera.height))
+        left, right = _crossings(corners, face, line + 0.5)
+        row, x = _counted(np.arange(len(face)), *_whole(left, right, camera.width))
+        face = face[row]
+        y = line[row]
+        closeness = _at(closeness_slopes[face], x, y)
+        pixel = y * camera.width + x
         np.maximum.at(nearest, pixel, closeness)
         # of several triangles at one depth, the last
         wins = (closeness > 0) & (closeness == nearest[pixel])
@@ -165,29 +178,6 @@ def rasterize(vertices: np.ndarray, faces: np.ndarray, camera: Camera) -> ArrayP
     weights[shown] = np.maximum(_at(slopes[owner[shown]], x[:, None], y[:, None]), 0)
     shape = camera.height, camera.width
     return triangle.reshape(shape), weights.reshape(*shape, 3)
-
-
-def fragments(
-    corners: np.ndarray, slopes: np.ndarray, width: int, height: int
-) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """Of each pixel whose center one of T triangles covers: the triangle, number y·width + x, and
-    value there, slopes (T, 3) as those of `barycentric_slopes`. In groups of triangles whose
-    bounding boxes hold about CHUNK_PIXELS. corners (T, 3, 2)."""
-    low = corners.min(1)
-    high = corners.max(1)
-    size = np.minimum(high, [width, height]) - np.maximum(low, 0)
-    drawn = np.flatnonzero((size >= 0).all(1))
-    groups = np.cumsum(np.ceil(size[drawn] + 1).prod(1)) // CHUNK_PIXELS
-    for group in np.split(drawn, np.flatnonzero(np.diff(groups)) + 1):
-        # pixel by pixel along the lines of the image that cross a triangle, between its edges
-        rows = _whole(low[group, 1], high[group, 1], height)
-        face, line = _counted(np.arange(len(group)), *rows)
-        left, right = _crossings(corners[group], face, line + 0.5)
-        row, x = _counted(np.arange(len(face)), *_whole(left, right, width))
-        face = group[face]
-        across, down, constant = slopes[face].T
-        value = across[row] * x + (down * line + constant)[row]
-        yield face[row], (line * width)[row] + x, value
 
 
 def painted(vertices: np.ndarray, faces: np.ndarray, camera: Camera) -> np.ndarray:
@@ -246,7 +236,7 @@ def _crossings(corners: np.ndarray, face: np.ndarray, y: np.ndarray) -> ArrayPai
     return left, right
 
 
-def barycentric_slopes(corners: np.ndarray) -> np.ndarray:
+def _barycentric_slopes(corners: np.ndarray) -> np.ndarray:
     """(T, 3, 3): the barycentric coordinate of corner k at pixel (x, y) is [k, 0]·x + [k, 1]·y +
     [k, 2]. Zero for triangles that are seen edge-on."""
     x = corners[..., 0] - 0.5

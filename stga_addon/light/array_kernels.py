@@ -3,8 +3,8 @@ rows of their own, (3, N): NumPy is slow where the last axis is short."""
 
 import numpy as np
 
-from ..capture.mesh_geometry import barycentric_slopes, fragments
-
+CHUNK_TEXELS = 1 << 17
+"""Texels in the boxes around triangles that are drawn at a time, to bound the memory."""
 CHUNK_POINTS = 1 << 13
 """Points that are computed at a time, whose arrays stay in the processor's cache."""
 SUN = 0
@@ -15,23 +15,67 @@ MIN_FACING = np.float32(0.05)
 
 def add_depths(points: np.ndarray, faces: np.ndarray, depth: np.ndarray) -> None:
     """As `raster.cpu.shadow.add_depths`."""
-    corners = points[faces].astype(np.float64)
-    corners = corners[np.isfinite(corners).all((1, 2))]
-    # from far to near, so that the nearest are mostly written last
-    corners = corners[np.argsort(-corners[..., 2].sum(1))]
-    weights = barycentric_slopes(corners)
-    drawn = weights.any((1, 2))  # not edge-on
-    corners = corners[drawn]
-    slopes = (weights[drawn] * corners[..., 2, None]).sum(1)
-    flat = depth.reshape(-1)
-    for _, at, value in fragments(corners[..., :2], slopes, *depth.shape):
-        z = value.astype(np.float32)
-        # as `np.minimum.at`, slow in older NumPy: what is less after writing is written again
+    size = len(depth)
+    corners = np.stack([points[faces[:, k]].T for k in range(3)]).astype(np.float64)
+    low = np.clip(corners.min(0)[:2], 0, size)
+    high = np.clip(corners.max(0)[:2], 0, size)
+    area = _crossed(corners[1] - corners[0], corners[2] - corners[0], 0, 1)
+    drawn = np.isfinite(corners).all((0, 1)) & (np.abs(area) > 1e-12)
+    drawn &= (low < size).all(0) & (high > 0).all(0)
+    order = np.flatnonzero(drawn)
+    # From far to near, so that the nearest are mostly written last.
+    order = order[np.argsort(-corners[:, 2, order].sum(0))]
+    boxes = np.cumsum((np.ceil(high - low) + 1)[:, order].prod(0))
+    for group in np.split(order, np.flatnonzero(np.diff(boxes // CHUNK_TEXELS)) + 1):
+        _add_group(corners[:, :, group], area[group], depth)
+
+
+def _add_group(corners: np.ndarray, area: np.ndarray, depth: np.ndarray) -> None:
+    """Draw triangles (3 corners, 3, F) row by row, from texel to texel."""
+    size = len(depth)
+    u = corners[1] - corners[0]
+    v = corners[2] - corners[0]
+    across = _crossed(u, v, 2, 1) / area
+    down = _crossed(u, v, 0, 2) / area
+    plane = across, down, corners[0, 2] - across * corners[0, 0] - down * corners[0, 1]
+    order = np.argsort(corners[:, 1], axis=0)[:, None]
+    high, middle, low = np.take_along_axis(corners, order, axis=0)
+    rows = np.ceil(high[1] - 0.5) - 1, np.floor(middle[1] - 0.5), np.floor(low[1] - 0.5)
+    limits = [np.clip(row, -1, size - 1).astype(np.int64) for row in rows]
+    long = _line(high, low)
+    lines = _line(high, middle), _line(middle, low)
+    for before, last, short in zip(limits, limits[1:], lines, strict=False):
+        count = last - before
+        row = np.arange(int(count.sum())) - np.repeat(np.cumsum(count) - count - before - 1, count)
+        y = row + 0.5
+        edges = [np.repeat(slope, count) * y + np.repeat(b, count) for slope, b in (long, short)]
+        begin = np.ceil(np.maximum(np.minimum(*edges), 0) - 0.5).clip(0)
+        end = np.floor(np.minimum(np.maximum(*edges), size) - 0.5)
+        texels = np.maximum(end - begin + 1, 0).astype(np.int64)
+        steepness, down, z = (np.repeat(values, count) for values in plane)
+        z += steepness * (begin + 0.5) + down * y
+        along = np.arange(int(texels.sum())) - np.repeat(np.cumsum(texels) - texels, texels)
+        at = np.repeat(row * size + begin.astype(np.int64), texels) + along
+        z, steepness = (np.repeat(values.astype(np.float32), texels) for values in (z, steepness))
+        z = z + steepness * along.astype(np.float32)
+        flat = depth.reshape(-1)
+        # As `np.minimum.at`, slow in older NumPy: what is less after writing is written again.
         while len(at):
             less = z < flat[at]
             at = at[less]
             z = z[less]
             flat[at] = z
+
+
+def _crossed(u: np.ndarray, v: np.ndarray, i: int, j: int) -> np.ndarray:
+    return u[i] * v[j] - u[j] * v[i]
+
+
+def _line(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Slope and begin of the lines through a and b (3, F): x = slope · y + begin."""
+    height = b[1] - a[1]
+    slope = (b[0] - a[0]) / np.where(height == 0, 1, height)
+    return slope, a[0] - slope * a[1]
 
 
 def lit_shares(
