@@ -1,7 +1,6 @@
 """Colors of sides of the head that no training view shows: only what shines through the front
 trains a hidden side, which gives it any color."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -11,25 +10,24 @@ from scipy.spatial import cKDTree
 from ...avatar.splats import SH_C0
 from ...capture.camera import look_at
 from ...capture.mesh_geometry import connected_parts, rasterize
-from ...capture.model import Capture, View, evenly_spread
+from ...capture.model import Capture, View, evenly_spread, views_by_timestep
 from .backend import Backend
 from .change import Turn
-from .frames import UNSEEN_COSINE, FrameStore
+from .frames import FACING_TIMESTEPS, UNSEEN_COSINE, FrameStore
 from .initial_splats import mean_colors, mirror_images
 from .likeness import (
     around,
     head_coordinates,
     inside_colors,
     kinds_of,
-    skin_of,
     teeth_of,
     with_hair,
 )
 
-COLOR_VIEWS = 48
-"""Training views whose colors are looked at, spread over all."""
-SIGHT_HEIGHT_PX = 400
-"""Of the views in which the inside of mouth and eyes is looked for."""
+SPREAD_VIEWS = 12
+OPEN_VIEWS = 6
+"""Training views whose colors are looked at, spread over all, and of the timesteps in which the
+mouth is highest."""
 MIN_TEETH_SHARE = 0.08
 """Of the teeth's triangles, half of which are behind others, that views show at least."""
 SOURCE_COSINE = 0.5
@@ -37,9 +35,11 @@ SOURCE_COSINE = 0.5
 matte's edge may be in."""
 SOURCE_TRIANGLES = 100
 """Of whose colors a hidden triangle has the median."""
-OUTSIDE_CAMERAS = 18
+OUTSIDE_CAMERAS = 15
 OUTSIDE_DISTANCE = 4.0
-"""Cameras that tell the neutral head's outside from its inside; their distance, in its radius."""
+OUTSIDE_SIDE_PX = 240
+"""Cameras that tell the neutral head's outside from its inside; their distance, in its radius;
+width and height of their images."""
 
 
 @dataclass(frozen=True)
@@ -80,7 +80,7 @@ def unseen_sides(capture: Capture, cosine: np.ndarray) -> UnseenSides:
     """Unseen triangles look as their mirror images that are shown; those of scalp, neck and
     shoulders else as a shown one of their height, back and forth around the head; any other as the
     nearest connected ones. cosine: of `FrameStore.facing`."""
-    views = evenly_spread(capture.views["train"], COLOR_VIEWS)
+    views = _telling_views(capture)
     is_outside = outside(capture)
     color, shown = mean_colors(capture, views)
     is_source = shown & is_outside & (cosine > SOURCE_COSINE)
@@ -107,27 +107,42 @@ def unseen_sides(capture: Capture, cosine: np.ndarray) -> UnseenSides:
             found[rows] = color[around(at, own, rows)]
     hidden, partner = mirror_images(capture, unseen, is_source)
     found[hidden] = color[partner]
-    inside = _unseen_inside(capture, views, is_outside)
+    inside = _unseen_inside(capture, shown, is_outside)
     found[inside] = inside_colors(capture, color, shown, inside)
     return UnseenSides(unseen | inside, found)
 
 
-def _unseen_inside(capture: Capture, views: Sequence[View], is_outside: np.ndarray) -> np.ndarray:
-    """(F,) bool: triangles of the inside, of lids and of teeth that no view shows; but for lids,
-    none of whose neighbors either. Teeth of which hardly any is shown count as unseen."""
-    faces = capture.faces
-    in_sight = np.zeros(len(faces), bool)
-    for view in views:
-        camera = view.camera.scaled(min(1.0, SIGHT_HEIGHT_PX / view.camera.height))
-        triangle, _ = rasterize(capture.mesh(view.timestep), faces, camera)
-        in_sight[np.unique(triangle[triangle >= 0])] = True
+def _telling_views(capture: Capture) -> list[View]:
+    """Some views spread over all, and some of the timesteps in which the mouth is highest: a mouth
+    that opens once is seen."""
+    views = capture.views["train"]
+    spread = evenly_spread(views, SPREAD_VIEWS)
+    mouth = capture.regions.get("mouth")
+    by_timestep = views_by_timestep(views)
+    is_known = mouth is not None and mouth.any() and capture.flame is not None
+    if not is_known or len(by_timestep) <= SPREAD_VIEWS:
+        return spread
+    lips = np.unique(capture.faces[mouth])
+    height = {}
+    for timestep in evenly_spread(list(by_timestep), FACING_TIMESTEPS):
+        place = np.asarray(capture.mesh(timestep))[lips]
+        height[timestep] = np.linalg.svd(place - place.mean(0), compute_uv=False)[1]
+    highest = sorted(height, key=lambda timestep: -height[timestep])[:OPEN_VIEWS]
+    opened = [by_timestep[timestep] for timestep in highest]
+    return [*spread, *(own[len(own) // 2] for own in opened)]
+
+
+def _unseen_inside(capture: Capture, shown: np.ndarray, is_outside: np.ndarray) -> np.ndarray:
+    """(F,) bool: triangles of the inside that no view shows, nor any neighbor of theirs. Teeth of
+    which hardly any is shown count as unseen. None in a long recording whose meshes are files: not
+    all of its mouths were looked for."""
+    if capture.flame is None and len(capture.timesteps) > SPREAD_VIEWS:
+        return np.zeros(len(shown), bool)
     touched = np.zeros(len(capture.neutral), bool)
-    touched[faces[in_sight]] = True
-    inside = ~is_outside & ~touched[faces].any(1)
-    for name in ("left_eye", "right_eye"):
-        inside |= capture.regions.get(name, inside) & ~in_sight & skin_of(capture)
+    touched[capture.faces[shown]] = True
+    inside = ~is_outside & ~touched[capture.faces].any(1)
     teeth = teeth_of(capture)
-    if (teeth & in_sight).sum() < MIN_TEETH_SHARE * teeth.sum():
+    if (teeth & shown).sum() < MIN_TEETH_SHARE * teeth.sum():
         inside |= teeth
     return np.asarray(inside)
 
@@ -138,11 +153,12 @@ def outside(capture: Capture) -> np.ndarray:
     center = neutral.mean(0)
     radius = max(float(np.linalg.norm(neutral - center, axis=1).max()), 1e-9)
     seen = np.zeros(len(capture.faces), bool)
+    focal = OUTSIDE_SIDE_PX * OUTSIDE_DISTANCE / 2.2
     for number in range(OUTSIDE_CAMERAS):
         angle = 2 * np.pi * number / OUTSIDE_CAMERAS
         height = (-0.5, 0.2, 0.9)[number % 3]
         eye = center + OUTSIDE_DISTANCE * radius * np.array([np.sin(angle), height, np.cos(angle)])
-        camera = look_at(eye, center, 400, 400, focal_length=400 * OUTSIDE_DISTANCE / 2.2)
+        camera = look_at(eye, center, OUTSIDE_SIDE_PX, OUTSIDE_SIDE_PX, focal_length=focal)
         triangle, _ = rasterize(neutral, capture.faces, camera)
         seen[np.unique(triangle[triangle >= 0])] = True
     return seen
