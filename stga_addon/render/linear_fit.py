@@ -13,7 +13,7 @@ from ..capture.camera import Camera
 from ..capture.color import srgb_to_linear
 from ..capture.model import Capture, evenly_spread
 from ..errors import StgaError
-from ..progress import Progress, Report, ignore
+from ..progress import Report, counted, ignore
 from ..raster.cpu.layout import CameraFrames, Parameters
 from ..raster.cpu.rasterize import BufferPool, frames_in_camera, render_backward, render_forward
 from .render import render
@@ -44,7 +44,8 @@ class _Seen(NamedTuple):
 
 def fit_linear(avatar: Avatar, capture: Capture, report: Report = ignore) -> np.ndarray:
     """`Avatar.linear_base` (N, 4) with which blending in linear light comes nearest to
-    `render_avatar`, in display values, in views of the capture. Raises StgaError without any."""
+    `render_avatar`, in display values, in views of the capture. Raises StgaError without any,
+    Cancelled where the report says to stop."""
     views = capture.views.get("train", ())
     if not views:
         raise StgaError(f"{capture.root}: has no training views, by which colors could be fitted")
@@ -61,8 +62,7 @@ def fit_linear(avatar: Avatar, capture: Capture, report: Report = ignore) -> np.
     square = np.zeros_like(change)
     buffers = BufferPool()
     order = [n for _ in range(0, STEPS, len(seen)) for n in rng.permutation(len(seen))]
-    for step in range(STEPS):
-        report(Progress(step / STEPS, "Fitting colors for linear light"))
+    for step in counted(range(STEPS), STEPS, report, "Fitting colors for linear light", "Step"):
         gradient = _gradient(avatar, change, seen[order[step]], buffers)
         mean += (1 - BETAS[0]) * (gradient - mean)
         square += (1 - BETAS[1]) * (gradient**2 - square)

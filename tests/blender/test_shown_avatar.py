@@ -324,7 +324,7 @@ def test_a_file_says_what_is_missing_without_the_extension(extension, head, tmp_
 
 
 def test_what_the_engine_leaves_out_is_said(extension, head, tmp_path):
-    """Catches F12 by the engine that drops meshes and depth of field without a word."""
+    """Catches F12 by the engine that drops meshes and depth of field without a warning."""
     write_ball_avatar(tmp_path / "avatar.npz")
     bpy.ops.stga.show_avatar(filepath=str(tmp_path / "avatar.npz"))
     scene = bpy.context.scene

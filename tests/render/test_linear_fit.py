@@ -17,6 +17,7 @@ from stga_addon.capture.open import open_capture
 from stga_addon.errors import StgaError
 from stga_addon.export.formats import export_avatar
 from stga_addon.export.ply import read_ply
+from stga_addon.progress import Cancelled
 from stga_addon.render.linear_fit import fit_linear
 from stga_addon.render.render import render, render_avatar
 
@@ -49,7 +50,7 @@ def blended_linearly(avatar: Avatar, mesh: np.ndarray, camera: Camera, gray: flo
 
 def test_blending_linearly_shows_what_was_trained(tmp_path: Path) -> None:
     """Catches a fit that is worse on one background or in a view that it has not seen, that turns
-    harmonics or a head's pose, or changes what was trained."""
+    harmonics or a head's pose, changes what was trained, or goes on after *Cancel*."""
     root = write_mesh_capture(tmp_path / "capture")
     capture = open_capture(root)
     avatar = hairy_avatar()
@@ -68,6 +69,10 @@ def test_blending_linearly_shows_what_was_trained(tmp_path: Path) -> None:
     np.testing.assert_array_equal(fitted.for_linear_light.splats.sh[:, 1:], avatar.splats.sh[:, 1:])
     with pytest.raises(StgaError, match="has no training views"):
         fit_linear(avatar, replace(capture, views={}))
+    told = []
+    with pytest.raises(Cancelled):
+        fit_linear(avatar, capture, lambda progress: told.append(progress) or len(told) > 2)
+    assert len(told) == 3
 
 
 def test_files_keep_both(tmp_path: Path) -> None:

@@ -82,7 +82,7 @@ def test_summary_of_a_run():
 
 def test_both_qualities_are_named() -> None:
     """Catches heads fitted to the very images that are scored and not called so, and tracking that
-    nothing has checked without a word."""
+    nothing has checked without a warning."""
     values = metrics([20.0, 23.0])
     values[1] |= {"psnr_fitted_heads": 26.0, "ssim_fitted_heads": 0.95}
     values[1]["tracking_gain_db"] = float("nan")

@@ -422,7 +422,7 @@ def test_transforms_of_another_name(tmp_path):
 
 def test_inputs_that_nobody_uses_are_named(tmp_path):
     """Catches a camera's video, a mask, a plate or photos in another format that are left out
-    without a word."""
+    without a warning."""
     write_colmap_binary(tmp_path / "sparse/0", rig(2), ["left/1.png", "right/1.png"])
     for name in ("left", "right", "third"):
         write_images(tmp_path / "images" / name, ["1.png", "2.png"])

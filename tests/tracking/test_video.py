@@ -327,7 +327,7 @@ def with_clean_aperture(path, width, height):
 
 def test_what_a_video_asks_for_in_vain(tmp_path):
     """Catches combs of interlaced frames, a frame to be cropped, and a turn by no right angle, of
-    which a player shows something else, without a word."""
+    which a player shows something else, without a warning."""
     frames = [np.full((64, 96, 3), 30 + 10 * n, np.uint8) for n in range(3)]
     encode(tmp_path / "fields.mp4", frames, options={"x264-params": "tff=1"})
     encode(tmp_path / "crop.mov", frames)

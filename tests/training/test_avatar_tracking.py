@@ -565,7 +565,7 @@ def test_quality_is_measured_with_and_without_fitted_heads(
 def test_a_short_take_is_checked_or_called_unchecked(
     timesteps: tuple[int, ...], right: Made, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """Catches tracking that is kept without a check, and without a word, in short takes."""
+    """Catches tracking that is kept without a check, and without a warning, in short takes."""
     views = right[0].views["train"]
     shown = tuple(view for view in views if view.timestep in timesteps)
     capture = replace(right[0], views={"train": shown})

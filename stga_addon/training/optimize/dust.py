@@ -1,6 +1,7 @@
 """Pruning of dust: unbound splats in the air that fill next to nothing of any image."""
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 
@@ -25,7 +26,7 @@ class DustPruning:
     view. Neither opacity nor density tells dust from the faint rim of hair."""
 
     capture: Capture
-    interval: int = 1
+    interval: ClassVar[int] = 1  # turns are told by the share of the budget
 
     def prepare(self) -> None:
         """Nothing is found out once."""

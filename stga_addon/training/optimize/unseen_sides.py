@@ -1,5 +1,5 @@
-"""Colors of sides of the head that no training view shows: only what shines through the front
-trains a hidden side, which gives it any color."""
+"""Colors of what no training view shows, sides of the head and the inside of a closed mouth: only
+what shines through the front trains it, which gives it any color."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -44,14 +44,15 @@ width and height of their images."""
 
 @dataclass(frozen=True)
 class UnseenSides:
-    """Triangles (F,) bool of the outside that no view shows; the color (F, 3) in 0…1 they keep."""
+    """Triangles (F,) bool that no view shows; the color (F, 3) in 0…1 that they keep."""
 
     triangles: np.ndarray
     color: np.ndarray
 
 
 class UnseenSideColors:
-    """Gives bound splats of unseen sides their color, from everywhere and in every expression."""
+    """Gives bound splats of unseen triangles their color, from everywhere and in every
+    expression."""
 
     interval = 20
 

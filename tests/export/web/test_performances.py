@@ -123,7 +123,7 @@ REFUSED_BY_THE_PAGE = {
 
 
 def test_unusable_values_are_refused_in_one_sentence(tmp_path: Path) -> None:
-    """Catches a head that vanishes, or a face that stays still, without a word."""
+    """Catches a head that vanishes, or a face that stays still, without a warning."""
     refused = REFUSED | REFUSED_BY_THE_PAGE
     pages = read_by_page([text for text, _ in refused.values()], tmp_path)
     for (name, (text, word)), page in zip(refused.items(), pages, strict=True):
