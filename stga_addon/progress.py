@@ -14,7 +14,7 @@ import numpy as np
 Item = TypeVar("Item")
 
 PACE_SHARE = 0.1  # Share of the work, the last that was done, whose pace says how much time is left
-LONGER = 1.25  # Times what was said to be left, from which on that was too little
+MAX_OVERRUN_RATIO = 1.25  # Times what was said to be left, from which on that was too little
 MAX_STEP_SHARE = 0.03  # Of a step; beyond, an interrupted call had done it before
 
 
@@ -80,7 +80,7 @@ class TimeLeft:
         return (1 - share) * seconds / done if done >= PACE_SHARE / 10 else math.nan
 
 
-MAX_SHARE = 0.99
+MAX_TOLD_SHARE = 0.99
 """Before the end: 100 % is said of what is done."""
 
 
@@ -94,12 +94,12 @@ class Clock:
     def told(self, progress: Progress) -> dict[str, float]:
         """The finite figures of some progress; `left_s` is the least so far, and `longer` 1 where
         it is known to be too little."""
-        self.share = max(self.share, min(progress.share, MAX_SHARE))
+        self.share = max(self.share, min(progress.share, MAX_TOLD_SHARE))
         figures = {n: value for n, value in progress.figures().items() if math.isfinite(value)}
         if "left_s" in figures:
             asked_s = figures["left_s"]
             self._left_s = min(self._left_s, asked_s)
-            longer = asked_s > LONGER * self._left_s + 1
+            longer = asked_s > MAX_OVERRUN_RATIO * self._left_s + 1
             figures |= {"left_s": self._left_s, **({"longer": 1.0} if longer else {})}
         return figures
 

@@ -115,7 +115,7 @@ def kinds_of(at: HeadCoordinates, is_outside: np.ndarray) -> dict[str, np.ndarra
     return {"scalp": scalp, "body": body}
 
 
-def with_hair(
+def hairy_triangles(
     sources: np.ndarray, centers: np.ndarray, color: np.ndarray, regions: Mapping[str, np.ndarray]
 ) -> np.ndarray:
     """Those of a scalp's triangles whose color is not the skin's; all of a bald one."""
@@ -128,7 +128,9 @@ def with_hair(
     return np.asarray(sources[contrast > MIN_HAIR_CONTRAST * np.quantile(contrast, 0.9)])
 
 
-def around(at: HeadCoordinates, sources: np.ndarray, targets: np.ndarray) -> np.ndarray:
+def sources_around_head(
+    at: HeadCoordinates, sources: np.ndarray, targets: np.ndarray
+) -> np.ndarray:
     """The source of each target: the stretch of azimuth that is seen at its height, back and forth,
     on both sides of the head alike."""
     angle = np.abs(at.azimuth)

@@ -16,12 +16,12 @@ from .change import Turn
 from .frames import FACING_TIMESTEPS, UNSEEN_COSINE, FrameStore
 from .initial_splats import mean_colors, mirror_images
 from .likeness import (
-    around,
+    hairy_triangles,
     head_coordinates,
     inside_colors,
     kinds_of,
+    sources_around_head,
     teeth_of,
-    with_hair,
 )
 
 SPREAD_VIEWS = 12
@@ -81,7 +81,7 @@ def unseen_sides(capture: Capture, cosine: np.ndarray) -> UnseenSides:
     """Unseen triangles look as their mirror images that are shown; those of scalp, neck and
     shoulders else as a shown one of their height, back and forth around the head; any other as the
     nearest connected ones. cosine: of `FrameStore.facing`."""
-    views = _telling_views(capture)
+    views = _color_views(capture)
     is_outside = outside(capture)
     color, shown = mean_colors(capture, views)
     is_source = shown & is_outside & (cosine > SOURCE_COSINE)
@@ -102,10 +102,10 @@ def unseen_sides(capture: Capture, cosine: np.ndarray) -> UnseenSides:
     for kind, members in kinds.items():
         own = np.flatnonzero(members & is_source)
         if kind == "scalp":
-            own = with_hair(own, centers, color, capture.regions)
+            own = hairy_triangles(own, centers, color, capture.regions)
         rows = np.flatnonzero(members & unseen)
         if at is not None and len(own) and len(rows):
-            found[rows] = color[around(at, own, rows)]
+            found[rows] = color[sources_around_head(at, own, rows)]
     hidden, partner = mirror_images(capture, unseen, is_source)
     found[hidden] = color[partner]
     inside = _unseen_inside(capture, shown, is_outside)
@@ -113,7 +113,7 @@ def unseen_sides(capture: Capture, cosine: np.ndarray) -> UnseenSides:
     return UnseenSides(unseen | inside, found)
 
 
-def _telling_views(capture: Capture) -> list[View]:
+def _color_views(capture: Capture) -> list[View]:
     """Some views spread over all, and some of the timesteps in which the mouth is highest: a mouth
     that opens once is seen."""
     views = capture.views["train"]
