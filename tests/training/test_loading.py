@@ -16,7 +16,8 @@ from stga_addon.training.evaluate.metrics import Residuals
 from stga_addon.training.optimize import frames
 from stga_addon.training.optimize.frames import FrameStore
 from stga_addon.training.optimize.initial_splats import MAX_LATER_TIMESTEPS
-from stga_addon.training.optimize.unseen_sides import UnseenSideColors
+from stga_addon.training.optimize.surface import Surface
+from stga_addon.training.optimize.surface_prior import SurfacePrior
 from stga_addon.training.run import session
 from stga_addon.training.run.session import train_run
 
@@ -49,8 +50,8 @@ def test_no_mesh_is_read_on_the_training_thread(tmp_path, monkeypatch):
     capture = replace(opened, mesh=mesh, views={"train": opened.views["train"]})
     run = make_run(capture, "global", iterations=len(timesteps) - 1)
     # which read meshes once, before training and after it
-    monkeypatch.setattr(FrameStore, "facing", np.ones(len(opened.faces)))
-    monkeypatch.setattr(UnseenSideColors, "apply", lambda *_: None)
+    monkeypatch.setattr(Surface, "facing", np.ones(len(opened.faces)))
+    monkeypatch.setattr(SurfacePrior, "apply", lambda *_: None)
     monkeypatch.setattr(session, "triangle_residuals", no_residuals)
     train_run(capture, tmp_path / "loaded", run)
     assert {timestep for timestep, _ in read} == set(timesteps[:-1])  # the last one is a test view

@@ -16,11 +16,12 @@ from stga_addon.capture.open import open_capture
 from stga_addon.training.optimize.backend import RenderOptions
 from stga_addon.training.optimize.cpu_backend import CpuBackend
 from stga_addon.training.optimize.frames import (
-    UNSEEN_COSINE,
+    BORDER_LIMIT_SHARE,
     UNSEEN_LIMIT_SHARE,
     FrameStore,
 )
 from stga_addon.training.optimize.initial_splats import initial_splats, unseen_share
+from stga_addon.training.optimize.surface import GRAZING_COSINE, UNSEEN_COSINE
 from stga_addon.training.optimize.trainer import Trainer
 from stga_addon.training.settings import MAX_FINE_TRIANGLES
 
@@ -210,7 +211,10 @@ def test_splats_of_a_triangle_by_the_mesh(toy, triangles, first, whole):
     fine = replace(toy, faces=toy.faces[rows])
     settings = quick_settings(lattice=None, density_interval=10)
     trainer = Trainer(fine, settings, {})
-    assert (len(trainer), trainer.initial_count) == (first * triangles, whole * triangles)
+    hidden = int(trainer.frames.surface.hidden.sum())  # three each, in which no view splits
+    shown = triangles - hidden
+    assert len(trainer) == first * shown + 3 * hidden
+    assert trainer.initial_count == whole * shown + 3 * hidden
     even = replace(settings, density_interval=0)
     assert len(initial_splats(fine, even)) == whole * triangles
     assert len(initial_splats(fine, quick_settings(lattice=0))) == triangles
@@ -256,8 +260,10 @@ def test_scale_limits_in_meters(toy, convention):
     settings = quick_settings(convention=convention, scale_limit=3.0, unbound_scale_limit=2.0)
     store = FrameStore(toy, convention)
     bound, unbound = store.scale_limits(settings)
-    share = np.where(store.facing < UNSEEN_COSINE, UNSEEN_LIMIT_SHARE, 1)
-    assert 0 < (share < 1).mean() < 0.6
+    facing = store.surface.facing
+    share = np.interp(facing, (UNSEEN_COSINE, GRAZING_COSINE), (UNSEEN_LIMIT_SHARE, 1))
+    assert 0 < (share < 1).mean() < 0.8
+    share[store.surface.border] *= BORDER_LIMIT_SHARE
     np.testing.assert_allclose(bound, 3 * share * store.units, rtol=1e-6)
     diagonal = np.linalg.norm(toy.neutral.max(0) - toy.neutral.min(0))
     frames = face_frames(toy.neutral, toy.faces, toy.neutral, convention)

@@ -15,13 +15,11 @@ from stga_addon.flame.model import faces_within
 from stga_addon.flame.parts import flame_model, key_regions
 from stga_addon.training.optimize.change import Turn
 from stga_addon.training.optimize.frames import FrameStore
+from stga_addon.training.optimize.likeness import outside
+from stga_addon.training.optimize.surface import Surface
+from stga_addon.training.optimize.surface_prior import SurfacePrior
 from stga_addon.training.optimize.trainer import Trainer
-from stga_addon.training.optimize.unseen_sides import (
-    UnseenSideColors,
-    UnseenSides,
-    outside,
-    unseen_sides,
-)
+from stga_addon.training.optimize.unseen_sides import UnseenSides, unseen_sides
 
 from .heads import PLACES, write_head
 from .toys import Rows, quick_settings
@@ -31,7 +29,7 @@ CAMERA = 3
 
 
 def sides_of(capture: Capture) -> UnseenSides:
-    return unseen_sides(capture, FrameStore(capture, "stga").facing)
+    return unseen_sides(Surface(capture))
 
 
 @pytest.fixture(scope="module")
@@ -108,7 +106,7 @@ def test_restored_colors_are_those_of_the_avatar(from_one_side):
         part.sh[:] = rng.random(part.sh.shape)
     state.unbound[::7] = True
     before = {name: getattr(state, name).sh.copy() for name in ("average", "first", "second")}
-    UnseenSideColors(FrameStore(capture, "stga")).apply(Rows(state), Turn(0, 0.5, len(state)))
+    SurfacePrior(FrameStore(capture, "stga")).apply(Rows(state), Turn(0, 0.5, len(state)))
     far = sides.triangles[state.face] & ~state.unbound
     assert 0 < far.sum() < len(far)
     expected = (sides.color[state.face[far]] - 0.5) / 0.28209479177387814
@@ -135,8 +133,8 @@ def test_a_glance_counts(from_one_side):
     ]
     posed = capture.mesh(view.timestep)
     video = replace(capture, views={"train": tuple(views)}, mesh=lambda _: posed)
-    facing = FrameStore(video, "stga").facing
-    both = FrameStore(replace(capture, views={"train": (view, glance)}), "stga").facing
+    facing = Surface(video).facing
+    both = Surface(replace(capture, views={"train": (view, glance)})).facing
     np.testing.assert_array_equal(facing, both)
 
 

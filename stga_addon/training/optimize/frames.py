@@ -10,25 +10,25 @@ import numpy as np
 from ...avatar.embedding import MIN_DIVISOR, FaceFrames, face_areas, face_frames
 from ...avatar.offsets import SIGNALS, moved_frames
 from ...avatar.strain import strain_basis, trained_range
-from ...capture.model import Capture, evenly_spread, views_by_timestep
+from ...capture.model import Capture
 from ..settings import TrainingSettings
 from .initial_splats import voxel_size
+from .surface import GRAZING_COSINE, UNSEEN_COSINE, Surface
 
 CACHE_BYTES = 256e6
 BYTES_PER_TRIANGLE = 170
 """Of the timesteps kept in memory; of a triangle's frame, deformation, signals and corners in one.
 Posing a mesh anew takes a seventh of an iteration."""
 
-FACING_TIMESTEPS = 300
-FACING_MESHES = 48
-"""Timesteps of the training views that are looked at, spread over all, so that a glance of half a
-second counts in a recording of minutes; fewer where each one's mesh is a file, which takes long."""
-UNSEEN_COSINE = -0.1
-"""Of the angle between a triangle and a camera: below it, the triangle faces away so far that not
-even its hair stands in the outline."""
 UNSEEN_LIMIT_SHARE = 0.35
+BORDER_LIMIT_SHARE = 0.2
+BORDER_DISTANCE_SHARE = 0.6
 """Of the scale limits, on triangles that face away from all cameras: a large splat that serves an
-outline hangs in the air for other cameras."""
+outline hangs in the air for other cameras. Of the limits of scale and distance, where the mesh
+ends."""
+SHELL_HEIGHT_SHARE = 0.8
+SHELL_VOXELS = 0.5
+"""Share of the height of hair at which its outer layer lies, less its own thickness."""
 
 
 @dataclass
@@ -43,6 +43,9 @@ class FrameStore:
 
     strain    `strain_basis` of the neutral mesh, None if nothing depends on strain
     units     (F,) float32: the length that a triangle's limits are multiples of, in local units
+    unit_lengths  (F,) meters of the neutral mesh that are a triangle's local unit
+    voxel     meters between hull points
+    surface   what training views tell of the triangles
     """
 
     def __init__(
@@ -65,36 +68,36 @@ class FrameStore:
         if convention != "gaussian_avatars":
             areas = face_areas(capture.neutral, capture.faces)
             self.units = np.asarray(np.sqrt(2 * areas), np.float32)
+        neutral = capture.neutral
+        frames = face_frames(neutral, capture.faces, neutral, convention)
+        self.unit_lengths = np.maximum(frames.scale, MIN_DIVISOR)
+        self.voxel = voxel_size(neutral)
+        self.surface = Surface(capture)
         self._most = int(CACHE_BYTES / BYTES_PER_TRIANGLE / len(capture.faces))
         self._cached: dict[int, _Timestep] = {}
 
     def scale_limits(self, settings: TrainingSettings) -> np.ndarray:
         """Largest scale (2, F) float32 of bound and of unbound splats, in local units."""
-        neutral = self.capture.neutral
-        frames = face_frames(neutral, self.capture.faces, neutral, self.convention)
-        limit = settings.unbound_scale_limit * voxel_size(neutral)
-        unbound = limit / np.maximum(frames.scale, MIN_DIVISOR)
+        unbound = settings.unbound_scale_limit * self.voxel / self.unit_lengths
         limits = np.stack([settings.scale_limit * self.units, unbound])
-        limits[:, self.facing < UNSEEN_COSINE] *= UNSEEN_LIMIT_SHARE
+        cosines = UNSEEN_COSINE, GRAZING_COSINE
+        limits *= np.interp(self.surface.facing, cosines, (UNSEEN_LIMIT_SHARE, 1))
+        limits[:, self.surface.border] *= BORDER_LIMIT_SHARE
         return np.asarray(limits, np.float32)
 
+    def stray_limits(self, settings: TrainingSettings) -> np.ndarray:
+        """How far (F,) float32 bound splats may lie from the middle of their triangle, in local
+        units: on the scalp as far as hair reaches."""
+        share = np.where(self.surface.border, BORDER_DISTANCE_SHARE, 1.0)
+        hair = self.surface.hair_height / self.unit_lengths
+        return np.asarray(settings.stray_limit * self.units * share + hair, np.float32)
+
     @cached_property
-    def facing(self) -> np.ndarray:
-        """(F,) cosine of the angle between each triangle's normal and the camera of the training
-        views that it faces most."""
-        capture = self.capture
-        by_timestep = views_by_timestep(capture.views["train"])
-        limit = FACING_TIMESTEPS if capture.flame is not None else FACING_MESHES
-        cosine = np.full(len(capture.faces), -1.0)
-        for timestep in evenly_spread(list(by_timestep), limit):
-            a, b, c = np.asarray(capture.mesh(timestep))[capture.faces].swapaxes(0, 1)
-            normal = np.cross(b - a, c - a)
-            normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-20)
-            for view in by_timestep[timestep]:
-                towards = view.camera.position - (a + b + c) / 3
-                length = np.maximum(np.linalg.norm(towards, axis=1), 1e-20)
-                np.maximum(cosine, (normal * towards).sum(1) / length, out=cosine)
-        return cosine
+    def shell_height(self) -> np.ndarray:
+        """(F,) of the middle of hair's outer layer over each triangle, 0 on skin, in local
+        units."""
+        inner = SHELL_HEIGHT_SHARE * self.surface.hair_height - SHELL_VOXELS * self.voxel
+        return np.asarray(np.maximum(inner, 0) / self.unit_lengths, np.float32)
 
     def of(self, timestep: int) -> FaceFrames:
         entry = self._latest(timestep)

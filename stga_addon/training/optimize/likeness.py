@@ -6,9 +6,16 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
-from ...capture.mesh_geometry import connected_parts
+from ...capture.camera import look_at
+from ...capture.mesh_geometry import connected_parts, rasterize
 from ...capture.model import Capture
 from ...flame.model import faces_within
+
+OUTSIDE_CAMERAS = 15
+OUTSIDE_DISTANCE = 4.0
+OUTSIDE_SIDE_PX = 240
+"""Cameras that tell the neutral head's outside from its inside; their distance, in its radius;
+width and height of their images."""
 
 SCALP_ANGLE_DEG = 66.0
 SCALP_ELEVATION_DEG = 38.0
@@ -17,6 +24,7 @@ NECK_ANGLE_DEG = 60.0
 begins behind the third."""
 EYES_TO_MIDDLE = 1.35
 BROWS_OVER_EYES = 0.15
+BROWS_LEVEL = 0.45
 JAW_LEVEL = -0.5
 CHIN_LEVEL = -2.0
 """Places on a head, in distances of its eyes from its mouth: how far its middle lies behind the
@@ -72,6 +80,23 @@ class HeadCoordinates:
     level: np.ndarray
     side: np.ndarray
     unit: float
+
+
+def outside(capture: Capture) -> np.ndarray:
+    """(F,) bool: triangles of the neutral mesh that some camera around it sees."""
+    neutral = np.asarray(capture.neutral, np.float64)
+    center = neutral.mean(0)
+    radius = max(float(np.linalg.norm(neutral - center, axis=1).max()), 1e-9)
+    seen = np.zeros(len(capture.faces), bool)
+    focal = OUTSIDE_SIDE_PX * OUTSIDE_DISTANCE / 2.2
+    for number in range(OUTSIDE_CAMERAS):
+        angle = 2 * np.pi * number / OUTSIDE_CAMERAS
+        height = (-0.5, 0.2, 0.9)[number % 3]
+        eye = center + OUTSIDE_DISTANCE * radius * np.array([np.sin(angle), height, np.cos(angle)])
+        camera = look_at(eye, center, OUTSIDE_SIDE_PX, OUTSIDE_SIDE_PX, focal_length=focal)
+        triangle, _ = rasterize(neutral, capture.faces, camera)
+        seen[np.unique(triangle[triangle >= 0])] = True
+    return seen
 
 
 def head_coordinates(capture: Capture) -> HeadCoordinates | None:

@@ -7,6 +7,7 @@ import numpy as np
 
 from ...avatar.file import Avatar
 from ...avatar.lattice import splats_per_triangle
+from ...avatar.splats import joined
 from ...capture.model import Capture, View
 from ...schema import to_json
 from ..schedule import learning_rates, sh_degree
@@ -22,7 +23,7 @@ from .make_backend import make_backend
 from .outlines import OutlinePruning
 from .state import TrainState, new_state, with_offsets
 from .strays import StrayReset
-from .unseen_sides import UnseenSideColors
+from .surface_prior import SurfacePrior, hidden_splats
 
 EXTEND_LOCAL_SHARE = 0.5
 """Of an extension's budget, in which what the new takes need is trained, before all splats."""
@@ -118,13 +119,14 @@ class Trainer:
         self.last_timestep: int | None = None
         self._progress: float | None = None
         self._background = np.array(settings.background, np.float32)
-        state = _placed_splats(capture, settings) if start.state is None else start.state
-        self._backend = make_backend(device, settings, self.frames, state)
-        self.initial_count = len(state)
         if start.state is None:
-            self.initial_count = _whole_count(state, settings, len(capture.faces))
-        limit = settings.stray_limit * self.frames.units
-        strays = StrayReset(settings.stray_reset_interval, limit, settings.stray_reset_share)
+            state, self.initial_count = _placed_splats(self.frames, settings)
+        else:
+            state = start.state
+            self.initial_count = len(state)
+        self._backend = make_backend(device, settings, self.frames, state)
+        limits = self.frames.stray_limits(settings)
+        strays = StrayReset(settings.stray_reset_interval, limits, settings.stray_reset_share)
         self.changes: dict[str, Change] = {
             "strays": strays,
             "density": density_control(settings),
@@ -133,7 +135,7 @@ class Trainer:
             self.changes["outlines"] = OutlinePruning(capture, settings.seed, self.frames.moved)
         self.changes["dust"] = DustPruning(capture)
         if self.strategy.region is None:
-            self.changes["unseen sides"] = UnseenSideColors(self.frames)
+            self.changes["unseen sides"] = SurfacePrior(self.frames)
 
     def __len__(self) -> int:
         """How many splats there are."""
@@ -241,16 +243,17 @@ def density_control(settings: TrainingSettings) -> DensityControl:
     )
 
 
-def _placed_splats(capture: Capture, settings: TrainingSettings) -> TrainState:
-    """The splats that a training begins with."""
+def _placed_splats(frames: FrameStore, settings: TrainingSettings) -> tuple[TrainState, int]:
+    """The splats that a training begins with; how many there would be, had the lattice begun with
+    all of its points."""
+    capture = frames.capture
+    triangles = len(capture.faces)
     splats = initial_splats(capture, settings)
-    state = new_state(splats, unseen_share(capture, settings.convention, splats))
-    return with_offsets(state, settings.driven_offsets, len(capture.faces))
-
-
-def _whole_count(state: TrainState, settings: TrainingSettings, triangles: int) -> int:
-    """How many splats there would be, had the lattice begun with all of its points."""
+    splats = splats.rows(splats.unbound | ~frames.surface.hidden[splats.face])
     orders = settings.lattice_order, settings.first_lattice_order
     whole, first = (splats_per_triangle(order(triangles)) for order in orders)
-    bound = int((~state.unbound).sum())
-    return len(state) + bound * whole // first - bound
+    lattice = int((~splats.unbound).sum())
+    splats = joined([splats, hidden_splats(frames, settings)])
+    state = new_state(splats, unseen_share(capture, settings.convention, splats))
+    state = with_offsets(state, settings.driven_offsets, triangles)
+    return state, len(state) + lattice * whole // first - lattice

@@ -1,19 +1,12 @@
-"""Colors of what no training view shows, sides of the head and the inside of a closed mouth: only
-what shines through the front trains it, which gives it any color."""
+"""Colors of what no training view shows, sides of the head and the inside of a closed mouth."""
 
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 from scipy.spatial import cKDTree
 
-from ...avatar.splats import SH_C0
-from ...capture.camera import look_at
-from ...capture.mesh_geometry import connected_parts, rasterize
+from ...capture.mesh_geometry import connected_parts
 from ...capture.model import Capture, View, evenly_spread, views_by_timestep
-from .backend import Backend
-from .change import Turn
-from .frames import FACING_TIMESTEPS, UNSEEN_COSINE, FrameStore
 from .initial_splats import mean_colors, mirror_images
 from .likeness import (
     hairy_triangles,
@@ -23,6 +16,7 @@ from .likeness import (
     sources_around_head,
     teeth_of,
 )
+from .surface import FACING_TIMESTEPS, GRAZING_COSINE, UNSEEN_COSINE, Surface
 
 SPREAD_VIEWS = 12
 OPEN_VIEWS = 6
@@ -35,65 +29,38 @@ SOURCE_COSINE = 0.5
 matte's edge may be in."""
 SOURCE_TRIANGLES = 100
 """Of whose colors a hidden triangle has the median."""
-OUTSIDE_CAMERAS = 15
-OUTSIDE_DISTANCE = 4.0
-OUTSIDE_SIDE_PX = 240
-"""Cameras that tell the neutral head's outside from its inside; their distance, in its radius;
-width and height of their images."""
 
 
 @dataclass(frozen=True)
 class UnseenSides:
-    """Triangles (F,) bool that no view shows; the color (F, 3) in 0…1 that they keep."""
+    """Triangles (F,) bool that no view shows; those (F,) bool that some of the views whose colors
+    were looked at show; the color (F, 3) in 0…1 that each triangle plausibly has."""
 
     triangles: np.ndarray
+    shown: np.ndarray
     color: np.ndarray
 
 
-class UnseenSideColors:
-    """Gives bound splats of unseen triangles their color, from everywhere and in every
-    expression."""
-
-    interval = 20
-
-    def __init__(self, frames: FrameStore) -> None:
-        self._frames = frames
-
-    @cached_property
-    def sides(self) -> UnseenSides:
-        return unseen_sides(self._frames.capture, self._frames.facing)
-
-    def prepare(self) -> None:
-        self.sides  # noqa: B018
-
-    def apply(self, backend: Backend, turn: Turn) -> None:
-        columns = backend.columns(("face", "unbound", "parameters/sh"))
-        face = columns["face"]
-        rows = np.flatnonzero(self.sides.triangles[face] & ~columns["unbound"])
-        sh = np.zeros((len(rows), *columns["parameters/sh"].shape[1:]), np.float32)
-        sh[:, 0] = (self.sides.color[face[rows]] - 0.5) / SH_C0
-        backend.assign(
-            rows, {"parameters/sh": sh, "average/sh": sh, "first/sh": 0.0, "second/sh": 0.0}
-        )
-
-
-def unseen_sides(capture: Capture, cosine: np.ndarray) -> UnseenSides:
-    """Unseen triangles look as their mirror images that are shown; those of scalp, neck and
-    shoulders else as a shown one of their height, back and forth around the head; any other as the
-    nearest connected ones. cosine: of `FrameStore.facing`."""
+def unseen_sides(surface: Surface) -> UnseenSides:
+    """Triangles that no camera looks at look as their mirror images that are shown; those of scalp,
+    neck and shoulders else as a shown one of their height, back and forth around the head; any
+    other as the nearest connected ones. All that views show look as there."""
+    capture = surface.capture
+    cosine = surface.facing
     views = _color_views(capture)
-    is_outside = outside(capture)
+    is_outside = surface.outside
     color, shown = mean_colors(capture, views)
     is_source = shown & is_outside & (cosine > SOURCE_COSINE)
     sources = np.flatnonzero(is_source)
-    unseen = is_outside & (cosine < UNSEEN_COSINE)
     if not len(sources):
-        return UnseenSides(np.zeros_like(unseen), color)
+        return UnseenSides(np.zeros_like(shown), shown, color)
+    unseen = is_outside & (cosine < GRAZING_COSINE)
     found = color.copy()
     centers = np.asarray(capture.neutral)[capture.faces].mean(1)
     part = connected_parts(len(capture.neutral), capture.faces)[capture.faces[:, 0]]
-    for number in np.unique(part[unseen]):
-        rows = np.flatnonzero(unseen & (part == number))
+    hidden = unseen | ~shown
+    for number in np.unique(part[hidden]):
+        rows = np.flatnonzero(hidden & (part == number))
         own = sources[part[sources] == number] if (part[sources] == number).any() else sources
         _, near = cKDTree(centers[own]).query(centers[rows], min(SOURCE_TRIANGLES, len(own)))
         found[rows] = np.median(color[own[near.reshape(len(rows), -1)]], axis=1)
@@ -110,7 +77,7 @@ def unseen_sides(capture: Capture, cosine: np.ndarray) -> UnseenSides:
     found[hidden] = color[partner]
     inside = _unseen_inside(capture, shown, is_outside)
     found[inside] = inside_colors(capture, color, shown, inside)
-    return UnseenSides(unseen | inside, found)
+    return UnseenSides((is_outside & (cosine < UNSEEN_COSINE)) | inside, shown, found)
 
 
 def _color_views(capture: Capture) -> list[View]:
@@ -146,20 +113,3 @@ def _unseen_inside(capture: Capture, shown: np.ndarray, is_outside: np.ndarray) 
     if (teeth & shown).sum() < MIN_TEETH_SHARE * teeth.sum():
         inside |= teeth
     return np.asarray(inside)
-
-
-def outside(capture: Capture) -> np.ndarray:
-    """(F,) bool: triangles of the neutral mesh that some camera around it sees."""
-    neutral = np.asarray(capture.neutral, np.float64)
-    center = neutral.mean(0)
-    radius = max(float(np.linalg.norm(neutral - center, axis=1).max()), 1e-9)
-    seen = np.zeros(len(capture.faces), bool)
-    focal = OUTSIDE_SIDE_PX * OUTSIDE_DISTANCE / 2.2
-    for number in range(OUTSIDE_CAMERAS):
-        angle = 2 * np.pi * number / OUTSIDE_CAMERAS
-        height = (-0.5, 0.2, 0.9)[number % 3]
-        eye = center + OUTSIDE_DISTANCE * radius * np.array([np.sin(angle), height, np.cos(angle)])
-        camera = look_at(eye, center, OUTSIDE_SIDE_PX, OUTSIDE_SIDE_PX, focal_length=focal)
-        triangle, _ = rasterize(neutral, capture.faces, camera)
-        seen[np.unique(triangle[triangle >= 0])] = True
-    return seen

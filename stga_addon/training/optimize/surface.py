@@ -1,0 +1,188 @@
+"""What training views tell of a head's surface: which triangles face a camera, where something
+stands above them, where the mesh ends."""
+
+from functools import cached_property
+
+import numpy as np
+from scipy.ndimage import binary_dilation
+from scipy.spatial import cKDTree
+
+from ...capture.images import read_view
+from ...capture.mesh_geometry import connected_parts, silhouette
+from ...capture.model import Capture, View, evenly_spread, views_by_timestep
+from .initial_splats import FEW_CAMERAS, SAMPLED_HEIGHT_PIXELS, voxel_size
+from .likeness import BROWS_LEVEL, head_coordinates, kinds_of, outside
+
+FACING_TIMESTEPS = 300
+FACING_MESHES = 48
+"""Timesteps of the training views that are looked at, spread over all, so that a glance of half a
+second counts in a recording of minutes; fewer where each one's mesh is a file, which takes long."""
+UNSEEN_COSINE = -0.1
+HIDDEN_COSINE = 0.0
+GRAZING_COSINE = 0.35
+"""Of the angle between a triangle and the camera that it faces most: below the first, not even hair
+stands in an outline; below the second, the triangle is hidden; below the third, it fills little of
+any image."""
+OUTLINE_VIEWS = 16
+OUTLINE_COSINE = 0.2
+"""Views whose outlines are measured, spread over all; the largest cosine of the angle between a
+camera and a triangle that lies in the mesh's outline."""
+STEPS_PER_VOXEL = 4
+MAX_HEIGHT_VOXELS = 10
+OUTLINE_VOXELS = 1.5
+"""Heights that are tried above a triangle; within the last, it must come out of the mesh's
+silhouette."""
+AROUND = 30
+"""Measured triangles of whose heights one that is in no outline has the median."""
+STANDING_VOXELS = 1.5
+STANDING_REACH_VOXELS = 4
+"""A surface is not known to be flat that is so near to where hair, or a collar, is so high."""
+
+
+class Surface:
+    """The triangles (F,) of a capture, each property found out when it is asked for first."""
+
+    def __init__(self, capture: Capture) -> None:
+        self.capture = capture
+
+    @cached_property
+    def facing(self) -> np.ndarray:
+        """(F,) cosine of the angle between each triangle's normal and the camera of the training
+        views that it faces most."""
+        capture = self.capture
+        by_timestep = views_by_timestep(capture.views["train"])
+        limit = FACING_TIMESTEPS if capture.flame is not None else FACING_MESHES
+        cosine = np.full(len(capture.faces), -1.0)
+        for timestep in evenly_spread(list(by_timestep), limit):
+            center, normal = _centers_and_normals(capture, timestep)
+            for view in by_timestep[timestep]:
+                np.maximum(cosine, _cosine(center, normal, view), out=cosine)
+        return cosine
+
+    @cached_property
+    def outside(self) -> np.ndarray:
+        """(F,) bool: triangles of the neutral mesh that some camera around it sees."""
+        return outside(self.capture)
+
+    @cached_property
+    def hidden(self) -> np.ndarray:
+        """(F,) bool: triangles of the outside that face away from all cameras."""
+        return np.asarray(self.outside & (self.facing < HIDDEN_COSINE))
+
+    @cached_property
+    def border(self) -> np.ndarray:
+        """(F,) bool: triangles at the longest edge of the mesh, where a bust ends."""
+        faces = self.capture.faces
+        count = len(self.capture.neutral)
+        edges = np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
+        edges, uses = np.unique(edges, axis=0, return_counts=True)
+        edges = edges[uses == 1]
+        if not len(edges):
+            return np.zeros(len(faces), bool)
+        ends = np.asarray(self.capture.neutral)[edges]
+        length = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1)
+        part = connected_parts(count, edges)
+        longest = np.bincount(part[edges[:, 0]], length).argmax()
+        is_border = np.zeros(count, bool)
+        is_border[edges[part[edges[:, 0]] == longest]] = True
+        return np.asarray(is_border[faces].any(1))
+
+    @cached_property
+    def hair_height(self) -> np.ndarray:
+        """(F,) meters that hair stands above the scalp's triangles: as measured, else as where it
+        is measured around there, on both sides of the head alike. 0 elsewhere."""
+        height = np.zeros(len(self.outside))
+        scalp = np.flatnonzero(self._scalp)
+        measured = scalp[self._is_measured[scalp]] if len(scalp) else scalp
+        if not len(measured):
+            return height
+        center = np.asarray(self.capture.neutral, np.float64)[self.capture.faces].mean(1)
+        across = center[measured] * [-1, 1, 1] + [2 * center[:, 0].mean(), 0, 0]
+        sources = cKDTree(np.concatenate([center[measured], across]))
+        near = sources.query(center[scalp], min(AROUND, 2 * len(measured)))[1]
+        near = measured[near.reshape(len(scalp), -1) % len(measured)]
+        height[scalp] = np.median(self._measured_height[near], axis=1)
+        return height
+
+    @cached_property
+    def is_flat(self) -> np.ndarray:
+        """(F,) bool: hidden triangles and, where few cameras do not tell how thick it is, skin and
+        clothes, above which no outline shows anything to stand."""
+        at = head_coordinates(self.capture)
+        cameras = {view.camera_index for view in self.capture.views["train"]}
+        if at is None or len(cameras) > FEW_CAMERAS:
+            return self.hidden
+        voxel = voxel_size(np.asarray(self.capture.neutral))
+        bare = self.outside & ~self._scalp & (at.level < BROWS_LEVEL)
+        stands = self._is_measured & (self._measured_height > STANDING_VOXELS * voxel)
+        if stands.any():
+            center = np.asarray(self.capture.neutral, np.float64)[self.capture.faces].mean(1)
+            distance, _ = cKDTree(center[stands]).query(center)
+            bare &= distance > STANDING_REACH_VOXELS * voxel
+        return np.asarray(bare | self.hidden)
+
+    @cached_property
+    def _scalp(self) -> np.ndarray:
+        at = head_coordinates(self.capture)
+        if at is None:
+            return np.zeros(len(self.outside), bool)
+        return kinds_of(at, self.outside)["scalp"]
+
+    @property
+    def _is_measured(self) -> np.ndarray:
+        return self._outlines[1] > 0
+
+    @property
+    def _measured_height(self) -> np.ndarray:
+        total, count = self._outlines
+        return np.asarray(total / np.maximum(count, 1))
+
+    @cached_property
+    def _outlines(self) -> tuple[np.ndarray, np.ndarray]:
+        """Sum (F,) of the heights, and in how many masks' outlines each triangle lies."""
+        total, count = np.zeros((2, len(self.outside)))
+        for view in evenly_spread(self.capture.views["train"], OUTLINE_VIEWS):
+            rows, height = self._heights_in(view)
+            total[rows] += height
+            count[rows] += 1
+        return total, count
+
+    def _heights_in(self, view: View) -> tuple[np.ndarray, np.ndarray]:
+        """Triangles in the outline of one view, and how high its mask reaches above them."""
+        capture = self.capture
+        voxel = voxel_size(np.asarray(capture.neutral))
+        scale = min(1.0, SAMPLED_HEIGHT_PIXELS / view.camera.height)
+        small, _, mask = read_view(view, scale)
+        center, normal = _centers_and_normals(capture, view.timestep)
+        cosine = _cosine(center, normal, view)
+        rows = np.flatnonzero(self.outside & (np.abs(cosine) < OUTLINE_COSINE))
+        if mask is None or not len(rows):
+            return np.zeros(0, int), np.zeros(0)
+        heights = np.arange(MAX_HEIGHT_VOXELS * STEPS_PER_VOXEL + 1) * voxel / STEPS_PER_VOXEL
+        points = center[rows, None] + heights[:, None] * normal[rows, None]
+        camera = small.camera
+        pixels, _ = camera.project(points.reshape(-1, 3))
+        x, y = np.floor(pixels).T.astype(int)
+        within = (x >= 0) & (x < camera.width) & (y >= 0) & (y < camera.height)
+        at = np.where(within, y, 0), np.where(within, x, 0)
+        shape = len(rows), len(heights)
+        covered = silhouette(capture.mesh(view.timestep), capture.faces[cosine > 0], camera)
+        beside = (within & ~binary_dilation(covered)[at]).reshape(shape)
+        is_outline = beside[:, heights <= OUTLINE_VOXELS * voxel].any(1) & beside[:, -1]
+        is_outline &= within.reshape(shape).all(1)
+        is_foreground = (within & (mask > 127)[at]).reshape(shape)
+        steps = np.maximum(np.cumprod(is_foreground, axis=1).sum(1) - 1, 0)
+        return rows[is_outline], heights[steps[is_outline]]
+
+
+def _centers_and_normals(capture: Capture, timestep: int) -> tuple[np.ndarray, np.ndarray]:
+    a, b, c = np.asarray(capture.mesh(timestep), np.float64)[capture.faces].swapaxes(0, 1)
+    normal = np.cross(b - a, c - a)
+    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-20)
+    return (a + b + c) / 3, normal
+
+
+def _cosine(center: np.ndarray, normal: np.ndarray, view: View) -> np.ndarray:
+    towards = view.camera.position - center
+    length = np.maximum(np.linalg.norm(towards, axis=1), 1e-20)
+    return np.asarray((normal * towards).sum(1) / length)

@@ -1,0 +1,194 @@
+"""What is plausible of splats that no training view tells anything about: only what shines through
+the front trains them, which gives them any color, size and place."""
+
+from collections.abc import Mapping
+from dataclasses import replace
+from functools import cached_property
+
+import numpy as np
+
+from ...avatar.lattice import NORMAL_AXIS, lattice_splats
+from ...avatar.splats import SH_C0, Splats
+from ...flame.quaternions import from_matrices, to_matrices
+from ..settings import TrainingSettings
+from .backend import Backend
+from .change import Turn
+from .frames import FrameStore
+from .surface import GRAZING_COSINE
+from .unseen_sides import UnseenSides, unseen_sides
+
+WELL_SEEN_COSINE = 0.8
+SHOWN_COSINE = 0.5
+"""Of the angle between a triangle and the camera that it faces most: above the first, gradients are
+those that others are compared with; above the second, what views show keeps its color."""
+DOUBT = 0.3
+MIN_PULL = 0.02
+"""Gradient, in the median of well seen splats, at which a splat is pulled halfway to what is
+plausible at a turn; the least share of the way that is worth it."""
+HIDDEN_ORDER = 1
+HIDDEN_OPACITY = 3.0
+HIDDEN_FLATNESS = 0.5
+"""Of the layer on hidden triangles: order of the lattice, logit, and how much thinner it is than
+the lattice's splats."""
+BORDER_INSET = 0.6
+"""Of the distance from the middle of a triangle, and of the scale, at the mesh's edge."""
+HEAD_RADIUS_VOXELS = 22.5
+"""By which hair's outer layer is wider than the scalp."""
+FLAT_VOXELS = 0.25
+FLAT_TOLERANCE = 1.02
+"""Largest standard deviation of splats on skin and clothes along the normal; how much more is worth
+a change. Views of a narrow cone do not tell it."""
+MIN_VARIANCE = 1e-14
+PULLED_COLUMNS = (
+    "face",
+    "unbound",
+    "parameters/sh",
+    "parameters/opacity",
+    "parameters/xyz",
+    "parameters/rotation",
+    "parameters/log_scale",
+    "second/sh",
+    "second/opacity",
+)
+
+
+class SurfacePrior:
+    """Pulls bound splats towards what is plausible, the more the less the views tell of them: the
+    color of what they lie on, opaque and flat on the surface, or in the outer layer of hair.
+
+    How much views tell is read from Adam's second moments, root mean squares of gradients. Without
+    this, its steps, which are of one length for strong and weak gradients, would let splats that
+    fill a pixel of an outline take any color and size for the cameras that see them from behind.
+    """
+
+    interval = 20
+
+    def __init__(self, frames: FrameStore) -> None:
+        self._frames = frames
+        self._surface = frames.surface
+
+    @cached_property
+    def sides(self) -> UnseenSides:
+        return unseen_sides(self._surface)
+
+    def prepare(self) -> None:
+        self.sides  # noqa: B018
+        self._surface.is_flat  # noqa: B018
+
+    def apply(self, backend: Backend, turn: Turn) -> None:
+        columns = backend.columns(PULLED_COLUMNS)
+        bound = np.flatnonzero(~columns["unbound"])
+        columns = {name: column[bound] for name, column in columns.items()}
+        self._pull_colors(backend, bound, columns)
+        self._pull_shapes(backend, bound, columns)
+        self._flatten(backend, bound, columns)
+
+    def _doubt(self, second: np.ndarray, face: np.ndarray) -> np.ndarray:
+        """Share (N,) in 0…1 of what is plausible: 1 where views tell nothing, a half where
+        gradients are DOUBT times those of well seen splats. second (N, C): Adam's moments."""
+        told = np.sqrt(second.mean(1))
+        is_well_seen = self._surface.facing[face] > WELL_SEEN_COSINE
+        usual = told[is_well_seen] if is_well_seen.any() else told
+        little = DOUBT * np.median(usual) + np.finfo(np.float32).tiny
+        return np.asarray(little / (little + told), np.float32)
+
+    def _pull_colors(
+        self, backend: Backend, bound: np.ndarray, columns: Mapping[str, np.ndarray]
+    ) -> None:
+        sides = self.sides
+        face = columns["face"]
+        share = self._doubt(columns["second/sh"][:, 0], face)
+        share[sides.shown[face] & (self._surface.facing[face] > SHOWN_COSINE)] = 0
+        rows = np.flatnonzero((share > MIN_PULL) & ~sides.triangles[face])
+        plausible = ((sides.color[face] - 0.5) / SH_C0).astype(np.float32)
+        sh = columns["parameters/sh"][rows]
+        sh[:, 0] += share[rows, None] * (plausible[rows] - sh[:, 0])
+        backend.assign(bound[rows], {"parameters/sh": sh})
+        rows = np.flatnonzero(sides.triangles[face])
+        sh = np.zeros_like(columns["parameters/sh"][rows])
+        sh[:, 0] = plausible[rows]
+        moments = dict.fromkeys(("first/sh", "second/sh"), 0.0)
+        backend.assign(bound[rows], {**parameters_and_average({"sh": sh}), **moments})
+
+    def _pull_shapes(
+        self, backend: Backend, bound: np.ndarray, columns: Mapping[str, np.ndarray]
+    ) -> None:
+        face = columns["face"]
+        share = self._doubt(columns["second/opacity"][:, None], face)
+        rows = np.flatnonzero((share > MIN_PULL) & (self._surface.facing[face] < GRAZING_COSINE))
+        share = share[rows]
+        opacity = columns["parameters/opacity"][rows]
+        opacity += share * (HIDDEN_OPACITY - opacity)
+        xyz = columns["parameters/xyz"][rows]
+        axis = NORMAL_AXIS[self._frames.convention]
+        height = self._frames.shell_height[face[rows]]
+        xyz[:, axis] += share * (height - xyz[:, axis])
+        values = {"opacity": opacity, "xyz": xyz}
+        backend.assign(bound[rows], parameters_and_average(values))
+
+    def _flatten(
+        self, backend: Backend, bound: np.ndarray, columns: Mapping[str, np.ndarray]
+    ) -> None:
+        face = columns["face"]
+        limit = FLAT_VOXELS * self._frames.voxel
+        axis = NORMAL_AXIS[self._frames.convention]
+        rows = np.flatnonzero(self._surface.is_flat[face])
+        rotation = columns["parameters/rotation"][rows]
+        log_scale = columns["parameters/log_scale"][rows]
+        limits = limit / self._frames.unit_lengths[face[rows]]
+        thick = np.flatnonzero(thickness(rotation, log_scale, axis) > FLAT_TOLERANCE * limits)
+        flat = flattened(rotation[thick], log_scale[thick], axis, limits[thick])
+        values = parameters_and_average(dict(zip(("rotation", "log_scale"), flat, strict=True)))
+        moments = dict.fromkeys(("first/rotation", "first/log_scale"), 0.0)
+        backend.assign(bound[rows[thick]], {**values, **moments})
+
+
+def parameters_and_average(values: Mapping[str, np.ndarray]) -> dict[str, np.ndarray | float]:
+    """The columns that give splats these values at once, in the avatar as well."""
+    kinds = ("parameters", "average")
+    return {f"{kind}/{name}": value for kind in kinds for name, value in values.items()}
+
+
+def thickness(rotation: np.ndarray, log_scale: np.ndarray, axis: int) -> np.ndarray:
+    """Standard deviation (N,) of splats along a local axis; rotation (N, 4) wxyz."""
+    across = to_matrices(rotation)[:, axis]
+    return np.asarray(np.sqrt(((across * np.exp(log_scale)) ** 2).sum(1)))
+
+
+def flattened(
+    rotation: np.ndarray, log_scale: np.ndarray, axis: int, limit: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Splats compressed along a local axis to the standard deviation `limit` (N,): rotation (N, 4)
+    wxyz and log_scale (N, 3), float32. What is seen along that axis stays as it is."""
+    sides = to_matrices(rotation) * np.exp(log_scale)[:, None]
+    sides[:, axis] *= (limit / np.linalg.norm(sides[:, axis], axis=1))[:, None]
+    variance, axes = np.linalg.eigh(sides @ sides.swapaxes(1, 2))
+    axes[np.linalg.det(axes) < 0] *= -1
+    turned = from_matrices(axes)
+    scale = 0.5 * np.log(np.maximum(variance, MIN_VARIANCE))
+    return turned.astype(np.float32), scale.astype(np.float32)
+
+
+def hidden_splats(frames: FrameStore, settings: TrainingSettings) -> Splats:
+    """A dense opaque layer on the hidden triangles, in which no view splits splats: on skin and
+    clothes, or where the outer layer of hair is."""
+    capture = frames.capture
+    surface = frames.surface
+    axis = NORMAL_AXIS[frames.convention]
+    layer = lattice_splats(
+        capture.neutral,
+        capture.faces,
+        HIDDEN_ORDER,
+        settings.sh_degree,
+        HIDDEN_OPACITY,
+        convention=frames.convention,
+    )
+    layer = layer.rows(surface.hidden[layer.face])
+    face = layer.face
+    inset = np.where(surface.border, BORDER_INSET, 1.0)[face]
+    xyz = layer.xyz * inset[:, None]
+    xyz[:, axis] += frames.shell_height[face]
+    lifted = inset * (1 + surface.hair_height[face] / (HEAD_RADIUS_VOXELS * frames.voxel))
+    log_scale = layer.log_scale + np.log(lifted)[:, None]
+    log_scale[:, axis] += np.log(HIDDEN_FLATNESS)
+    return replace(layer, xyz=xyz.astype(np.float32), log_scale=log_scale.astype(np.float32))
