@@ -20,7 +20,7 @@ from ..stga_addon.scene.display import splat_nodes, splat_object
 from ..stga_addon.scene.display.splat_nodes import AS_TRAINED, LIMITS, NATIVE
 from ..stga_addon.scene.display.splat_object import shows_nodes
 from ..stga_addon.scene.gpu.context import has_gpu_context
-from ..stga_addon.scene.light import MODE_CHANGED, lighting_settings, world_light
+from ..stga_addon.scene.light import MODE_CHANGED, lighting_settings, throws_shadow, world_light
 from ..stga_addon.scene.render import viewport_display
 from ..stga_addon.scene.render.scene_splats import level_exposure, light_hint
 from ..stga_addon.scene.render.viewport_display import ENGINE
@@ -70,6 +70,8 @@ class ShowPanel(SidebarPanel, bpy.types.Panel):
             return
         draw_text(layout, context, LIMITS.get(mode, ""), "INFO")
         is_avatar = tags.CONVENTION in settings.splats
+        if mode == NATIVE:
+            draw_input(layout, modifier, splat_nodes.NATIVE_LIGHT)
         if mode == NATIVE and is_avatar and not draw_running(layout, context, Kind.EXACT):
             layout.operator("stga.make_exact").directory = settings.run_folder
         if context.space_data.shading.type in GRAY:
@@ -128,7 +130,10 @@ class LightingPanel(SidebarPanel, bpy.types.Panel):
         row = layout.row(align=True)
         row.operator("stga.relight_frame")
         row.operator("stga.relight_frame", text="", icon="X").clear = True
-        layout.operator("stga.head_shadow")
+        shown = context.scene.stga.splats
+        # native splats throw their own
+        if splat_object.display_mode(shown) != NATIVE or throws_shadow(shown):
+            layout.operator("stga.head_shadow")
 
 
 def _begin_exposure(scene: Any) -> None:

@@ -14,11 +14,12 @@ from stga_addon.avatar.offsets import COLOR, OFFSETS, POSITION, SCALE
 from stga_addon.avatar.splats import SH_C0, Splats
 from stga_addon.avatar.strain import at_rest, edge_neighbors
 from stga_addon.errors import StgaError
+from stga_addon.scene import compat
 from stga_addon.scene.arrays import evaluated_vertices
 from stga_addon.scene.display import splat_nodes
 from stga_addon.scene.display.node_builder import find_tree
-from stga_addon.scene.display.splat_attributes import avatar_attributes
-from stga_addon.scene.display.splat_nodes import DISPLAY_COLOR, EXTENT, POINTS, QUADS
+from stga_addon.scene.display.splat_attributes import DISPLAY_COLOR, avatar_attributes
+from stga_addon.scene.display.splat_nodes import EXTENT, POINTS, QUADS
 from stga_addon.scene.display.splat_object import (
     can_update,
     evaluated_splats,
@@ -402,7 +403,8 @@ def test_trees_are_built_one_node_group_at_a_time(kind):
     assert max(len(tree.nodes) for tree in bpy.data.node_groups) <= 64
     assert splat_nodes.splat_tree(options) == find_tree(options.tree_name)
     assert len(bpy.data.node_groups) == len(built)
-    assert len(bpy.data.materials) == 2
+    is_lit = compat.NATIVE_SPLATS and options.convention is not None
+    assert len(bpy.data.materials) == (4 if is_lit else 2)
     nodes = [node for tree in bpy.data.node_groups for node in tree.nodes]
     sockets = [socket for node in nodes for socket in node.inputs if socket.type == "STRING"]
     names = [socket.default_value for socket in sockets]

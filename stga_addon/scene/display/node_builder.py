@@ -37,7 +37,7 @@ def is_current(tree: bpy.types.NodeTree) -> bool:
 
 
 def _version() -> str:
-    return f"{__version__} with native splats" if compat.NATIVE_SPLATS else __version__
+    return f"{__version__} with lit native splats" if compat.NATIVE_SPLATS else __version__
 
 
 def new_socket(tree: bpy.types.NodeTree, name: str, side: str, kind: str) -> Any:
@@ -82,6 +82,16 @@ def new_material(name: str, build: Callable[["Nodes"], bpy.types.NodeSocket]) ->
     return material
 
 
+def kept_material(name: str, build: Callable[["Nodes"], Any], method: str) -> bpy.types.Material:
+    """Built where the file has none; method: EEVEE's, "DITHERED" or "BLENDED"."""
+    material = bpy.data.materials.get(name)
+    if material is None:
+        material = new_material(name, build)
+        material.surface_render_method = method
+        material.use_backface_culling = True
+    return material
+
+
 class Nodes:
     """Adds nodes to a tree; most methods return the first enabled output of the node they name."""
 
@@ -96,7 +106,11 @@ class Nodes:
         node = self.tree.nodes.new(kind)
         for name, value in properties.items():
             setattr(node, name, value)
-        for name, values in (inputs or {}).items():
+        self.set_inputs(node, inputs or {})
+        return node
+
+    def set_inputs(self, node: bpy.types.Node, inputs: Mapping[str, Any]) -> None:
+        for name, values in inputs.items():
             named = [s for s in node.inputs if s.enabled and name in (s.name, s.identifier)]
             values = values if isinstance(values, list) else [values]
             for socket, value in zip(named, values, strict=True):
@@ -104,7 +118,6 @@ class Nodes:
                     self.tree.links.new(value, socket)
                 else:
                     socket.default_value = value
-        return node
 
     def finish(self, kind: str, inputs: Mapping[str, Any]) -> None:
         """Add the tree's output node and arrange all nodes in columns, by links to it."""
@@ -167,6 +180,17 @@ class Nodes:
     def switch(self, kind: str, condition: Any, false: Any, true: Any) -> bpy.types.NodeSocket:
         inputs = {"Switch": condition, "False": false, "True": true}
         return self.out("GeometryNodeSwitch", inputs, input_type=kind)
+
+    def menu(
+        self, kind: str, choice: Any, values: Mapping[str, Any], descriptions: Mapping[str, str]
+    ) -> bpy.types.NodeSocket:
+        """What the menu socket `choice` has chosen of values or sockets by name."""
+        node = self.add("GeometryNodeMenuSwitch", data_type=kind)
+        node.enum_definition.enum_items.clear()
+        for name in values:
+            node.enum_definition.enum_items.new(name).description = descriptions[name]
+        self.set_inputs(node, {**values, "Menu": choice})
+        return node.outputs[0]
 
     def attribute(self, name: Any, data_type: str = "FLOAT_VECTOR") -> bpy.types.NodeSocket:
         return self.attribute_if_any(name, data_type)[0]

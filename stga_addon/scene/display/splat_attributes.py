@@ -15,6 +15,8 @@ from ...avatar.splats import SH_C0, Splats, in_world
 from ...avatar.strain import STRAIN_COMPONENTS, strain_basis
 from ...capture.color import srgb_to_linear
 from ...flame.quaternions import normalized
+from ...light.relight import Relighter
+from ...light.values import SKIN_ROUGHNESS
 from .. import tags
 from ..arrays import flat_floats, read_values
 
@@ -28,9 +30,11 @@ RELIT_COLOR = "stga_relit_color"  # scene-linear, of one frame: where it is ther
 SH = "stga_sh_{}"  # sRGB coefficients, by index
 LINEAR_SH = "stga_linear_sh"  # the first of these, and opacity, for linear light (`linear_base`)
 LINEAR_OPACITY = "stga_linear_opacity"
+ALBEDO = "stga_albedo"  # linear, and roughness, where the capture's light is known
 FACE = "stga_face"
 NEUTRAL_AREA = "stga_neutral_area"  # of its triangle, m²; also on faces with driven offsets
 
+DISPLAY_COLOR = "stga_display_color"  # scene-linear, stored by the nodes
 WORLD_ROTATION = "rotation"
 WORLD_SCALE = "scale"
 """As posed by the nodes, by the names that Blender's native splats have."""
@@ -79,7 +83,7 @@ def avatar_attributes(avatar: Avatar) -> SplatAttributes:
     splats = splat_attributes(avatar.splats)
     splats[FACE] = "INT", "value", np.ascontiguousarray(avatar.splats.face, np.int32)
     splats[NEUTRAL_AREA] = _number(areas[avatar.splats.face])
-    splats |= linear_attributes(avatar)
+    splats |= linear_attributes(avatar) | albedo_attribute(avatar)
     neutral: Attributes = {}  # what nodes need to have splats follow the deformation
     if avatar.follows_strain:
         basis = strain_basis(avatar.neutral, avatar.faces, avatar.strain_range)
@@ -106,6 +110,16 @@ def linear_attributes(avatar: Avatar) -> Attributes:
         return {}
     opacity = _number(avatar.for_linear_light.splats.opacities())
     return {LINEAR_SH: _vector(avatar.linear_base[:, :3]), LINEAR_OPACITY: opacity}
+
+
+def albedo_attribute(avatar: Avatar) -> Attributes:
+    """Of vertices of a splat object: what the scene's light falls on; none without a light."""
+    if avatar.light is None:
+        return {}
+    relighter = Relighter(avatar)
+    roughness = np.where(relighter.roughness > 0, relighter.roughness, SKIN_ROUGHNESS)
+    values = np.column_stack([relighter.albedo, roughness])
+    return {ALBEDO: ("FLOAT_COLOR", "color", flat_floats(values))}
 
 
 def _vector(values: np.ndarray) -> tuple[str, str, np.ndarray]:
@@ -145,7 +159,7 @@ def write_splats(mesh: Any, attributes: Attributes) -> None:
         mesh.vertices.add(len(positions) // 3)
     # Through the attribute, which takes all values at once; `MeshVertex.co` takes them one by one.
     write_attributes(mesh, attributes | {"position": attributes[XYZ]}, "POINT")
-    for name in {LINEAR_SH, LINEAR_OPACITY} - attributes.keys():  # of splats before
+    for name in {LINEAR_SH, LINEAR_OPACITY, ALBEDO} - attributes.keys():  # of splats before
         if name in mesh.attributes:
             mesh.attributes.remove(mesh.attributes[name])
     mesh[tags.REVISION] = uuid4().hex

@@ -1,7 +1,6 @@
 """The geometry node tree that displays splats: colors, display modes and materials. For splats that
 follow a head it computes each triangle's frame on the *evaluated* mesh."""
 
-from collections.abc import Callable
 from functools import cached_property, partial
 from typing import Any, NamedTuple
 
@@ -14,7 +13,8 @@ from .. import compat, tags
 from ..layers import FROZEN_COLOR
 from . import splat_attributes as stored
 from .frame_nodes import DEFORMED, FACE_COLOR, FRAMES, PLACED, SIGNALS, driven
-from .node_builder import NodeGroup, Nodes, find_tree, new_material, new_socket, new_tree
+from .lit_nodes import LIGHTS, LIT, RECORDED, SCENE_LIGHT, SURFACE
+from .node_builder import NodeGroup, Nodes, find_tree, kept_material, new_socket, new_tree
 
 # Inputs of the modifier, by their displayed names.
 HEAD = "Head"
@@ -26,6 +26,7 @@ PERCENTAGE = "Percentage"
 VIEW_DEPENDENT = "View-Dependent Color"
 SHOW_SELECTION = "Show Selection"
 SELECTED_ONLY = "Selected Only"
+NATIVE_LIGHT = "Native Light"
 
 
 def constant_color(nodes: Nodes, added: Any) -> Any:
@@ -102,21 +103,10 @@ SH_BANDS = tuple(
 )
 
 
-DISPLAY_COLOR = "stga_display_color"  # attribute that the splat nodes store
 DISK = 0.7  # radius of the disk that an octahedron of radius 1 shows whole
 DOT_SIZE = 1.8  # radius of a dot in mean standard deviations, at which dots leave no holes
 EXTENT = 3.0
 """Standard deviations from a quad's center to its sides; a Gaussian is below 1.2 % there."""
-
-
-def _splat_material(name: str, build: Callable[[Nodes], Any], method: str) -> bpy.types.Material:
-    """Built where the file has none; method: EEVEE's, "DITHERED" or "BLENDED"."""
-    material = bpy.data.materials.get(name)
-    if material is None:
-        material = new_material(name, build)
-        material.surface_render_method = method
-        material.use_backface_culling = True
-    return material
 
 
 def _point_shader(nodes: Nodes) -> Any:
@@ -159,7 +149,7 @@ def _emission(nodes: Nodes, attribute_type: str, density: Any) -> Any:
     color = nodes.add("ShaderNodeAttribute")
     opacity = nodes.add("ShaderNodeAttribute")
     color.attribute_type = opacity.attribute_type = attribute_type
-    color.attribute_name = DISPLAY_COLOR
+    color.attribute_name = stored.DISPLAY_COLOR
     opacity.attribute_name = stored.OPACITY
     shaders = [nodes.out("ShaderNodeBsdfTransparent")]
     shaders.append(nodes.out("ShaderNodeEmission", {"Color": color.outputs["Color"]}))
@@ -193,14 +183,7 @@ def displayed(nodes: Nodes, mode: Any, splats: Any, visible: Any, size: Any, nat
     geometries = {AS_TRAINED: in_images, **made}
     if native is not None:
         geometries[NATIVE] = native
-    menu = nodes.add("GeometryNodeMenuSwitch", data_type="GEOMETRY")
-    menu.enum_definition.enum_items.clear()
-    for name in geometries:
-        menu.enum_definition.enum_items.new(name).description = LIMITS[name]
-    for name, geometry in geometries.items():
-        nodes.tree.links.new(geometry, menu.inputs[name])
-    nodes.tree.links.new(mode, menu.inputs["Menu"])
-    return menu.outputs[0]
+    return nodes.menu("GEOMETRY", mode, geometries, LIMITS)
 
 
 def _points(nodes: Nodes, splats: Any, visible: Any, size: Any) -> bpy.types.NodeSocket:
@@ -210,7 +193,7 @@ def _points(nodes: Nodes, splats: Any, visible: Any, size: Any) -> bpy.types.Nod
     inputs = {"Mesh": splats, "Selection": visible, "Radius": nodes.math("MULTIPLY", mean, size)}
     points = nodes.out("GeometryNodeMeshToPoints", inputs)
     # EEVEE does not sort the points of a point cloud.
-    material = _splat_material("STGA Points", _point_shader, "DITHERED")
+    material = kept_material("STGA Points", _point_shader, "DITHERED")
     return nodes.out("GeometryNodeSetMaterial", {"Geometry": points, "Material": material})
 
 
@@ -222,7 +205,7 @@ def _quads(nodes: Nodes, splats: Any, visible: Any, size: Any) -> bpy.types.Node
     quad = nodes.out("GeometryNodeMeshGrid", sides)
     # EEVEE sorts instances: no noise. Stochastic transparency takes hundreds of samples to come
     # as close.
-    material = _splat_material("STGA Gaussians", _gaussian_shader, "BLENDED")
+    material = kept_material("STGA Gaussians", _gaussian_shader, "BLENDED")
     quad = nodes.out("GeometryNodeSetMaterial", {"Geometry": quad, "Material": material})
     points = {"Points": splats, "Selection": visible, "Instance": quad}
     quads = nodes.out("GeometryNodeInstanceOnPoints", points)
@@ -265,12 +248,12 @@ class _NativeInputs(NamedTuple):
 
 def _radiance(nodes: Nodes, added: Any, flat: Any) -> bpy.types.NodeSocket:
     """Field: constant coefficient and opacity of native splats, those fitted for linear light
-    where there are any; flat: of DISPLAY_COLOR. As a color, which 5.3 draws as four floats; of
+    where there are any; flat: of the display color. As a color, which 5.3 draws as four floats; of
     FLOAT4, the node that stores it in 5.2 takes three."""
     fitted, is_fitted = nodes.attribute_if_any(stored.LINEAR_SH, "FLOAT_VECTOR")
     base = nodes.switch("VECTOR", is_fitted, nodes.attribute(stored.SH.format(0)), fitted)
     base = nodes.vector("MULTIPLY_ADD", added, (1 / SH_C0,) * 3, base)
-    shown = nodes.group(LINEAR_TO_SRGB, nodes.attribute(DISPLAY_COLOR, "FLOAT_COLOR"))
+    shown = nodes.group(LINEAR_TO_SRGB, nodes.attribute(stored.DISPLAY_COLOR, "FLOAT_COLOR"))
     shown = nodes.scale(nodes.vector("SUBTRACT", shown, (0.5, 0.5, 0.5)), 1 / SH_C0)
     base = nodes.switch("VECTOR", flat, base, shown)
     clamped = nodes.vector("MINIMUM", nodes.vector("MAXIMUM", base, MIN_BASE), MAX_BASE)
@@ -317,6 +300,8 @@ NATIVE_GROUPS = tuple(
 
 
 _FROZEN = "stga_frozen"
+MENUS = {DISPLAY: AS_TRAINED, NATIVE_LIGHT: RECORDED}
+"""Inputs that are menus, and what is chosen in a new file."""
 
 
 class TreeOptions(NamedTuple):
@@ -373,7 +358,9 @@ def build_next_node_group(options: TreeOptions) -> bool:
         groups += [driven(name, convention) for name in offsets]
     if degree > 0 or options.is_colored:
         groups.append(SRGB_TO_LINEAR)
-    groups += [LINEAR_TO_SRGB, _RADIANCE, NATIVE_GROUPS[degree]] if compat.NATIVE_SPLATS else []
+    if compat.NATIVE_SPLATS:
+        groups += [LINEAR_TO_SRGB, _RADIANCE, NATIVE_GROUPS[degree]]
+        groups += [] if convention is None else [SURFACE, LIT]
     missing = next((group for group in groups if find_tree(f".{group.name}") is None), None)
     if missing is None:
         splat_tree(options)
@@ -406,6 +393,8 @@ def _add_interface(tree: bpy.types.NodeTree, embedded: bool, degree: int) -> Non
     frozen = "splats that the current frame's selection freezes"
     for name, verb in ((SHOW_SELECTION, "Gray out"), (SELECTED_ONLY, "Hide")) if embedded else ():
         add(name, "Bool", f"{verb} {frozen}", default_value=False)
+    if embedded and compat.NATIVE_SPLATS:
+        add(NATIVE_LIGHT, "Menu", "Light that native splats show in EEVEE and Cycles")
 
 
 def _build(nodes: Nodes, options: TreeOptions) -> None:
@@ -442,16 +431,24 @@ def _build(nodes: Nodes, options: TreeOptions) -> None:
         gray = nodes.logic("AND", frozen, inputs[SHOW_SELECTION])
         color = nodes.switch("RGBA", gray, color, FROZEN_COLOR)
         visible = nodes.logic("NIMPLY", visible, nodes.logic("AND", frozen, inputs[SELECTED_ONLY]))
-    splats = nodes.store(splats, DISPLAY_COLOR, nodes.group(_RELIT, color), "FLOAT_COLOR")
+    splats = nodes.store(splats, stored.DISPLAY_COLOR, nodes.group(_RELIT, color), "FLOAT_COLOR")
     native = None
     if compat.NATIVE_SPLATS:
         view_dependent = inputs[VIEW_DEPENDENT] if options.degree > 0 else False
         fields = inputs[SIZE], (0, 0, 0) if added is None else added, view_dependent, gray
-        native = nodes.group(NATIVE_GROUPS[options.degree], splats, visible, *fields)
+        lit = given = None
+        if options.convention is not None:
+            choices = {RECORDED: False, SCENE_LIGHT: True}
+            lit = nodes.menu("BOOLEAN", inputs[NATIVE_LIGHT], choices, LIGHTS)
+            given = nodes.switch("GEOMETRY", lit, splats, nodes.group(SURFACE, splats, head))
+        native = nodes.group(NATIVE_GROUPS[options.degree], given or splats, visible, *fields)
+        if lit is not None:
+            native = nodes.switch("GEOMETRY", lit, native, nodes.group(LIT, native, head))
     shown = displayed(nodes, inputs[DISPLAY], splats, visible, inputs[SIZE], native)
     nodes.finish("NodeGroupOutput", {"Geometry": shown})
-    display = next(item for item in nodes.tree.interface.items_tree if item.name == DISPLAY)
-    display.default_value = AS_TRAINED  # the menu has items only once it is linked
+    for item in nodes.tree.interface.items_tree:  # a menu has items only once it is linked
+        if item.name in MENUS:
+            item.default_value = MENUS[item.name]
 
 
 def _color(nodes: Nodes, inputs: Any, added: Any, degree: int) -> Any:

@@ -21,6 +21,7 @@ from ..objects import lock, remove
 from . import splat_attributes as stored
 from . import splat_nodes
 from .frame_nodes import SIGNALS
+from .lit_nodes import SCENE_LIGHT
 from .node_builder import VERSION, find_tree, is_current
 from .splat_attributes import SplatAttributes, avatar_attributes
 from .splat_nodes import AS_TRAINED, NATIVE, POINTS, QUADS
@@ -102,6 +103,7 @@ def _exchange_tree(splat_object: Any, tree: Any) -> None:
     before = input_identifiers(modifier)
     values = {name: modifier_input(modifier, identifier) for name, identifier in before.items()}
     modifier.node_group = tree
+    _set_menus(splat_object)
     after = input_identifiers(modifier)
     for name in values.keys() & after.keys():
         set_modifier_input(modifier, after[name], values[name])
@@ -177,6 +179,8 @@ def store_light(splat_object: Any, avatar: Avatar) -> bool:
     if neutral is None or not has_triangles(neutral, avatar.faces) or count != len(avatar.splats):
         return False
     stored.write_light(neutral, avatar.light)
+    stored.write_attributes(splat_object.data, stored.albedo_attribute(avatar), "POINT")
+    splat_object.data.update()
     splat_object.data[tags.REVISION] = uuid4().hex  # what was read of it before is out of date
     return True
 
@@ -297,6 +301,12 @@ def display_mode(splat_object: Any) -> str:
     return get_input(splat_object, splat_nodes.DISPLAY) or ""
 
 
+def is_lit(splat_object: Any) -> bool:
+    """Whether the scene's light falls on it in EEVEE and Cycles."""
+    light = get_input(splat_object, splat_nodes.NATIVE_LIGHT)
+    return light == SCENE_LIGHT and display_mode(splat_object) == NATIVE
+
+
 def choose_display(splat_object: Any, mode: str) -> None:
     """Show splats in a display mode, a name in `LIMITS`. A node tree that is not of this version,
     and may lack the mode, is built again. Raises StgaError where `stored_avatar` does."""
@@ -331,6 +341,13 @@ def _is_native(splat_object: Any) -> bool:
     with suppress(StgaError):  # it has lost its modifier
         return display_mode(splat_object) == NATIVE
     return False
+
+
+def _set_menus(splat_object: Any) -> None:
+    """Their defaults reach a modifier in some versions only."""
+    for name, value in splat_nodes.MENUS.items():
+        if input_identifier(splat_modifier(splat_object), name) is not None:
+            set_input(splat_object, name, value)
 
 
 def display_settings(modifier: Any) -> DisplaySettings:
@@ -384,8 +401,7 @@ def _splat_object(name: str, collection: Any, options: splat_nodes.TreeOptions) 
     splat_object[tags.KIND] = tags.SPLATS
     collection.objects.link(splat_object)
     splat_object.modifiers.new("STGA Splats", "NODES").node_group = splat_nodes.splat_tree(options)
-    # the default reaches it in some versions only
-    set_input(splat_object, splat_nodes.DISPLAY, AS_TRAINED)
+    _set_menus(splat_object)
     for scene in splat_object.users_scene:
         use_transparent_bounces(scene)
     return splat_object

@@ -26,6 +26,7 @@ from ..display.splat_attributes import (
 from ..display.splat_object import (
     display_settings,
     get_input,
+    is_lit,
     splat_modifier,
     stored_avatar,
     stored_light,
@@ -364,6 +365,8 @@ def light_hint(scene: Any) -> str | None:
         return None
     for shown in scene.objects:
         if tags.CONVENTION not in shown or shown.hide_render or stored_light(shown) is None:
+            continue
+        if is_lit(shown):
             continue
         frame = shown.data.get(tags.RELIT_FRAME) if RELIT_COLOR in shown.data.attributes else None
         if frame != scene.frame_current:

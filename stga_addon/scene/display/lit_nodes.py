@@ -1,0 +1,87 @@
+"""Native splats in the scene's light: a surface of albedo with the head's normals, and a shrunken
+mesh that throws the shadows."""
+
+from typing import Any
+
+import bpy
+
+from . import splat_attributes as stored
+from .node_builder import NodeGroup, Nodes, kept_material
+
+RECORDED = "Recorded"
+SCENE_LIGHT = "Scene Light"
+LIGHTS = {
+    RECORDED: "Native splats shine in the colors of the capture",
+    SCENE_LIGHT: "Native splats are lit by the scene's lights and world, and shadowed",
+}
+"""What native splats show, in EEVEE and Cycles."""
+ALBEDO = "albedo"  # of native splats, and in its fourth channel roughness
+NORMAL = "surface_normal"
+SHRINKAGE_M = 0.006
+"""By which the mesh that throws shadows lies below the head's: splats would lie in its shadow."""
+FOLD_M = 0.03
+"""Skin that sees other skin within this, as in mouth, nostrils and between lids, throws none: below
+its surface is the other one."""
+LIFT_M = 1e-4
+
+
+def _surface(nodes: Nodes, splats: Any, head: Any) -> bpy.types.NodeSocket:
+    """Splats with what they are lit by; without a known light, colors are taken for albedo."""
+    albedo, is_known = nodes.attribute_if_any(stored.ALBEDO, "FLOAT_COLOR")
+    color = nodes.attribute(stored.DISPLAY_COLOR, "FLOAT_COLOR")
+    color = nodes.switch("RGBA", is_known, color, albedo)
+    splats = nodes.store(splats, ALBEDO, color, "FLOAT_COLOR")
+    smooth = nodes.at_points(nodes.out("GeometryNodeInputNormal"), "FLOAT_VECTOR")
+    face = nodes.attribute(stored.FACE, "INT")
+    normal = nodes.sample(head, smooth, face, "FLOAT_VECTOR")
+    return nodes.store(splats, NORMAL, normal, "FLOAT_VECTOR")
+
+
+def _lit(nodes: Nodes, splats: Any, head: Any) -> bpy.types.NodeSocket:
+    """Native splats with their material, and the mesh that throws shadows."""
+    material = kept_material("STGA Lit Splats", _lit_shader, "DITHERED")
+    if cycles := getattr(material, "cycles", None):
+        # it takes light from normals that differ from the ellipsoids'
+        cycles.use_bump_map_correction = False
+    lit = nodes.out("GeometryNodeSetMaterial", {"Geometry": splats, "Material": material})
+    position = nodes.out("GeometryNodeInputPosition")
+    normal = nodes.out("GeometryNodeInputNormal")
+    start = nodes.vector("ADD", position, nodes.scale(normal, LIFT_M))
+    ray = {"Source Position": start, "Ray Direction": normal, "Ray Length": FOLD_M}
+    is_fold = nodes.add("GeometryNodeRaycast", {"Target Geometry": head, **ray}).outputs["Is Hit"]
+    open_skin = nodes.out("GeometryNodeDeleteGeometry", {"Geometry": head, "Selection": is_fold})
+    inward = {"Geometry": open_skin, "Offset": nodes.scale(normal, -SHRINKAGE_M)}
+    caster = nodes.out("GeometryNodeSetPosition", inward)
+    material = kept_material("STGA Shadow", _shadow_shader, "DITHERED")
+    caster = nodes.out("GeometryNodeSetMaterial", {"Geometry": caster, "Material": material})
+    both = nodes.add("GeometryNodeJoinGeometry")
+    for part in (lit, caster):
+        nodes.tree.links.new(part, both.inputs["Geometry"])
+    return both.outputs["Geometry"]
+
+
+def _lit_shader(nodes: Nodes) -> Any:
+    """Skin of the splats' albedo, which throws no shadow: on itself, it would be blotches."""
+    albedo = nodes.add("ShaderNodeAttribute", attribute_name=ALBEDO).outputs
+    normal = nodes.add("ShaderNodeAttribute", attribute_name=NORMAL).outputs["Vector"]
+    to_world = {"vector_type": "NORMAL", "convert_from": "OBJECT", "convert_to": "WORLD"}
+    normal = nodes.out("ShaderNodeVectorTransform", {"Vector": normal}, **to_world)
+    surface = {"Base Color": albedo["Color"], "Roughness": albedo["Alpha"], "Normal": normal}
+    return _by_shadow(nodes, nodes.out("ShaderNodeBsdfPrincipled", surface), None)
+
+
+def _shadow_shader(nodes: Nodes) -> Any:
+    """Seen by nothing but light."""
+    return _by_shadow(nodes, None, nodes.out("ShaderNodeBsdfDiffuse"))
+
+
+def _by_shadow(nodes: Nodes, seen: Any, shadow: Any) -> Any:
+    """One shader for rays to lights and one for all others; None: these pass."""
+    is_shadow = nodes.add("ShaderNodeLightPath").outputs["Is Shadow Ray"]
+    shaders = [each or nodes.out("ShaderNodeBsdfTransparent") for each in (seen, shadow)]
+    return nodes.out("ShaderNodeMixShader", {"Fac": is_shadow, "Shader": shaders})
+
+
+_INPUTS = {"Splats": "Geometry", "Head": "Geometry"}
+SURFACE = NodeGroup("STGA Lit Surface", _INPUTS, "Geometry", _surface)
+LIT = NodeGroup("STGA Scene Light", _INPUTS, "Geometry", _lit)
