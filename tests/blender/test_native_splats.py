@@ -14,13 +14,20 @@ import pytest
 
 from stga_addon.avatar.embedding import to_world
 from stga_addon.avatar.file import write_avatar
-from stga_addon.avatar.splats import SH_C0
+from stga_addon.avatar.splats import SH_C0, Splats
 from stga_addon.capture.color import linear_to_srgb
+from stga_addon.flame.quaternions import to_matrices
+from stga_addon.flame.sequence import neutral_mesh
 from stga_addon.scene import compat
+from stga_addon.scene.arrays import evaluated_vertices
 from stga_addon.scene.display import splat_nodes
-from stga_addon.scene.display.splat_nodes import NATIVE, POINTS, QUADS
+from stga_addon.scene.display.splat_attributes import read_native_splats
+from stga_addon.scene.display.splat_nodes import MAX_BASE, MIN_BASE, NATIVE, POINTS, QUADS
+from stga_addon.scene.display.splat_object import set_input, show_avatar
 from stga_addon.scene.layers import FROZEN_COLOR
+from stga_addon.scene.rig.head import import_head, rig_of
 
+from .captures import flame_model, flame_sequence, motion_capture
 from .test_operators import write_ball_avatar
 from .test_splat_object import driven_avatar, same_rotation
 from .test_versions import python_of
@@ -77,6 +84,62 @@ def test_native_splats_are_those_of_the_posed_avatar(command: list[str], tmp_pat
                 wanted.sh[:, index + 1] if case in ("recorded", "fitted") else 0 * wanted.sh[:, 0]
             )
             np.testing.assert_allclose(found[f"{case}/radiance:sh_{index}"], coefficient, atol=1e-6)
+
+
+def covariance(splats: Splats) -> np.ndarray:
+    """(N, 3, 3), which does not tell one order and sign of the axes from another."""
+    axes = to_matrices(splats.rotation.astype(np.float64))
+    axes = axes * np.exp(splats.log_scale.astype(np.float64))[:, None]
+    return axes @ axes.swapaxes(1, 2)
+
+
+@pytest.mark.skipif(not compat.NATIVE_SPLATS, reason="Blender before 5.3 has no native splats")
+def test_native_splats_follow_bones_shape_keys_and_strain(tmp_path: Path) -> None:
+    """Catches nodes that are exact on a mesh given as such, and not on an evaluated rig."""
+    sequence = flame_sequence(flame_model(300))
+    head = import_head(motion_capture(sequence, tmp_path / "motion.npz"))
+    rig = rig_of(head)
+    keys = head.data.shape_keys
+    rig.animation_data.action = keys.animation_data.action = None
+    some = driven_avatar("stga", count=800)
+    faces = sequence.model.faces
+    count = len(faces)
+    avatar = replace(
+        some,
+        splats=replace(some.splats, face=some.splats.face % count),
+        neutral=neutral_mesh(sequence).astype(np.float32),
+        faces=faces,
+        strain_range=some.strain_range[:count],
+        driven_offsets={name: each[:count] for name, each in some.driven_offsets.items()},
+    )
+    shown = show_avatar(avatar, head)
+    set_input(shown, splat_nodes.DISPLAY, NATIVE)
+    rng = np.random.default_rng(3)
+    sliders = [key for key in keys.key_blocks if key.name.startswith("expr")]
+    before = evaluated_vertices(head)
+    for _ in range(10):
+        for bone in rig.pose.bones:
+            bone.rotation_mode = "XYZ"
+            bone.rotation_euler = rng.normal(0, 0.3, 3)
+        for key in sliders:
+            key.value = rng.normal()
+        bpy.context.view_layer.update()
+        posed = evaluated_vertices(head)
+        assert np.abs(posed - before).max() > 0.01
+        wanted = to_world(avatar.splats, avatar.frames(posed))
+        (cloud,) = [
+            read_native_splats(each.object.data)
+            for each in bpy.context.evaluated_depsgraph_get().object_instances
+            if each.object.type == "POINTCLOUD"
+        ]
+        np.testing.assert_allclose(cloud.xyz, wanted.xyz, atol=1e-5)
+        size = np.exp(wanted.log_scale).max(1)[:, None, None]
+        found, expected = (covariance(each) / size**2 for each in (cloud, wanted))
+        np.testing.assert_allclose(found, expected, atol=1e-5)
+        np.testing.assert_allclose(cloud.log_scale, wanted.log_scale, atol=1e-5)
+        base = np.clip(wanted.sh[:, 0], MIN_BASE, MAX_BASE)
+        np.testing.assert_allclose(SH_C0 * cloud.sh[:, 0], SH_C0 * base, atol=1e-5)
+        np.testing.assert_allclose(cloud.opacities(), wanted.opacities(), atol=1e-5)
 
 
 @pytest.fixture
