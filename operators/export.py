@@ -1,6 +1,7 @@
 """Exports an avatar to the files of other viewers and tools; what the head plays, the cameras and a
 head model for tracking."""
 
+import os
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, closing, suppress
@@ -30,9 +31,11 @@ from ..stga_addon.flame.sequence import FlameSequence
 from ..stga_addon.format import format_bytes
 from ..stga_addon.jobs.export import Export
 from ..stga_addon.progress import Cancelled
+from ..stga_addon.scene import tags
 from ..stga_addon.scene.arrays import Z_UP_TO_Y_UP, evaluated_vertices
 from ..stga_addon.scene.cameras import export_cameras, scene_camera
-from ..stga_addon.scene.display.splat_object import check_head
+from ..stga_addon.scene.display.splat_nodes import NATIVE
+from ..stga_addon.scene.display.splat_object import check_head, display_mode, later_modifiers
 from ..stga_addon.scene.objects import (
     Identity,
     SceneView,
@@ -64,6 +67,7 @@ Read = Callable[[], Any]
 Write = Callable[[Iterable[tuple[int, Any]]], Any]
 STEP_INTERVAL_S = 0.005
 MAX_WAITING_FRAMES = 2
+SEPARATORS = ("/", os.sep)
 SUFFIXES = tuple(suffix for format in FORMATS.values() for suffix in format.suffixes)
 
 
@@ -97,6 +101,8 @@ class SplatExport(Stepwise, ExportHelper):
     def target(self: Any) -> Path:
         """The path that was chosen. Raises StgaError where it is not one of the format."""
         path = file_path(self.filepath, "export")
+        if self.filename_ext and (self.filepath.endswith(SEPARATORS) or path.is_dir()):
+            raise StgaError(f"{path}: is a folder; expected the name of a file")
         if self.filename_ext and not path.suffix:
             path = path.with_suffix(self.filename_ext)
         formats.check_suffix(path, self.format)
@@ -260,6 +266,11 @@ class ExportSplats(SplatExport, bpy.types.Operator):
         playback = Playback(fps=frames_per_second(context.scene))
         format = SPLAT_FORMATS[self.format]
         count = len(scene_frames(context.scene))
+        for shown in context.scene.objects:
+            is_own = shown.get(tags.KIND) == tags.SPLATS and not shown.hide_render
+            if is_own and display_mode(shown) != NATIVE and later_modifiers(shown):
+                names = ", ".join(each.name for each in later_modifiers(shown))
+                self.warn(f"{shown.name}: exported without {names}; {NATIVE} are exported with it")
 
         def read() -> Splats:
             depsgraph = bpy.context.evaluated_depsgraph_get()

@@ -207,7 +207,11 @@ class NumberedFiles:
     in nanoseconds, a line each; files with such a name that are not listed so are not touched."""
 
     def __init__(self, folder: Path, names: re.Pattern[str]) -> None:
-        """Raises StgaError where the folder holds one of these names that is not listed."""
+        """Raises StgaError where the folder cannot be made, or holds one of these names that is not
+        listed."""
+        there = next(each for each in (folder, *folder.parents) if os.path.lexists(each))
+        if not there.is_dir():
+            raise StgaError(f"{folder}: cannot be written ({there.name} is not a folder)")
         self.folder = folder
         self._names = names
         self._written = dict[str, str]()

@@ -265,3 +265,69 @@ def test_avatars_are_exported_as_they_are_posed(extension, head, tmp_path, displ
     stage = usd.Stage.Open(str(tmp_path / "a.usdc"))
     opacity = stage.GetPrimAtPath("/Avatar/Splats").GetAttribute("opacities").Get(3)
     np.testing.assert_allclose(opacity, 1 / (1 + np.exp(1 - expected.opacity)), atol=1e-5)
+
+
+UNWRITABLE = {
+    "no ending": ("a", "ply", ""),
+    "another ending": ("a.v2", "gltf", r"a\.v2: expected a name that ends in \.glb"),
+    "a folder": ("there/", "ply", "there: is a folder; expected the name of a file"),
+    "no path": ("", "ply", "export: no path given"),
+    "below a file": ("file/a.ply", "ply", "file/a.ply: cannot be written"),
+    "frames below a file": ("file/frames", "ply-sequence", "file/frames: cannot be written"),
+    "no folder of the system": ("/proc/a.ply", "ply", "/proc/a.ply: cannot be written"),
+    "frames where files are": ("file", "ply-sequence", "file: cannot be written"),
+}
+
+
+@pytest.mark.parametrize("case", UNWRITABLE)
+def test_what_cannot_be_written_is_one_sentence(extension, tmp_path, case) -> None:
+    """Catches tracebacks, and files beside the folder that was named."""
+    name, format, sentence = UNWRITABLE[case]
+    extension.stga_addon.scene.display.splat_object.show_world_splats(some_splats(), "room")
+    (tmp_path / "there").mkdir()
+    (tmp_path / "file").write_text("")
+    place = f"{tmp_path / name}/" if name.endswith("/") else str(tmp_path / name)
+
+    def export() -> None:
+        bpy.ops.stga.export_splats(filepath=place if name else "", format=format)
+
+    if not sentence:
+        export()
+        assert (tmp_path / "a.ply").is_file()
+        return
+    with pytest.raises(RuntimeError, match=sentence) as error:
+        export()
+    assert "Traceback" not in str(error.value)
+    assert len(str(error.value).strip().splitlines()) == 1
+    assert {each.name for each in tmp_path.iterdir()} == {"there", "file"}
+
+
+@needs_native
+def test_modifiers_after_ours_count(extension, head, tmp_path) -> None:
+    """Catches an avatar that is exported without what other modifiers make of its native splats,
+    or twice, and no sentence where it is not shown as native splats."""
+    write_ball_avatar(tmp_path / "avatar.npz")
+    bpy.ops.stga.show_avatar(filepath=str(tmp_path / "avatar.npz"))
+    splats = bpy.context.scene.stga.splats
+    bpy.ops.stga.choose_display(display="Native Splats")
+    bpy.ops.stga.export_splats(filepath=str(tmp_path / "a.ply"), format="ply")
+    plain = read_ply(tmp_path / "a.ply")
+    tree = splats.modifiers.new("move", "NODES").node_group = new_tree("move")
+    del tree["stga_version"]
+    new_socket(tree, "Geometry", "INPUT", "Geometry")
+    new_socket(tree, "Geometry", "OUTPUT", "Geometry")
+    nodes = Nodes(tree)
+    given = nodes.add("NodeGroupInput").outputs["Geometry"]
+    moved = nodes.out("GeometryNodeSetPosition", {"Geometry": given, "Offset": (1, 2, 3)})
+    nodes.finish("NodeGroupOutput", {"Geometry": moved})
+    bpy.ops.stga.export_splats(filepath=str(tmp_path / "b.ply"), format="ply")
+    found = read_ply(tmp_path / "b.ply")
+    offset = np.array(splats.matrix_world)[:3, :3] @ (1, 2, 3)
+    np.testing.assert_allclose(found.xyz, plain.xyz + offset, atol=1e-5)
+    np.testing.assert_allclose(found.sh[:, : plain.sh.shape[1]], plain.sh, atol=1e-4)
+    bpy.ops.stga.choose_display(display="As Trained")
+    bpy.ops.stga.export_splats(filepath=str(tmp_path / "c.ply"), format="ply")
+    np.testing.assert_array_equal(read_ply(tmp_path / "c.ply").xyz, plain.xyz)
+    message = bpy.context.window_manager.stga_message
+    sentence = "exported without move; Native Splats are exported with it"
+    assert message == f"{splats.name}: {sentence}"

@@ -267,6 +267,12 @@ def splat_modifier(splat_object: Any) -> Any:
     raise StgaError(f"{getattr(splat_object, 'name', None)}: is not an object that shows splats")
 
 
+def later_modifiers(splat_object: Any) -> list[Any]:
+    """The modifiers after ours that change what viewports show of the splats."""
+    last = [*splat_object.modifiers].index(splat_modifier(splat_object))
+    return [each for each in splat_object.modifiers[last + 1 :] if each.show_viewport]
+
+
 def set_input(splat_object: Any, name: str, value: Any) -> None:
     """Set an input of the splat modifier by its displayed name. Raises StgaError where it has
     none."""

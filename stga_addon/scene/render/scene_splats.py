@@ -24,9 +24,11 @@ from ..display.splat_attributes import (
     write_attributes,
 )
 from ..display.splat_object import (
+    display_mode,
     display_settings,
     get_input,
     is_lit,
+    later_modifiers,
     splat_modifier,
     stored_avatar,
     stored_light,
@@ -177,15 +179,20 @@ def native_layers(
     depsgraph: Any,
     cache: SplatCache,
     view: Any = None,
+    is_wanted: Callable[[Any], bool] = lambda splat_object: False,
 ) -> list[SceneLayer]:
     """The native splats at the depsgraph's frame that `visible_layers` has not: of others, and in
-    instances by nodes; none before Blender 5.3. view: as of `visible_layers`."""
+    instances by nodes; none before Blender 5.3. view: as of `visible_layers`. is_wanted: which of
+    those that it has, too."""
     layers = []
     for instance in depsgraph.object_instances if compat.NATIVE_SPLATS else ():
         shown = instance.object
         owner = instance.parent if instance.is_instance else shown
         # the data are there until the next instance only
-        if shown.type != "POINTCLOUD" or _is_own(owner.original, shown.original):
+        original = shown.original
+        if shown.type != "POINTCLOUD":
+            continue
+        if _is_own(owner.original, original) and not is_wanted(original):
             continue
         is_hidden = owner.hide_render or not (owner.visible_camera and shown.visible_camera)
         if view is None and is_hidden:
@@ -211,9 +218,14 @@ def all_layers(depsgraph: Any, cache: SplatCache, view: Any = None) -> list[Scen
 
 def evaluated_splats(depsgraph: Any, cache: SplatCache, to_file: np.ndarray) -> Splats:
     """All splats that images of the scene show at the depsgraph's frame, with harmonics of the
-    highest degree among them, by a matrix (4, 4) from Blender's axes. Raises StgaError as
-    `visible_layers`, and where there are none."""
-    layers = all_layers(depsgraph, cache)
+    highest degree among them, by a matrix (4, 4) from Blender's axes; native ones as modifiers
+    after ours leave them. Raises StgaError as `visible_layers`, and where there are none."""
+
+    def is_changed(shown: Any) -> bool:
+        return bool(later_modifiers(shown)) and display_mode(shown) == splat_nodes.NATIVE
+
+    layers = visible_layers(depsgraph, cache, is_wanted=lambda shown: not is_changed(shown))
+    layers += native_layers(depsgraph, cache, is_wanted=is_changed)
     camera = depsgraph.scene.camera
     eye = None if camera is None else np.array(camera.evaluated_get(depsgraph).matrix_world)[:3, 3]
     parts = []
