@@ -23,6 +23,7 @@ FOLD_M = 0.03
 """Skin that sees other skin within this, as in mouth, nostrils and between lids, throws none: below
 its surface is the other one."""
 LIFT_M = 1e-4
+TRANSLUCENT_SHARE = 1e-3
 
 
 def _surface(nodes: Nodes, splats: Any, head: Any) -> bpy.types.NodeSocket:
@@ -67,7 +68,11 @@ def _lit_shader(nodes: Nodes) -> Any:
     to_world = {"vector_type": "NORMAL", "convert_from": "OBJECT", "convert_to": "WORLD"}
     normal = nodes.out("ShaderNodeVectorTransform", {"Vector": normal}, **to_world)
     surface = {"Base Color": albedo["Color"], "Roughness": albedo["Alpha"], "Normal": normal}
-    return _by_shadow(nodes, nodes.out("ShaderNodeBsdfPrincipled", surface), None)
+    skin = nodes.out("ShaderNodeBsdfPrincipled", surface)
+    # Else Cycles' light tree leaves out lamps behind an ellipsoid, if not behind the mesh.
+    shaders = [skin, nodes.out("ShaderNodeBsdfTranslucent")]
+    lit = nodes.out("ShaderNodeMixShader", {"Fac": TRANSLUCENT_SHARE, "Shader": shaders})
+    return _by_shadow(nodes, lit, None)
 
 
 def _shadow_shader(nodes: Nodes) -> Any:
