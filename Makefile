@@ -10,7 +10,7 @@ PARALLEL := -n auto --dist worksteal
 # assertions, anew.
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: demo demo-footage test test-all test-5.3 kernels test-fast test-tools test-gui lint lint-web fuzz extension extension-complete repository clean
+.PHONY: demo demo-footage test test-all test-5.3 kernels test-fast test-tools test-gui lint lint-web fuzz extension extension-bare extension-complete repository clean
 
 demo: .venv/ready
 	$(BIN)/python -m stga_addon demo --out out/demo
@@ -66,6 +66,10 @@ fuzz: .venv/ready
 
 extension: .venv/ready
 	$(BIN)/python -m stga_addon.development.package --out dist
+
+# As extension, without others' data that are not in the public domain
+extension-bare: .venv/ready
+	$(BIN)/python -m stga_addon.development.package --edition bare --out dist
 
 # BLENDER: the command that starts a Blender, for the Python of that Blender alone; ALL=1: for every platform;
 # CUDA=1: with PyTorch's CUDA build where its CPU build cannot be had

@@ -1,5 +1,6 @@
 """Editions of the extension: what each bundles, and what its manifest says.
 
+bare      as small, without what others made that is neither code nor in the public domain
 small     tracks and trains in an interpreter that the user chooses
 complete  in Blender's own: with the wheels that this needs and a demo capture
 """
@@ -11,6 +12,11 @@ from typing import Any
 from .wheels import Target
 
 DEMO_FOLDER = "demo_capture"
+ASSETS = {
+    "ICT-FaceKit": ("stga_addon/flame/head.npz", "stga_addon/driving/arkit_shapes.npz"),
+    "MediaPipe": ("stga_addon/tracking/networks/",),
+}
+"""Data of others, by their name in the manifest's copyright -> files and folders in the zip."""
 
 
 @dataclass(frozen=True)
@@ -20,13 +26,21 @@ class Edition:
     suffix        of the file's name, after the version
     target        of the wheels that the edition bundles for training; None: only those that every
                   edition has
+    has_assets    whether it holds ASSETS
     """
 
     suffix: str = ""
     target: Target | None = None
+    has_assets: bool = True
+
+    def holds(self, name: str) -> bool:
+        """Whether a file of the checkout, by its name in the zip, is in the edition."""
+        assets = tuple(each for files in ASSETS.values() for each in files)
+        return self.has_assets or not name.startswith(assets)
 
 
 SMALL = Edition()
+BARE = Edition("-bare", has_assets=False)
 
 
 def complete(target: Target) -> Edition:
@@ -40,6 +54,9 @@ def edition_manifest(manifest: Mapping[str, Any], edition: Edition, wheels: Sequ
         name: value for name, value in manifest.items() if name not in ("build", "permissions")
     }
     values["wheels"] = [f"./wheels/{name}" for name in wheels]
+    if not edition.has_assets:
+        holders = values["copyright"]
+        values["copyright"] = [each for each in holders if not any(name in each for name in ASSETS)]
     if edition.target is not None:
         values["platforms"] = [edition.target.platform]
         first, end = edition.target.blender

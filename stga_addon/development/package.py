@@ -16,7 +16,7 @@ from ..errors import StgaError, exit_code
 from ..files import replacing
 from .compiled_kernels import compile_kernels
 from .demo.capture import unpack_capture
-from .editions import DEMO_FOLDER, SMALL, Edition, complete, edition_manifest
+from .editions import BARE, DEMO_FOLDER, SMALL, Edition, complete, edition_manifest
 from .wheels import (
     TARGETS,
     Target,
@@ -59,6 +59,7 @@ def build_zip(
     manifest = read_manifest(root)
     wheels = edition_wheels(root / "wheels", edition)
     files = {file.relative_to(root).as_posix(): file for file in extension_files(root, manifest)}
+    files = {name: file for name, file in files.items() if edition.holds(name)}
     files |= {f"wheels/{wheel.name}": wheel for wheel in wheels}
     if demo is not None:
         files |= {
@@ -181,7 +182,7 @@ def build_editions(options: argparse.Namespace) -> Iterator[Path]:
     """Build the edition that was asked for, the complete one for each of its targets. Raises
     StgaError."""
     if options.edition != "complete":
-        yield build_zip(options.out)
+        yield build_zip(options.out, edition=BARE if options.edition == "bare" else SMALL)
         return
     here = this_platform()
     targets = [target_of(shlex.split(options.blender))] if options.blender else list(TARGETS)
@@ -205,7 +206,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument(
         "--out", type=Path, default=ROOT / "dist", help="folder that receives the zip"
     )
-    parser.add_argument("--edition", choices=("small", "complete"), default="small")
+    parser.add_argument("--edition", choices=("bare", "small", "complete"), default="small")
     parser.add_argument(
         "--blender", default="", help="complete: for the Python of this Blender, and no other"
     )

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import StgaError
+from ..files import read_bytes
 
 FOLDER = Path(__file__).with_name("networks")
 FACE_FILE = FOLDER / "face_landmarker.task"
@@ -228,7 +229,7 @@ class PersonNetwork:
 
     @cached_property
     def _network(self) -> Any:
-        return _network(PERSON_FILE.read_bytes())
+        return _network(read_bytes(PERSON_FILE))
 
 
 def _network(data: bytes) -> Any:

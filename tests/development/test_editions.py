@@ -12,7 +12,7 @@ import pytest
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name, parse_wheel_filename
 
-from stga_addon.development.editions import SMALL, complete, edition_manifest
+from stga_addon.development.editions import BARE, SMALL, complete, edition_manifest
 from stga_addon.development.package import ROOT, build_zip, main, read_manifest, wheel_folder
 from stga_addon.development.wheels import (
     TARGETS,
@@ -24,6 +24,7 @@ from stga_addon.development.wheels import (
     needs,
 )
 from stga_addon.errors import StgaError
+from stga_addon.tracking.face_networks import PersonNetwork
 from stga_addon.worker.training_python import GPU_REQUIREMENT, REQUIREMENTS
 
 LINUX = Target("linux-x64", "3.11", ("4.2.0", "5.1.0"))
@@ -212,6 +213,32 @@ def test_manifest_of_an_edition(tmp_path):
     )
     assert needs(wheel, LINUX) == ["cuda", "old"]
     assert needs(wheel, WINDOWS, {"more"}) == ["dll", "more"]
+
+
+def test_the_bare_edition_has_no_data_of_others(tmp_path, monkeypatch):
+    """Catches others' data that are not told in the manifest, or stay in the zip without them; and
+    a traceback where they are missing."""
+    monkeypatch.setattr("stga_addon.development.package.edition_wheels", lambda folder, edition: [])
+    names = {}
+    holders = {}
+    for edition in (SMALL, BARE):
+        with zipfile.ZipFile(build_zip(tmp_path, edition=edition)) as archive:
+            names[edition] = set(archive.namelist())
+            manifest = tomllib.loads(archive.read("blender_manifest.toml").decode())
+        holders[edition] = " ".join(manifest["copyright"])
+    kinds = (".npz", ".task", ".tflite", ".zip")
+    assert not [name for name in names[BARE] if name.endswith(kinds)]
+    left_out = names[SMALL] - names[BARE]
+    assert {Path(name).name for name in left_out if name.endswith(kinds)} == {
+        *("head.npz", "arkit_shapes.npz", "face_landmarker.task", "selfie_segmentation.tflite")
+    }
+    assert names[BARE] < names[SMALL]
+    for holder in ("ICT-FaceKit", "MediaPipe"):
+        assert holder in holders[SMALL]
+        assert holder not in holders[BARE]
+    monkeypatch.setattr("stga_addon.tracking.face_networks.PERSON_FILE", tmp_path / "none.tflite")
+    with pytest.raises(StgaError, match=r"none\.tflite: cannot be read"):
+        assert PersonNetwork()._network
 
 
 @pytest.mark.parametrize("edition", [SMALL, complete(LINUX)], ids=["small", "complete"])
