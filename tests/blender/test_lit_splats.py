@@ -22,11 +22,13 @@ from stga_addon.scene.display.lit_nodes import (
     SCENE_LIGHT,
     SHRINKAGE_M,
 )
-from stga_addon.scene.display.splat_nodes import DISPLAY, NATIVE, NATIVE_LIGHT
+from stga_addon.scene.display.splat_nodes import DISPLAY, NATIVE, NATIVE_LIGHT, POINTS
 from stga_addon.scene.display.splat_object import set_input, store_light
+from stga_addon.scene.render.scene_splats import light_hint
 
 from .test_light import BALL, background, lamp, shown_head
 from .test_other_engines import EEVEE, EEVEE_MARKS
+from .test_panel import draw
 from .test_splat_object import active_camera
 
 pytestmark = [
@@ -124,6 +126,21 @@ def test_nothing_is_left_of_the_scenes_light(tmp_path) -> None:
         assert again.keys() == before.keys()
         for name, values in before["POINTCLOUD"].items():
             np.testing.assert_array_equal(again["POINTCLOUD"][name], values)
+
+
+def test_the_panel_offers_the_light_of_native_splats(extension) -> None:
+    """Catches a choice that is not offered, or offered for other displays, and a hint that images
+    do not show the scene's light where they do."""
+    shown, _ = native_head()
+    scene = bpy.context.scene
+    scene.stga.splats = shown
+    assert NATIVE_LIGHT in draw(extension, "show")
+    assert "render colors as recorded" in light_hint(scene)
+    set_input(shown, NATIVE_LIGHT, SCENE_LIGHT)
+    assert light_hint(scene) is None
+    set_input(shown, DISPLAY, POINTS)
+    assert NATIVE_LIGHT not in draw(extension, "show")
+    assert light_hint(scene) is not None
 
 
 @pytest.mark.parametrize("engine", [pytest.param(EEVEE, marks=EEVEE_MARKS), "CYCLES"])
