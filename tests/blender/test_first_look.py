@@ -11,6 +11,7 @@ from stga_addon.development.demo.capture import unpack_capture
 from stga_addon.export.ply import write_ply
 from stga_addon.scene import compat, tags
 from stga_addon.scene.avatar_scene import frame_head
+from stga_addon.scene.display.lit_nodes import LIGHTS
 from stga_addon.scene.display.splat_nodes import AS_TRAINED, DISPLAY, LIMITS, NATIVE, POINTS, QUADS
 from stga_addon.scene.display.splat_object import display_mode, set_input, splat_modifier
 from stga_addon.scene.objects import layers_of
@@ -145,6 +146,8 @@ def test_images_by_other_engines(extension, tmp_path):
     bpy.ops.stga.preview_images()
     assert display_mode(shown) == (NATIVE if compat.NATIVE_SPLATS else POINTS)
     tree = splat_modifier(shown).node_group
-    menu = next(node for node in tree.nodes if node.bl_idname == "GeometryNodeMenuSwitch")
-    described = {item.name: item.description for item in menu.enum_definition.enum_items}
-    assert described == {name: LIMITS[name] for name in described}
+    menus = [node for node in tree.nodes if node.bl_idname == "GeometryNodeMenuSwitch"]
+    items = [item for menu in menus for item in menu.enum_definition.enum_items]
+    expected = LIMITS | LIGHTS if compat.NATIVE_SPLATS else LIMITS.keys() - {NATIVE}
+    assert {item.name for item in items} == set(expected)
+    assert all(item.description == (LIMITS | LIGHTS)[item.name] for item in items)
