@@ -13,7 +13,7 @@ from ...avatar.strain import strain_basis, trained_range
 from ...capture.model import Capture
 from ..settings import TrainingSettings
 from .initial_splats import voxel_size
-from .surface import GRAZING_COSINE, UNSEEN_COSINE, Surface
+from .surface import UNSEEN_COSINE, Surface
 
 CACHE_BYTES = 256e6
 BYTES_PER_TRIANGLE = 170
@@ -28,7 +28,9 @@ outline hangs in the air for other cameras. Of the limits of scale and distance,
 ends."""
 SHELL_HEIGHT_SHARE = 0.8
 SHELL_VOXELS = 0.5
-"""Share of the height of hair at which its outer layer lies, less its own thickness."""
+SKIN_DEPTH = 0.1
+"""Share of the height of hair at which its outer layer lies, less its own thickness; depth of that
+on skin, in the triangles' units, so that it does not stand out of the surface."""
 
 
 @dataclass
@@ -80,7 +82,8 @@ class FrameStore:
         """Largest scale (2, F) float32 of bound and of unbound splats, in local units."""
         unbound = settings.unbound_scale_limit * self.voxel / self.unit_lengths
         limits = np.stack([settings.scale_limit * self.units, unbound])
-        cosines = UNSEEN_COSINE, GRAZING_COSINE
+        beyond = max(self.surface.grazing_cosine, UNSEEN_COSINE + 1e-9)
+        cosines = UNSEEN_COSINE, beyond
         limits *= np.interp(self.surface.facing, cosines, (UNSEEN_LIMIT_SHARE, 1))
         limits[:, self.surface.border] *= BORDER_LIMIT_SHARE
         return np.asarray(limits, np.float32)
@@ -94,10 +97,11 @@ class FrameStore:
 
     @cached_property
     def shell_height(self) -> np.ndarray:
-        """(F,) of the middle of hair's outer layer over each triangle, 0 on skin, in local
-        units."""
+        """(F,) of the middle of hair's outer layer over each triangle, just below the surface on
+        skin, in local units."""
         inner = SHELL_HEIGHT_SHARE * self.surface.hair_height - SHELL_VOXELS * self.voxel
-        return np.asarray(np.maximum(inner, 0) / self.unit_lengths, np.float32)
+        skin = -SKIN_DEPTH * self.units
+        return np.asarray(np.where(inner > 0, inner / self.unit_lengths, skin), np.float32)
 
     def of(self, timestep: int) -> FaceFrames:
         entry = self._latest(timestep)

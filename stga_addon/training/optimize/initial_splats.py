@@ -117,13 +117,14 @@ def triangle_colors(capture: Capture, views: Sequence[View]) -> np.ndarray:
     by_timestep: dict[int, list[View]] = {}
     for view in views:
         by_timestep.setdefault(view.timestep, []).append(view)
-    color, shown = mean_colors(capture, by_timestep.pop(views[0].timestep))
+    color, pixels = mean_colors(capture, by_timestep.pop(views[0].timestep))
+    shown = pixels > 0
     later: list[View] = []  # a few, of timesteps that are evenly spread, by other cameras in each
     for n, timestep in enumerate(evenly_spread(sorted(by_timestep), MAX_LATER_TIMESTEPS)):
         step = -(-len(by_timestep[timestep]) // MAX_LATER_VIEWS)
         later += by_timestep[timestep][n % step :: step]
-    late_color, late = mean_colors(capture, later)
-    late &= ~shown
+    late_color, pixels = mean_colors(capture, later)
+    late = (pixels > 0) & ~shown
     color[late] = late_color[late]
     shown |= late
     if not shown.any():
@@ -146,7 +147,7 @@ def triangle_colors(capture: Capture, views: Sequence[View]) -> np.ndarray:
 
 
 def mean_colors(capture: Capture, views: Sequence[View]) -> tuple[np.ndarray, np.ndarray]:
-    """Mean color (F, 3) in 0…1 of each triangle in the views; (F,) bool whether any shows it."""
+    """Mean color (F, 3) in 0…1 of each triangle in the views; (F,) how many pixels show it."""
     total = np.zeros((len(capture.faces), 3))
     count = np.zeros(len(capture.faces))
     for view in views:
@@ -160,7 +161,7 @@ def mean_colors(capture: Capture, views: Sequence[View]) -> tuple[np.ndarray, np
         count += np.bincount(found, minlength=len(count))
         for channel in range(3):
             total[:, channel] += np.bincount(found, pixels[:, channel], len(count))
-    return total / np.maximum(count, 1)[:, None] / 255, count > 0
+    return total / np.maximum(count, 1)[:, None] / 255, count
 
 
 def mirror_images(

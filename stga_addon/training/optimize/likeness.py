@@ -57,11 +57,13 @@ most different ones, and so are most of that many around it."""
 MOUTH_REACH = 1.1
 """How far a mouth's inside is from its middle, in that unit."""
 LINING_SHARES = np.array([0.2, 0.1, 0.1])
-GUM_SHARE = 0.75
+GUM_SHARES = (0.7, 0.3)
+GUM_REACH = (0.3, 1.0)
 TOOTH_COLOR = np.array([0.86, 0.82, 0.74])
 LIT_SKIN = 0.85
-"""A mouth's lining (red, green, blue) and gums, as shares of the lips' color; sRGB of teeth in a
-light in which skin has so much red."""
+"""A mouth's lining (red, green, blue), gums and tongue, as shares of the lips' color, the latter
+near the mouth's middle and far from it, in that unit; sRGB of teeth in a light in which skin has so
+much red."""
 
 
 @dataclass(frozen=True)
@@ -207,7 +209,9 @@ def inside_colors(
     near = away < MOUTH_REACH * at.unit
     teeth = teeth_of(capture)
     found[(near & skin)[inside]] = LINING_SHARES * np.median(color[lips], axis=0)
-    found[(near & ~skin)[inside]] = GUM_SHARE * np.median(color[lips], axis=0)
+    share = np.interp(away[inside] / at.unit, GUM_REACH, GUM_SHARES)
+    gums = (near & ~skin)[inside]
+    found[gums] = share[gums, None] * np.median(color[lips], axis=0)
     found[(teeth & near)[inside]] = light * TOOTH_COLOR
     return np.asarray(found)
 

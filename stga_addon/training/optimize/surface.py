@@ -22,7 +22,7 @@ HIDDEN_COSINE = 0.0
 GRAZING_COSINE = 0.35
 """Of the angle between a triangle and the camera that it faces most: below the first, not even hair
 stands in an outline; below the second, the triangle is hidden; below the third, it fills little of
-any image."""
+any image. In many cameras' outlines, the last two are seen well enough."""
 OUTLINE_VIEWS = 16
 OUTLINE_COSINE = 0.2
 """Views whose outlines are measured, spread over all; the largest cosine of the angle between a
@@ -65,9 +65,21 @@ class Surface:
         return outside(self.capture)
 
     @cached_property
+    def has_few_cameras(self) -> bool:
+        cameras = {view.camera_index for view in self.capture.views["train"]}
+        return len(cameras) <= FEW_CAMERAS
+
+    @property
+    def grazing_cosine(self) -> float:
+        """Of the angle between a triangle and the camera that it faces most, below which views tell
+        little of it."""
+        return GRAZING_COSINE if self.has_few_cameras else UNSEEN_COSINE
+
+    @cached_property
     def hidden(self) -> np.ndarray:
         """(F,) bool: triangles of the outside that face away from all cameras."""
-        return np.asarray(self.outside & (self.facing < HIDDEN_COSINE))
+        limit = HIDDEN_COSINE if self.has_few_cameras else UNSEEN_COSINE
+        return np.asarray(self.outside & (self.facing < limit))
 
     @cached_property
     def border(self) -> np.ndarray:
@@ -109,8 +121,7 @@ class Surface:
         """(F,) bool: hidden triangles and, where few cameras do not tell how thick it is, skin and
         clothes, above which no outline shows anything to stand."""
         at = head_coordinates(self.capture)
-        cameras = {view.camera_index for view in self.capture.views["train"]}
-        if at is None or len(cameras) > FEW_CAMERAS:
+        if at is None or not self.has_few_cameras:
             return self.hidden
         voxel = voxel_size(np.asarray(self.capture.neutral))
         bare = self.outside & ~self._scalp & (at.level < BROWS_LEVEL)

@@ -14,7 +14,7 @@ from ..settings import TrainingSettings
 from .backend import Backend
 from .change import Turn
 from .frames import FrameStore
-from .surface import GRAZING_COSINE
+from .surface import UNSEEN_COSINE
 from .unseen_sides import UnseenSides, unseen_sides
 
 WELL_SEEN_COSINE = 0.8
@@ -27,7 +27,7 @@ MIN_PULL = 0.02
 plausible at a turn; the least share of the way that is worth it."""
 HIDDEN_ORDER = 1
 HIDDEN_OPACITY = 3.0
-HIDDEN_FLATNESS = 0.5
+HIDDEN_FLATNESS = 0.25
 """Of the layer on hidden triangles: order of the lattice, logit, and how much thinner it is than
 the lattice's splats."""
 BORDER_INSET = 0.6
@@ -98,7 +98,8 @@ class SurfacePrior:
         sides = self.sides
         face = columns["face"]
         share = self._doubt(columns["second/sh"][:, 0], face)
-        share[sides.shown[face] & (self._surface.facing[face] > SHOWN_COSINE)] = 0
+        least = SHOWN_COSINE if self._surface.has_few_cameras else UNSEEN_COSINE
+        share[sides.shown[face] & (self._surface.facing[face] > least)] = 0
         rows = np.flatnonzero((share > MIN_PULL) & ~sides.triangles[face])
         plausible = ((sides.color[face] - 0.5) / SH_C0).astype(np.float32)
         sh = columns["parameters/sh"][rows]
@@ -115,7 +116,8 @@ class SurfacePrior:
     ) -> None:
         face = columns["face"]
         share = self._doubt(columns["second/opacity"][:, None], face)
-        rows = np.flatnonzero((share > MIN_PULL) & (self._surface.facing[face] < GRAZING_COSINE))
+        is_told_little = self._surface.facing < self._surface.grazing_cosine
+        rows = np.flatnonzero((share > MIN_PULL) & is_told_little[face])
         share = share[rows]
         opacity = columns["parameters/opacity"][rows]
         opacity += share * (HIDDEN_OPACITY - opacity)

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
+from ...avatar.embedding import MIN_DIVISOR, face_areas
 from ...capture.mesh_geometry import connected_parts
 from ...capture.model import Capture, View, evenly_spread, views_by_timestep
 from .initial_splats import mean_colors, mirror_images
@@ -16,7 +17,7 @@ from .likeness import (
     sources_around_head,
     teeth_of,
 )
-from .surface import FACING_TIMESTEPS, GRAZING_COSINE, UNSEEN_COSINE, Surface
+from .surface import FACING_TIMESTEPS, UNSEEN_COSINE, Surface
 
 SPREAD_VIEWS = 12
 OPEN_VIEWS = 6
@@ -27,14 +28,16 @@ MIN_TEETH_SHARE = 0.08
 SOURCE_COSINE = 0.5
 """Of the angle between a triangle and a camera: below it, others do not take its color, which a
 matte's edge may be in."""
+MIN_SHOWN_SHARE = 0.1
+"""Of the pixels that usually show as much of the surface: a folded eyelid has less."""
 SOURCE_TRIANGLES = 100
 """Of whose colors a hidden triangle has the median."""
 
 
 @dataclass(frozen=True)
 class UnseenSides:
-    """Triangles (F,) bool that no view shows; those (F,) bool that some of the views whose colors
-    were looked at show; the color (F, 3) in 0…1 that each triangle plausibly has."""
+    """Triangles (F,) bool that no view shows; those (F,) bool that the views whose colors were
+    looked at show well; the color (F, 3) in 0…1 that each triangle plausibly has."""
 
     triangles: np.ndarray
     shown: np.ndarray
@@ -49,12 +52,16 @@ def unseen_sides(surface: Surface) -> UnseenSides:
     cosine = surface.facing
     views = _color_views(capture)
     is_outside = surface.outside
-    color, shown = mean_colors(capture, views)
-    is_source = shown & is_outside & (cosine > SOURCE_COSINE)
+    color, pixels = mean_colors(capture, views)
+    density = pixels / np.maximum(face_areas(capture.neutral, capture.faces), MIN_DIVISOR)
+    facing = density[cosine > SOURCE_COSINE]
+    usual = np.median(facing[facing > 0]) if facing.any() else 0.0
+    shown = density > MIN_SHOWN_SHARE * usual
+    is_source = (pixels > 0) & is_outside & (cosine > SOURCE_COSINE)
     sources = np.flatnonzero(is_source)
     if not len(sources):
         return UnseenSides(np.zeros_like(shown), shown, color)
-    unseen = is_outside & (cosine < GRAZING_COSINE)
+    unseen = is_outside & (cosine < surface.grazing_cosine)
     found = color.copy()
     centers = np.asarray(capture.neutral)[capture.faces].mean(1)
     part = connected_parts(len(capture.neutral), capture.faces)[capture.faces[:, 0]]
@@ -75,8 +82,9 @@ def unseen_sides(surface: Surface) -> UnseenSides:
             found[rows] = color[sources_around_head(at, own, rows)]
     hidden, partner = mirror_images(capture, unseen, is_source)
     found[hidden] = color[partner]
-    inside = _unseen_inside(capture, shown, is_outside)
-    found[inside] = inside_colors(capture, color, shown, inside)
+    within = ~is_outside & ~shown
+    found[within] = inside_colors(capture, color, shown, within)
+    inside = _unseen_inside(capture, pixels > 0, is_outside)
     return UnseenSides((is_outside & (cosine < UNSEEN_COSINE)) | inside, shown, found)
 
 
