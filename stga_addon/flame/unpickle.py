@@ -9,14 +9,13 @@ own reconstruction nor scipy or chumpy is used.
 import io
 import math
 import pickle
-import pickletools
 import re
 from collections import OrderedDict
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from functools import cache
 from itertools import chain
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -26,17 +25,14 @@ from ..files import CHANGED_LINE_ENDS, line_ends_changed, read_bytes
 MAX_FILE_BYTES = 2 << 30
 MAX_DENSE_ELEMENTS = 1 << 22  # In a sparse matrix; FLAME's joint regressor has 25,115
 MAX_LISTED = 1 << 18  # Values in lists; FLAME has 29,928 corners of triangles
-MAX_DEPTH = 32
-MAX_HASHED = 1 << 16
-"""Of tuples in tuples, and of lists in lists: that many levels; a tuple, which Python hashes
-recursively and without end in C, holds that many values."""
+MAX_DEPTH = 32  # Of tuples in tuples, and of lists in lists
 SPARSE_CLASS = re.compile(
     r"scipy\.sparse(\._?(csc|csr|coo))?\.(?P<format>csc|csr|coo)_(matrix|array)"
 )
 CHUMPY_CLASS = re.compile(r"chumpy(\.\w+)+")
 
 
-class _NotAnArray(Exception):
+class _NotAnArray(pickle.UnpicklingError):
     """A pickled value that cannot become an array; the message completes 'is ...'."""
 
 
@@ -98,7 +94,33 @@ class _Function:
         raise pickle.UnpicklingError("sets attributes of a function")
 
 
-class _RestrictedUnpickler(pickle.Unpickler):
+def _bounded(load: Callable[[Any], None]) -> Callable[[Any], None]:
+    """The opcode of a tuple, which Python would hash recursively and without end in C."""
+
+    def load_bounded(unpickler: Any) -> None:
+        load(unpickler)
+        _check_nested(unpickler.stack[-1], tuple)
+
+    return load_bounded
+
+
+def _load_bytearray(unpickler: Any) -> None:
+    """Of as many bytes as the file holds; the library's allocates what the opcode promises."""
+    unpickler.append(bytearray(unpickler.read(int.from_bytes(unpickler.read(8), "little"))))
+
+
+class _RestrictedUnpickler(pickle._Unpickler):
+    """The one in Python: that in C allocates memo slots by their numbers, gigabytes of them."""
+
+    dispatch: ClassVar = {
+        **pickle._Unpickler.dispatch,
+        **{
+            opcode[0]: _bounded(pickle._Unpickler.dispatch[opcode[0]])
+            for opcode in (pickle.TUPLE, pickle.TUPLE1, pickle.TUPLE2, pickle.TUPLE3)
+        },
+        pickle.BYTEARRAY8[0]: _load_bytearray,
+    }
+
     def __init__(self, data: bytes) -> None:
         super().__init__(io.BytesIO(data), encoding="latin1")
         functions: dict[str, Callable[..., Any]] = {
@@ -144,7 +166,6 @@ def read_pickled_arrays(path: Path, names: tuple[str, ...] | None = None) -> dic
     """
     data = read_bytes(path, MAX_FILE_BYTES)
     try:
-        _check_values(data)
         loaded = _RestrictedUnpickler(data).load()
     except _Refused as error:
         if line_ends_changed(data):
@@ -154,7 +175,7 @@ def read_pickled_arrays(path: Path, names: tuple[str, ...] | None = None) -> dic
     except Exception as error:  # a damaged pickle raises anything from the opcodes that it spells
         if line_ends_changed(data):
             raise StgaError(f"{path}: {CHANGED_LINE_ENDS}") from error
-        reason = str(error) or type(error).__name__
+        reason = str(error) if isinstance(error, pickle.UnpicklingError) else "damaged, or cut off"
         raise StgaError(f"{path}: is not a readable pickle of arrays ({reason})") from error
     if not isinstance(loaded, dict):
         raise StgaError(f"{path}: holds a {type(loaded).__name__}, expected a dictionary of arrays")
@@ -175,101 +196,12 @@ def read_pickled_arrays(path: Path, names: tuple[str, ...] | None = None) -> dic
     return arrays
 
 
-_OPCODES = {opcode.code: opcode for opcode in pickletools.opcodes}
-_COUNT_BYTES = {
-    pickletools.TAKEN_FROM_ARGUMENT1: (1, False),
-    pickletools.TAKEN_FROM_ARGUMENT4: (4, True),
-    pickletools.TAKEN_FROM_ARGUMENT4U: (4, False),
-    pickletools.TAKEN_FROM_ARGUMENT8U: (8, False),
-}
-"""Kind of an argument's length -> bytes of the length, and whether it is signed."""
-_TWO_LINES = ("GLOBAL", "INST")
-
-
-def _opcodes(data: bytes) -> Iterator[tuple[pickletools.OpcodeInfo, bytes]]:
-    """Each opcode up to STOP and its argument as it is stored, without the length. Not decoded, as
-    `pickletools.genops` does: Python 3.10 to 3.13 take Python 2's strings for ASCII. Raises
-    UnpicklingError."""
-    position = 0
-    while position < len(data):
-        code = data[position : position + 1].decode("latin1")
-        position += 1
-        if code not in _OPCODES:
-            raise pickle.UnpicklingError(f"byte {code!r} is no opcode")
-        opcode = _OPCODES[code]
-        size = end = 0
-        kind = opcode.arg.n if opcode.arg is not None else 0
-        if kind == pickletools.UP_TO_NEWLINE:
-            for _ in range(1 + (opcode.name in _TWO_LINES)):
-                end = data.find(b"\n", end or position) + 1
-                if not end:
-                    raise pickle.UnpicklingError(f"{opcode.name} has no end of line")
-        else:
-            if kind in _COUNT_BYTES:
-                size, signed = _COUNT_BYTES[kind]
-                kind = int.from_bytes(data[position : position + size], "little", signed=signed)
-            end = position + size + kind
-            if kind < 0 or end > len(data):
-                raise pickle.UnpicklingError("pickle data was truncated")
-        yield opcode, data[position + size : end]
-        position = end
-        if opcode.name == "STOP":
-            return
-    raise pickle.UnpicklingError("pickle data was truncated")
-
-
-def _check_values(data: bytes) -> None:
-    """Raise UnpicklingError for what the C unpickler could not survive: memo slots that it would
-    allocate by the gigabyte, and tuples, the keys of dictionaries and sets among them, that are
-    nested too deeply or hold too much once those that they share are unfolded."""
-    values: list[tuple[int, int]] = []  # the unpickler's stack: depth and size of tuples, else 0, 1
-    marks: list[int] = []
-    memo: dict[int, tuple[int, int]] = {}
-    plain = 0, 1
-    for opcode, argument in _opcodes(data):
-        name = opcode.name
-        before = opcode.stack_before
-        if "PUT" in name or name == "MEMOIZE":
-            slot = len(memo) if name == "MEMOIZE" else _slot(name, argument)
-            if not 0 <= slot <= len(data):
-                raise pickle.UnpicklingError(f"memo slot {slot} in a file of {len(data)} bytes")
-            memo[slot] = values[-1]
-            continue
-        if name == "MARK":
-            marks.append(len(values))
-            continue
-        if name == "POP" and marks and marks[-1] == len(values):
-            marks.pop()
-            continue
-        count = len(before)
-        if pickletools.markobject in before:
-            count = len(values) - marks.pop() + before.index(pickletools.markobject)
-        if count > len(values):
-            raise pickle.UnpicklingError("unexpected MARK found")
-        taken = values[len(values) - count :]
-        del values[len(values) - count :]
-        made = plain
-        if "TUPLE" in name or name == "FROZENSET":
-            depths = max((depth for depth, _ in taken), default=0)
-            made = 1 + depths, 1 + sum(size for _, size in taken)
-            if made[0] > MAX_DEPTH or made[1] > MAX_HASHED:
-                raise pickle.UnpicklingError("tuples are nested too deeply, or too large")
-        elif "GET" in name:
-            made = memo[_slot(name, argument)]
-        elif name == "DUP":
-            made = taken[0]
-        values += [made] * len(opcode.stack_after)
-
-
-def _slot(name: str, argument: bytes) -> int:
-    return int(argument) if name in ("PUT", "GET") else int.from_bytes(argument, "little")
-
-
-def _check_lists(value: Any) -> None:
-    """Raise _NotAnArray for lists in lists that unfold to too many values, or are too deep."""
+def _check_nested(value: Any, kind: Any) -> None:
+    """Raise _NotAnArray for tuples or lists in each other that unfold to too many values, or are
+    too deep."""
     level: list[Any] = [value]
     for _ in range(MAX_DEPTH):
-        inner = [each for each in level if isinstance(each, list | tuple)]
+        inner = [each for each in level if isinstance(each, kind)]
         if not inner:
             return
         if sum(map(len, inner)) > MAX_LISTED:
@@ -309,7 +241,7 @@ def _leaf(value: Any) -> np.ndarray:
     if source == SCALAR and len(value.arguments) == 2:
         return _from_bytes(value.arguments[1], _dtype(value.arguments[0]), (), "C")
     if isinstance(value, list | tuple | int | float):
-        _check_lists(value)
+        _check_nested(value, list | tuple)
         try:
             plain = np.asarray(_plain(value))
         except (ValueError, OverflowError) as error:

@@ -204,3 +204,23 @@ def test_functions_cannot_be_changed(tmp_path, name, state):
     for method in (vars(_RestrictedUnpickler)[name] for name in ("encode", "rebuild")):
         assert vars(method) == {}
     assert not hasattr(codecs.encode, "left")
+
+
+@pytest.mark.parametrize(
+    ("data", "problem"),
+    [
+        (b"})" + b"\x85" * 1_000_000 + b"Ns.", "too many, or too deep"),
+        (b"}(" + b"K\x01" * 9 + b"t" + b"2\x86" * 60 + b"Ns.", "too many, or too deep"),
+        (b"}U\x01a\x96" + b"\xff" * 7 + b"\x0fs.", "damaged, or cut off"),
+        (b"}U\x01a\x96" + b"\xff" * 8 + b"s.", "damaged, or cut off"),
+        (b"}r\xff\xff\xff\x7fU\x01aT\xff\xff\xff\x7fs.", "damaged, or cut off"),
+    ],
+    ids=["deep", "wide", "long", "longest", "slot"],
+)
+def test_what_a_file_promises_is_not_allocated(tmp_path, data, problem):
+    """Catches tuples as keys that end the process when they are hashed, and memory that only an
+    opcode's number asks for."""
+    path = tmp_path / "model.pkl"
+    path.write_bytes(b"\x80\x02" + data)
+    with pytest.raises(StgaError, match=problem):
+        read_pickled_arrays(path)
