@@ -14,7 +14,7 @@ import numpy as np
 
 from ..capture.model import evenly_spread, parts_of
 from ..flame.forward import RIGID_SIZE
-from ..worker.helpers import Helpers, Step
+from ..worker.helpers import Step
 from .appearance import PyramidView, Sample, Texture, Views, average_texture, pyramid, robust
 from .dense_head import HELD_OUT_LEVEL, NO_TEXTURE, REGIONS, UPPER_FACE, DenseHead, Misfit
 from .fit import (
@@ -27,7 +27,7 @@ from .fit import (
 )
 from .posed_points import split
 from .solve import Observation, acceleration_precision, normal_equations, prior_terms, smoothed
-from .stages import ReportStage, Stage, unreported
+from .stages import Crew, Stage
 
 MIN_TIMESTEPS = 6  # Below it, an averaged texture is no evidence of how timesteps differ
 SETTLED_WEIGHT = 0.1  # Least weight of a timestep in the texture of a settled take
@@ -119,11 +119,7 @@ class _Solved:
 
 
 def fit_dense(
-    fit: HeadFit,
-    take: RecordedTake,
-    helpers: Helpers,
-    settled: bool = False,
-    report: ReportStage = unreported,
+    fit: HeadFit, take: RecordedTake, crew: Crew, settled: bool = False
 ) -> DenseFit | None:
     """Expression and pose of every timestep from the images; None where the take is too short for
     it.
@@ -147,7 +143,7 @@ def fit_dense(
     ) -> list:
         every = [(*excerpt(fit, take, part), *arguments) for part, *arguments in parts]
         stage = Stage.REFINEMENT if settled else Stage.DENSE
-        return helpers.map(work, every, lambda steps: report(stage, before + steps, total), keep)
+        return crew.map(work, every, (stage, before, total), keep)
 
     weights = head.rest([fit.parameters[t] for t in chosen])
     weights = np.maximum(weights, SETTLED_WEIGHT if settled else 0)

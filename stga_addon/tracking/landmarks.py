@@ -10,14 +10,14 @@ import numpy as np
 from ..capture.model import parts_of
 from ..errors import StgaError
 from ..files import read_npz, write_npz
-from ..worker.helpers import MAX_HELPERS, Helpers, Step
+from ..worker.helpers import MAX_HELPERS, Step
 from .face_networks import FaceNetworks
 from .fit import MIN_LANDMARKS
 from .folder import PLACES_FILE
 from .footage.model import Footage, FootageCamera
 from .head_model import floats
 from .posed_points import SurfacePoints
-from .stages import ReportStage, Stage
+from .stages import Crew, Stage
 
 MIN_BARYCENTRIC = -1e-3
 MAX_SUM_ERROR = 1e-3
@@ -55,7 +55,7 @@ def landmark_file(folder: Path, camera: str) -> Path:
 
 
 def detect_landmarks(
-    footage: Footage, detector: FaceNetworks, folder: Path, helpers: Helpers, report: ReportStage
+    footage: Footage, detector: FaceNetworks, folder: Path, crew: Crew
 ) -> dict[str, CameraLandmarks]:
     """Landmarks by camera; each camera's are written to `folder`, and read from there where they
     are already.
@@ -66,16 +66,16 @@ def detect_landmarks(
     total = sum(len(camera.timesteps) for camera in footage.cameras)
     found: dict[str, CameraLandmarks] = {}
     done = 0
-
-    def count(steps: int) -> None:
-        report(Stage.LANDMARKS, done + steps, total)
-
     for camera in footage.cameras:
         path = landmark_file(folder, camera.name)
         if not path.exists():
             limit = max(MIN_PART_TIMESTEPS, -(-len(camera.timesteps) // MAX_HELPERS))
             parts = [(camera, part, detector) for part in parts_of(camera.timesteps, limit)]
-            seen = [faces for part in helpers.map(_detect, parts, count) for faces in part]
+            seen = [
+                faces
+                for part in crew.map(_detect, parts, (Stage.LANDMARKS, done, total))
+                for faces in part
+            ]
             several = [t for t, own in zip(camera.timesteps, seen, strict=True) if len(own) > 1]
             if len(several) > MAX_TWO_FACES_SHARE * len(camera.timesteps):
                 raise StgaError(
@@ -92,7 +92,7 @@ def detect_landmarks(
         # in the file's precision, whether it was detected now or before
         found[camera.name] = read_camera(path, camera)
         done += len(camera.timesteps)
-        count(0)
+        crew.report(Stage.LANDMARKS, done, total)
     return found
 
 

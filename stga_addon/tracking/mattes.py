@@ -18,11 +18,11 @@ from scipy.ndimage import binary_fill_holes
 
 from ..capture.model import parts_of
 from ..files import read_json, replacing, write_json
-from ..worker.helpers import Helpers, Step
+from ..worker.helpers import Step
 from .face_networks import PersonNetwork
 from .folder import MATTES_FILE, mask_name
 from .footage.model import Footage, FootageCamera
-from .stages import ReportStage, Stage
+from .stages import Crew, Stage
 
 PART_TIMESTEPS = 24  # At most, of the parts of a camera that are worked on at once
 MIN_HEAD_PROBABILITY = 0.5
@@ -62,8 +62,7 @@ def with_mattes(
     head_pixels: HeadPixels,
     out: Path,
     source: dict[str, Any],
-    helpers: Helpers,
-    report: ReportStage,
+    crew: Crew,
 ) -> tuple[Footage, tuple[str, ...]]:
     """The footage with a mask for every frame, and warnings.
 
@@ -78,10 +77,6 @@ def with_mattes(
     write_json(path, source)
     unseen = list[str]()
     cameras = []
-
-    def count(steps: int) -> None:
-        report(Stage.MATTES, done + steps, total)
-
     for number, camera in enumerate(footage.cameras):
         files = {t: out / mask_name(t, number) for t in camera.timesteps}
         kept = {t: file for t, file in files.items() if continues and file.exists()}
@@ -89,9 +84,9 @@ def with_mattes(
         parts = [part for part in parts_of(left, PART_TIMESTEPS) if part]
         work = [(camera, {t: files[t] for t in part}, head_pixels) for part in parts]
         done += len(kept)
-        found = helpers.map(_write_mattes, work, count)
+        found = crew.map(_write_mattes, work, (Stage.MATTES, done, total))
         done += len(left)
-        count(0)
+        crew.report(Stage.MATTES, done, total)
         known = {t: is_seen for part in found for t, is_seen in part.items()}
         unseen += [f"{camera.name} at timestep {t}" for t in left if not known.get(t, True)]
         mattes = {t: file for t, file in files.items() if t in kept or t in known}

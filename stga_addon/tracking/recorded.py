@@ -121,7 +121,7 @@ def _detected(opened: OpenedFootage, crew: Crew) -> tuple[dict[str, CameraLandma
     take = RecordedTake(places, reliable, {})
     crew.show(partial(picture_of_first_frame, opened.head, footage, detector, take), {})
     try:
-        detected = detect_landmarks(footage, detector, kept, crew.helpers, crew.report)
+        detected = detect_landmarks(footage, detector, kept, crew)
         _check_faces(footage, detected)
         _check_share(footage, detected)
     except StgaError:

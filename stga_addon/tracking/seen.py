@@ -10,7 +10,6 @@ import numpy as np
 from ..capture.mesh_geometry import silhouette
 from ..capture.model import evenly_spread
 from ..flame.forward import parameters_at
-from ..worker.helpers import Helpers
 from . import fit as head_fit
 from .dense import DenseFit, fit_dense
 from .dense_head import REGIONS
@@ -23,7 +22,7 @@ from .opened import file_state
 from .pictures import picture_of_fit
 from .recorded import RecordedFootage
 from .reprojection import Errors, check_cameras, median_px, reprojection_errors
-from .stages import Crew, ReportStage, Stage, unreported
+from .stages import Crew, Stage
 from .surface import fit_surface
 from .torso import FollowedTorso, follow_torso
 
@@ -96,16 +95,14 @@ def fit_skin(fitted: FittedHead, crew: Crew) -> FittedHead:
     """The head of a person who is seen for the first time, fitted to images."""
     fitted = _with_images(fitted)
     recorded = fitted.recorded
-    fit, misfits = by_images(
-        recorded.opened.head, fitted.fit, recorded.take, crew.helpers, crew.report
-    )
+    fit, misfits = by_images(recorded.opened.head, fitted.fit, recorded.take, crew)
     return _in_world(replace(fitted, fit=fit, misfits=misfits))
 
 
 def fit_expressions(fitted: FittedHead, person: HeadFit, crew: Crew) -> FittedHead:
     """The head of a known person, whose surface need not be sought, posed as images show it."""
     fitted = _with_images(fitted)
-    dense = fit_dense(fitted.fit, fitted.recorded.take, crew.helpers, report=crew.report)
+    dense = fit_dense(fitted.fit, fitted.recorded.take, crew)
     fit = fitted.fit if dense is None else dense.fit
     fit = replace(fit, shape=person.shape, static_offset=person.static_offset)
     return _in_world(replace(fitted, fit=fit, misfits=_misfits(dense)))
@@ -124,28 +121,23 @@ def with_torso(fitted: FittedHead, crew: Crew, bends: bool) -> SeenHead:
         plates = [camera.plate for camera in footage.cameras if camera.plate is not None]
         source = {**opened.source, "plates": [list(map(str, plates)), file_state(plates)]}
         pixels = partial(_head_pixels, fitted.fit, parameters)
-        helpers = crew.helpers
-        footage, unseen = with_mattes(footage, pixels, opened.out, source, helpers, crew.report)
+        footage, unseen = with_mattes(footage, pixels, opened.out, source, crew)
         warnings += unseen
-    torso = follow_torso(fitted.fit, parameters, footage, crew.helpers, crew.report, bends)
+    torso = follow_torso(fitted.fit, parameters, footage, crew, bends)
     return SeenHead(fitted, errors, footage, torso, warnings)
 
 
 def by_images(
-    head: HeadModel,
-    fit: HeadFit,
-    take: RecordedTake,
-    helpers: Helpers,
-    report: ReportStage = unreported,
+    head: HeadModel, fit: HeadFit, take: RecordedTake, crew: Crew
 ) -> tuple[HeadFit, Misfits]:
     """The fit moved onto what the images show, and how badly they are explained. `fit` is what
     `fit_head` returns for `head`."""
-    dense = fit_dense(fit, take, helpers, report=report)
+    dense = fit_dense(fit, take, crew)
     if dense is None:
-        return fit_surface(head, fit, take, helpers, report), {}
+        return fit_surface(head, fit, take, crew), {}
     take = replace(take, landmarks=dense.landmarks)
-    fit = fit_surface(head, dense.fit, take, helpers, report, dense=True)
-    dense = fit_dense(fit, take, helpers, True, report)
+    fit = fit_surface(head, dense.fit, take, crew, dense=True)
+    dense = fit_dense(fit, take, crew, settled=True)
     assert dense is not None
     return dense.fit, _misfits(dense)
 

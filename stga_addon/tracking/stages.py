@@ -1,8 +1,9 @@
 """Stages of a tracking, and how they are reported."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from enum import Enum
+from typing import Any
 
 import numpy as np
 
@@ -65,3 +66,15 @@ class Crew:
     helpers: Helpers
     report: ReportStage = unreported
     show: Show = unseen
+
+    def map(
+        self,
+        work: Callable[..., Any],
+        parts: Sequence[tuple],
+        at: tuple[Stage, int, int],
+        keep: bool = False,
+    ) -> list[Any]:
+        """The results of `Helpers.map`, whose steps are told; at: a stage, its steps before these,
+        and in all."""
+        stage, before, total = at
+        return self.helpers.map(work, parts, lambda n: self.report(stage, before + n, total), keep)

@@ -11,7 +11,7 @@ from ..capture.mesh_geometry import vertex_normals
 from ..capture.model import evenly_spread, parts_of
 from ..flame.forward import RIGID_SIZE
 from ..flame.model import faces_within
-from ..worker.helpers import Helpers, Step
+from ..worker.helpers import Step
 from . import fit as head_fit
 from .fit import HeadFit, RecordedTake, posed_mesh
 from .head_model import HeadModel
@@ -27,7 +27,7 @@ from .seen_surface import (
     surface_points,
 )
 from .solve import LANDMARK_SIGMA_M, Observation, person, solve_identity, solve_take
-from .stages import ReportStage, Stage, unreported
+from .stages import Crew, Stage
 
 IDENTITY_SWEEPS = (
     Sweep(0.010, 0.001, 0.0015),
@@ -75,8 +75,7 @@ def fit_surface(
     head: HeadModel,
     fit: HeadFit,
     take: RecordedTake,
-    helpers: Helpers,
-    report: ReportStage = unreported,
+    crew: Crew,
     dense: bool = False,
 ) -> HeadFit:
     """The fit moved onto the surface that several cameras see; unchanged where no timestep has
@@ -103,7 +102,7 @@ def fit_surface(
     take = replace(take, landmarks=visible)
     points = surface_points(head, SURFACE_POINTS)
     early = (len(IDENTITY_SWEEPS) + len(OUTLINE_SWEEPS)) * len(chosen)
-    search = _Search(helpers, report, early + len(timesteps))
+    search = _Search(crew, early + len(timesteps))
     start = replace(fit, parameters={t: fit.parameters[t] for t in chosen})
     solved = _solved_subject(head, start, take, points, search)
     if solved is None:
@@ -133,19 +132,15 @@ class _Search:
     """Parts of a search for the surface, worked on at once by helping processes, and reported as
     so many timesteps of `total`."""
 
-    def __init__(self, helpers: Helpers, report: ReportStage, total: int) -> None:
+    def __init__(self, crew: Crew, total: int) -> None:
         self.done = 0
-        self._helpers = helpers
-        self._report = report
+        self._crew = crew
         self._total = total
 
     def __call__(self, work: Callable[..., list], parts: Sequence[tuple]) -> list:
         """The results of the parts' timesteps, in order."""
-
-        def count(steps: int) -> None:
-            self._report(Stage.SURFACE, self.done + steps, self._total)
-
-        found = [one for result in self._helpers.map(work, parts, count) for one in result]
+        at = Stage.SURFACE, self.done, self._total
+        found = [one for result in self._crew.map(work, parts, at) for one in result]
         self.done += len(found)
         return found
 

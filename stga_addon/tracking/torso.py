@@ -17,13 +17,13 @@ import numpy as np
 from ..capture.model import evenly_spread
 from ..flame.forward import RIGID_SIZE, axis_angle_matrices, cross_matrices
 from ..flame.model import torso_faces
-from ..worker.helpers import Helpers, Step
+from ..worker.helpers import Step
 from . import appearance, torso_take
 from .appearance import NOISE_LEVELS, flow_weights, point_weights, projection_derivative, sampled
 from .fit import HeadFit, posed_mesh
 from .folder import TorsoMotion, TorsoPoints
 from .footage.model import Footage
-from .stages import ReportStage
+from .stages import Crew
 from .surface import with_offset
 from .torso_cloth import Bending, found_bending
 from .torso_take import NECK, Motion, PosedTorso, TorsoPose, TorsoTake, axis_angle, head_turn
@@ -80,8 +80,7 @@ def follow_torso(
     fit: HeadFit,
     parameters: Mapping[int, np.ndarray],
     footage: Footage,
-    helpers: Helpers,
-    report: ReportStage,
+    crew: Crew,
     bends: bool = True,
 ) -> FollowedTorso:
     """The torso's motion in a take of heads whose parameters (E + 18,) are given by timestep.
@@ -108,7 +107,7 @@ def follow_torso(
     seen = torso_take.seen_points(take, middle)
     if sum(map(len, seen.rows.values())) < MIN_POINTS:
         return FollowedTorso(fit, unchanged)
-    walk = torso_take.BothWays(helpers, report, len(some) + 3 * len(unchanged))
+    walk = torso_take.BothWays(crew, len(some) + 3 * len(unchanged))
     motions = _motions(take, seen, some, walk)
     deep = torso_take.at_depth(take, seen, motions)
     found = torso_take.compared(take, deep, motions, some)

@@ -15,13 +15,12 @@ from ..capture.model import evenly_spread
 from ..flame.forward import RIGID_SIZE, axis_angle_matrices
 from ..flame.model import JOINTS, MIN_TORSO_WEIGHT, torso_faces
 from ..flame.quaternions import from_matrices, to_axis_angle
-from ..worker.helpers import Helpers
 from . import appearance
 from .appearance import NOISE_LEVELS, PyramidView, inside, sampled, unexplained
 from .fit import HeadFit, posed_mesh
 from .footage.model import FootageCamera
 from .posed_points import PosedPoints, SurfacePoints, head_rotation, split, unit
-from .stages import ReportStage, Stage
+from .stages import Crew, Stage
 
 ROOT = JOINTS.index("root")
 NECK = JOINTS.index("neck")
@@ -186,9 +185,8 @@ class TorsoTake:
 class BothWays:
     """Work along a take, from one timestep to both ends, by helping processes, each on a way."""
 
-    def __init__(self, helpers: Helpers, report: ReportStage, total: int) -> None:
-        self._helpers = helpers
-        self._report = report
+    def __init__(self, crew: Crew, total: int) -> None:
+        self._crew = crew
         self._done = 0
         self._total = total
 
@@ -199,12 +197,7 @@ class BothWays:
         later = [first, *sorted(t for t in timesteps if t > first)]
         earlier = [first, *sorted((t for t in timesteps if t < first), reverse=True)]
         every = [(own, way) for own in who for way in (later, earlier)]
-        done = self._done
-
-        def count(number: int) -> None:
-            self._report(Stage.TORSO, done + number, self._total)
-
-        found = self._helpers.map(follow, every, count, keep=True)
+        found = self._crew.map(follow, every, (Stage.TORSO, self._done, self._total), keep=True)
         self._done += len(who) * (len(later) + len(earlier) - 2)
         results: list[dict[int, Rows]] = [{} for _ in who]
         for number, ((_, way), own) in enumerate(zip(every, found, strict=True)):

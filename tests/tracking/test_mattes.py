@@ -11,6 +11,7 @@ from stga_addon.errors import StgaError
 from stga_addon.tracking import mattes
 from stga_addon.tracking.footage.open import open_footage
 from stga_addon.tracking.mattes import with_mattes
+from stga_addon.tracking.stages import Crew
 from stga_addon.worker.helpers import Helpers
 
 from .scenes import HEIGHT, WIDTH, write_image, write_video
@@ -56,7 +57,7 @@ def take(folder, frames=3):
 
 def made(footage, folder, source=None):
     """The footage with mattes, and warnings."""
-    return with_mattes(footage, head, folder / "out", source or {}, Helpers(1), lambda *_: None)
+    return with_mattes(footage, head, folder / "out", source or {}, Crew(Helpers(1)))
 
 
 def brightest(footage):

@@ -39,6 +39,7 @@ from stga_addon.tracking.head_model import HeadModel
 from stga_addon.tracking.landmarks import write_places
 from stga_addon.tracking.opened import TrackingOptions
 from stga_addon.tracking.solve import person
+from stga_addon.tracking.stages import Crew
 from stga_addon.tracking.surface import with_offset
 from stga_addon.tracking.torso import _followed, follow_torso
 from stga_addon.tracking.torso_cloth import Bending, draped, found_bending, torso_sheet
@@ -73,7 +74,7 @@ HERE = Similarity(1.0, np.eye(3), np.zeros(3))
 
 
 def follow(fit, parameters, footage):
-    return follow_torso(fit, parameters, footage, Helpers(1), lambda *_: None)
+    return follow_torso(fit, parameters, footage, Crew(Helpers(1)))
 
 
 def assert_head_stays(fit, parameters, meshes):
@@ -256,7 +257,7 @@ def test_cloth_that_slides_over_the_shoulders_is_followed(fine_head):
     first = 3
     moved = np.arange(TIMESTEPS)[:, None] * [0.002, 0, 0] + LIFT_M
     shown = (cloth + slides[first] + moved[first])[cloth[:, 2] > CHEST_CENTER_M[2] + 0.02]
-    walk = BothWays(Helpers(1), lambda *_: None, TIMESTEPS)
+    walk = BothWays(Crew(Helpers(1)), TIMESTEPS)
     bending = found_bending(posed, motion, TorsoPoints(first, shown), sorted(parameters), walk)
     meshes = {}
     for timestep, torso in motion.items():

@@ -31,7 +31,7 @@ from stga_addon.tracking.head_model import HeadModel
 from stga_addon.tracking.landmarks import detect_landmarks, landmark_file, read_camera
 from stga_addon.tracking.opened import TrackingOptions
 from stga_addon.tracking.solve import person
-from stga_addon.tracking.stages import Stage
+from stga_addon.tracking.stages import Crew, Stage
 from stga_addon.tracking.track import track
 from stga_addon.worker.helpers import Helpers
 
@@ -339,10 +339,10 @@ def test_detection_resumes_camera_by_camera(recorded):
     footage = open_footage(folder / "footage")
     detector = Counting([np.ones((3, 2))] * 2)
     with pytest.raises(KeyboardInterrupt):
-        detect_landmarks(footage, detector, folder / "found", Helpers(1), cancel)
+        detect_landmarks(footage, detector, folder / "found", Crew(Helpers(1), cancel))
     assert len(list((folder / "found").iterdir())) == 2
     detector.calls = 0
-    found = detect_landmarks(footage, detector, folder / "found", Helpers(1), lambda *_: None)
+    found = detect_landmarks(footage, detector, folder / "found", Crew(Helpers(1)))
     assert detector.calls == 15
     # the same face twice is one face
     assert all(camera.confidence.all() for camera in found.values())
@@ -352,7 +352,7 @@ def test_detection_resumes_camera_by_camera(recorded):
     two = np.array([[0.0, 0.0], [9.0, 9.0]])
     message = r"camera cam0 sees 5 of 5 frames with two faces, the first at timestep 0"
     with pytest.raises(StgaError, match=message):
-        detect_landmarks(footage, Counting([two, two + 30]), folder, Helpers(1), lambda *_: None)
+        detect_landmarks(footage, Counting([two, two + 30]), folder, Crew(Helpers(1)))
 
 
 def cancel(stage, done, total):
