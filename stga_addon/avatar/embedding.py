@@ -153,7 +153,7 @@ def face_areas(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
 def points_to_world(points: np.ndarray, frames: FaceFrames, face: np.ndarray) -> np.ndarray:
     """(N, 3) in meters of points (N, 3) in the frames of the triangles `face` (N,)."""
     turned = np.einsum("nij,nj->ni", frames.rotation[face], points)
-    return np.asarray(frames.scale[face, None] * turned + frames.origin[face])
+    return frames.scale[face, None] * turned + frames.origin[face]
 
 
 def to_world(splats: Splats, frames: FaceFrames) -> Splats:
@@ -265,11 +265,11 @@ def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 def _length(v: np.ndarray) -> np.ndarray:
-    return np.asarray(np.sqrt(_dot(v, v)))
+    return np.sqrt(_dot(v, v))
 
 
 def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    return np.asarray(a[0] * b[0] + a[1] * b[1] + a[2] * b[2])
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
 def _orthonormal(first: np.ndarray, triangles: _Triangles) -> tuple[np.ndarray, np.ndarray]:

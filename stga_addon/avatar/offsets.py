@@ -54,7 +54,7 @@ stays gets brighter or darker."""
 
 def offset_of(coefficients: np.ndarray, signal: np.ndarray) -> np.ndarray:
     """(F, 3): coefficients (F, S, 3) times signal (F, S)."""
-    return np.asarray(np.einsum("fk,fkc->fc", signal, coefficients))
+    return np.einsum("fk,fkc->fc", signal, coefficients)
 
 
 def moved_frames(

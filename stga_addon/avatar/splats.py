@@ -61,7 +61,7 @@ class Splats:
 
     def scales(self) -> np.ndarray:
         """(N, 3) float32: standard deviations, linear."""
-        return np.asarray(np.exp(self.log_scale))
+        return np.exp(self.log_scale)
 
     def opacities(self) -> np.ndarray:
         """(N,) float32 in 0 to 1."""
@@ -188,4 +188,4 @@ def sh_color(sh: np.ndarray, direction: np.ndarray) -> np.ndarray:
     from the eye."""
     terms = enumerate(harmonics(*direction.T)[1 : sh.shape[1]], 1)
     rest = sum(term[:, None] * sh[:, k] for k, term in terms)
-    return np.asarray(0.5 + SH_C0 * sh[:, 0] + rest)
+    return 0.5 + SH_C0 * sh[:, 0] + rest

@@ -271,12 +271,12 @@ def _unit(normal: np.ndarray) -> np.ndarray:
     """Unit vectors (3, F); 0 where triangles have no area."""
     square = normal[0] * normal[0] + normal[1] * normal[1] + normal[2] * normal[2]
     flat = square < MIN_SQUARED_NORMAL
-    return np.asarray(np.where(flat, 0.0, normal / np.sqrt(np.where(flat, 1.0, square))))
+    return np.where(flat, 0.0, normal / np.sqrt(np.where(flat, 1.0, square)))
 
 
 def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """Scalar products (F,) of vectors (F, 3)."""
-    return np.asarray(a[:, 0] * b[:, 0] + a[:, 1] * b[:, 1] + a[:, 2] * b[:, 2])
+    return a[:, 0] * b[:, 0] + a[:, 1] * b[:, 1] + a[:, 2] * b[:, 2]
 
 
 def _by_component(per_face: np.ndarray, dtype: Any = None) -> np.ndarray:
@@ -287,4 +287,4 @@ def _by_component(per_face: np.ndarray, dtype: Any = None) -> np.ndarray:
 def _product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """The symmetric part (F, 6) of the outer product of vectors (F, 3): xx, yy, zz, xy, yz, zx."""
     outer = (a[:, :, None] * b[:, None, :] + b[:, :, None] * a[:, None, :]) / 2
-    return np.asarray(outer[:, [0, 1, 2, 0, 1, 2], [0, 1, 2, 1, 2, 0]])
+    return outer[:, [0, 1, 2, 0, 1, 2], [0, 1, 2, 1, 2, 0]]

@@ -311,7 +311,7 @@ def find_region(capture: Capture, name: str) -> np.ndarray:
     path = Path(name)
     shape = (len(capture.faces),)
     if name in capture.regions:
-        region = np.asarray(capture.regions[name])
+        region = capture.regions[name]
     elif name in masks:
         region = faces_within(capture.faces, masks[name])
     elif path.suffix.lower() == ".npz":
@@ -322,10 +322,10 @@ def find_region(capture: Capture, name: str) -> np.ndarray:
                 f"{path}: expected 'weights', one number from 0 to 1 per triangle {shape}, "
                 f"found {found}"
             )
-        region = np.asarray(weights >= SELECTED_WEIGHT)
+        region = weights >= SELECTED_WEIGHT
     elif path.suffix.lower() == ".json":
         regions = read_regions(path, capture.faces, len(capture.neutral))
-        region = np.asarray(np.any([np.zeros(shape, bool), *regions.values()], axis=0))
+        region = np.any([np.zeros(shape, bool), *regions.values()], axis=0)
     else:
         known = ", ".join(dict.fromkeys([*capture.regions, *masks])) or "none"
         raise StgaError(

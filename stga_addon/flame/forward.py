@@ -37,7 +37,7 @@ class FlameFrame:
     def pose(self) -> np.ndarray:
         """(5, 3) axis-angle of root, neck, jaw, left eye, right eye."""
         joints = [self.rotation, self.neck_pose, self.jaw_pose, self.eyes_pose]
-        return np.asarray(np.concatenate(joints).reshape(len(JOINTS), 3))
+        return np.concatenate(joints).reshape(len(JOINTS), 3)
 
     @property
     def parameters(self) -> np.ndarray:
@@ -147,7 +147,7 @@ def nearest_axis_angle(vectors: np.ndarray, others: np.ndarray) -> np.ndarray:
     angle = np.linalg.norm(vectors, axis=-1, keepdims=True)
     axis = vectors / np.maximum(angle, np.finfo(np.float64).tiny)
     along = (others * axis).sum(-1, keepdims=True)
-    return np.asarray(vectors + 2 * np.pi * np.round((along - angle) / (2 * np.pi)) * axis)
+    return vectors + 2 * np.pi * np.round((along - angle) / (2 * np.pi)) * axis
 
 
 def _joints(vectors: np.ndarray) -> np.ndarray:
@@ -161,7 +161,7 @@ def left_jacobian(angles: np.ndarray) -> np.ndarray:
     cross = cross_matrices(angles[None])[0]
     second = 0.5 * np.sinc(angle / (2 * np.pi)) ** 2  # (1 − cos) / angle²
     third = (1 - np.sinc(angle / np.pi)) / angle**2 if angle > SMALL_ANGLE else 1 / 6
-    return np.asarray(np.eye(3) + second * cross + third * cross @ cross)
+    return np.eye(3) + second * cross + third * cross @ cross
 
 
 def by_change(parameters: np.ndarray) -> np.ndarray:
@@ -180,12 +180,12 @@ def shaped_vertices(
 ) -> np.ndarray:
     """Template (V, 3) in meters with identity (I,), expression (E,) and offset (V, 3), unposed."""
     shaped = model.v_template + model.shapedirs @ np.concatenate([shape, expr])
-    return np.asarray(shaped if offset is None else shaped + offset)
+    return shaped if offset is None else shaped + offset
 
 
 def joint_positions(model: FlameModel, shaped: np.ndarray) -> np.ndarray:
     """Joints (5, 3) of shaped, unposed vertices (V, 3)."""
-    return np.asarray(model.j_regressor @ shaped)
+    return model.j_regressor @ shaped
 
 
 def flame_forward(
@@ -198,7 +198,7 @@ def flame_forward(
     shaped = shaped_vertices(model, shape, frame.expr, np.sum(offsets, axis=0) if offsets else None)
     posed = _posed(model, shaped, frame)
     vertices = np.einsum("vab,vb->va", posed.skin, posed.corrected) + model.weights @ posed.moved
-    return np.asarray(vertices + frame.translation)
+    return vertices + frame.translation
 
 
 def parameters_gradient(

@@ -203,10 +203,10 @@ def _masks(path: Path, arrays: Arrays, vertices: int) -> dict[str, np.ndarray]:
 
 def faces_within(faces: np.ndarray, vertices: np.ndarray) -> np.ndarray:
     """(F,) bool: triangles (F, 3) whose three corners are all among `vertices` (ids)."""
-    return np.asarray(np.isin(faces, vertices).all(axis=1))
+    return np.isin(faces, vertices).all(axis=1)
 
 
 def torso_faces(model: FlameModel) -> np.ndarray:
     """(F,) bool: triangles at the end of the neck, which the root joint carries."""
     torso = model.weights[:, JOINTS.index("root")] > MIN_TORSO_WEIGHT
-    return np.asarray(torso[model.faces].all(axis=1))
+    return torso[model.faces].all(axis=1)

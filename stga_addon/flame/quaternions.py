@@ -27,7 +27,7 @@ def to_axis_angle(quaternions: np.ndarray) -> np.ndarray:
     length = np.linalg.norm(quaternions[..., 1:], axis=-1, keepdims=True)
     half = np.arctan2(length, quaternions[..., :1])
     # length / half, finite at zero
-    return np.asarray(2 * quaternions[..., 1:] / np.sinc(half / np.pi))
+    return 2 * quaternions[..., 1:] / np.sinc(half / np.pi)
 
 
 def continuous(quaternions: np.ndarray) -> np.ndarray:
@@ -43,7 +43,7 @@ def normalized(q: np.ndarray) -> np.ndarray:
     largest = np.max(np.abs(q), axis=-1, keepdims=True)
     unit = q / np.where(largest > 0, largest, 1.0)
     q = np.where(largest > 0, unit, np.array([1.0, 0.0, 0.0, 0.0]))
-    return np.asarray(q / np.linalg.norm(q, axis=-1, keepdims=True))
+    return q / np.linalg.norm(q, axis=-1, keepdims=True)
 
 
 def multiply(a: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -79,4 +79,4 @@ def from_matrices(matrices: np.ndarray) -> np.ndarray:
     best = np.argmax(np.diagonal(outer, axis1=-2, axis2=-1), axis=-1)
     row = np.take_along_axis(outer, best[..., None, None], axis=-2)[..., 0, :]
     row = np.where(row[..., :1] < 0, -row, row)
-    return np.asarray(row / np.linalg.norm(row, axis=-1, keepdims=True))
+    return row / np.linalg.norm(row, axis=-1, keepdims=True)

@@ -122,7 +122,7 @@ def below_neck(sequence: FlameSequence, timestep: int, points: np.ndarray) -> np
     shaped = shaped_vertices(model, sequence.shape, frame.expr)
     root = joint_positions(model, shaped)[JOINTS.index("root")] + frame.translation
     up = axis_angle_matrices(frame.rotation[None])[0][:, 1]
-    return np.asarray((points - root) @ up < 0)
+    return (points - root) @ up < 0
 
 
 def with_identity(sequence: FlameSequence) -> FlameSequence:
@@ -140,7 +140,7 @@ def with_identity(sequence: FlameSequence) -> FlameSequence:
 def joint_angles(frames: Sequence[FlameFrame]) -> np.ndarray:
     """Largest angle (5,) in degrees by which the frames turn each of `JOINTS`."""
     angles = np.linalg.norm([frame.pose for frame in frames], axis=2)
-    return np.asarray(np.degrees(angles.max(axis=0)))
+    return np.degrees(angles.max(axis=0))
 
 
 def read_frame(path: Path, model: FlameModel) -> FlameFrame:
@@ -314,7 +314,7 @@ def _axis_angles(path: Path, name: str, array: np.ndarray) -> np.ndarray:
     off = np.abs(rows @ rows.swapaxes(1, 2) - np.eye(3)).max()
     if not off < MATRIX_TOLERANCE or (np.linalg.det(rows) < 0).any():
         raise StgaError(f"{path}: {name} has shape {array.shape}, but holds no rotations")
-    return np.asarray(to_axis_angle(from_matrices(rows)).reshape(-1))
+    return to_axis_angle(from_matrices(rows)).reshape(-1)
 
 
 def _vector(path: Path, arrays: Arrays, name: str, size: int) -> np.ndarray:

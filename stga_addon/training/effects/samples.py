@@ -123,7 +123,7 @@ def _sample_view(capture: Capture, view: View, faces: np.ndarray) -> dict[str, n
     scale = SAMPLED_HEIGHT_PIXELS / view.camera.height
     small, image, mask = read_view(view, scale if scale < 2 / 3 else 1.0)
     camera = small.camera
-    mesh = np.asarray(capture.mesh(view.timestep))
+    mesh = capture.mesh(view.timestep)
     corners, depth = camera.project(mesh)
     depths = depth[capture.faces].mean(1)
     towards = _facing(mesh, capture.faces, camera)

@@ -281,7 +281,7 @@ def psnr_recorded(avatar: Avatar, world: Splats, capture: Capture, split: str) -
     known = known_exposure(avatar.settings.get("exposure") or (), capture.views.get("train", ()))
     found = []
     for view in capture.views[split]:
-        mesh = np.asarray(capture.mesh(view.timestep))
+        mesh = capture.mesh(view.timestep)
         layers = [posed_avatar(avatar, mesh), PosedSplats(world)]
         image = render_layers(layers, view.camera, avatar.background)
         exposure = known(view)
@@ -392,7 +392,7 @@ def triangle_residuals(
         scaled, target, mask = read_view(view, scale, (red, green, blue))
         if prepare is not None:
             target, _ = prepare(scaled, target, mask)
-        mesh = np.asarray(capture.mesh(view.timestep))
+        mesh = capture.mesh(view.timestep)
         frames = frames_in_camera(avatar.frames(mesh), scaled.camera)
         render = partial(
             render_forward,

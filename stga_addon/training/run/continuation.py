@@ -286,7 +286,7 @@ def is_faced(capture: Capture, views: Sequence[View], region: np.ndarray) -> boo
 
 def _facing_area(capture: Capture, view: View, region: np.ndarray) -> float:
     """Pixels that the region's triangles facing the camera cover."""
-    mesh = np.asarray(capture.mesh(view.timestep))
+    mesh = capture.mesh(view.timestep)
     corners, depth = view.camera.project(mesh)
     triangles = capture.faces[region]
     a, b, c = (corners[triangles[:, n]] for n in range(3))
