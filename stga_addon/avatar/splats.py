@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from ..flame.quaternions import normalized
+from ..flame.quaternions import normalized, unit
 
 MAX_SH_DEGREE = 3
 SH_C0 = 0.28209479177387814
@@ -171,8 +171,7 @@ def harmonics_text() -> list[str]:
 def turned_harmonics(sh: np.ndarray, turn: np.ndarray) -> np.ndarray:
     """(N, K, 3) of the same colors where turn (3, 3), a rotation that may mirror, has turned all
     directions."""
-    directions = np.random.default_rng(0).normal(size=(64, 3))
-    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    directions = unit(np.random.default_rng(0).normal(size=(64, 3)))
     new, old = (_basis(each, sh.shape[1]) for each in (directions, directions @ turn))
     matrix = np.linalg.lstsq(new, old, rcond=None)[0]
     return np.asarray(np.einsum("kj,njc->nkc", matrix, sh), np.float32)

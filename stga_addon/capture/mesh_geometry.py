@@ -4,6 +4,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from ..flame.quaternions import unit
 from .camera import Camera
 
 ArrayPair = tuple[np.ndarray, np.ndarray]
@@ -20,7 +21,7 @@ def vertex_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     flat = faces.ravel()
     count = len(vertices)
     total = np.stack([np.bincount(flat, np.repeat(n, 3), count) for n in normal.T], axis=-1)
-    return total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-20)
+    return unit(total, 1e-20)
 
 
 def connected_parts(vertices: int, faces: np.ndarray) -> np.ndarray:

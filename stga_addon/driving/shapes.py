@@ -20,7 +20,8 @@ from ..errors import StgaError
 from ..files import read_npz
 from ..flame.forward import joint_positions
 from ..flame.model import EYEBALL_WEIGHT, JOINTS, FlameModel
-from ..tracking.posed_points import SurfacePoints, unit
+from ..flame.quaternions import unit
+from ..tracking.posed_points import SurfacePoints
 from .performance import ARKIT_SHAPES, COLUMN, COUNT, OPTIONAL
 
 SHAPES_FILE = Path(__file__).with_name("arkit_shapes.npz")

@@ -1,6 +1,12 @@
-"""Rotations as unit quaternions (w, x, y, z): conversions and products."""
+"""Vectors of length 1, and rotations as unit quaternions (w, x, y, z): conversions and products."""
 
 import numpy as np
+
+
+def unit(vectors: np.ndarray, least: float = 1e-9) -> np.ndarray:
+    """(..., N) of length 1; shorter ones than `least` stay near 0."""
+    length = np.linalg.norm(vectors, axis=-1, keepdims=True)
+    return vectors / np.maximum(length, least)
 
 
 def from_axis_angle(vectors: np.ndarray) -> np.ndarray:
@@ -41,9 +47,9 @@ def normalized(q: np.ndarray) -> np.ndarray:
     """(..., 4) normalized in float64; a zero quaternion counts as the identity."""
     q = np.asarray(q, np.float64)
     largest = np.max(np.abs(q), axis=-1, keepdims=True)
-    unit = q / np.where(largest > 0, largest, 1.0)
-    q = np.where(largest > 0, unit, np.array([1.0, 0.0, 0.0, 0.0]))
-    return q / np.linalg.norm(q, axis=-1, keepdims=True)
+    scaled = q / np.where(largest > 0, largest, 1.0)
+    q = np.where(largest > 0, scaled, np.array([1.0, 0.0, 0.0, 0.0]))
+    return unit(q)
 
 
 def multiply(a: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -79,4 +85,4 @@ def from_matrices(matrices: np.ndarray) -> np.ndarray:
     best = np.argmax(np.diagonal(outer, axis1=-2, axis2=-1), axis=-1)
     row = np.take_along_axis(outer, best[..., None, None], axis=-2)[..., 0, :]
     row = np.where(row[..., :1] < 0, -row, row)
-    return row / np.linalg.norm(row, axis=-1, keepdims=True)
+    return unit(row)

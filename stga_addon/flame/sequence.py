@@ -24,7 +24,7 @@ from .forward import (
 )
 from .model import JOINTS, MIN_TORSO_WEIGHT, Arrays, FlameModel
 from .parts import ADDED_VERTICES
-from .quaternions import from_matrices, to_axis_angle
+from .quaternions import from_matrices, to_axis_angle, unit
 
 Identity = tuple[np.ndarray, np.ndarray | None]  # Shape and static offset
 ZERO_POSES = {
@@ -307,9 +307,8 @@ def _axis_angles(path: Path, name: str, array: np.ndarray) -> np.ndarray:
         return array
     rows = _finite(path, name, array).reshape(joints, -1, 3)
     if rows.shape[1] == 2:
-        x = rows[:, 0] / np.maximum(np.linalg.norm(rows[:, 0], axis=1, keepdims=True), 1e-12)
-        y = rows[:, 1] - (x * rows[:, 1]).sum(axis=1, keepdims=True) * x
-        y = y / np.maximum(np.linalg.norm(y, axis=1, keepdims=True), 1e-12)
+        x = unit(rows[:, 0])
+        y = unit(rows[:, 1] - (x * rows[:, 1]).sum(axis=1, keepdims=True) * x)
         rows = np.stack([x, y, np.cross(x, y)], axis=1)
     off = np.abs(rows @ rows.swapaxes(1, 2) - np.eye(3)).max()
     if not off < MATRIX_TOLERANCE or (np.linalg.det(rows) < 0).any():

@@ -12,6 +12,7 @@ import numpy as np
 from ..errors import StgaError
 from .graft import Graft, grafted
 from .model import JOINTS, FlameModel
+from .quaternions import unit
 
 TEMPLATE_VERTICES = 5023
 TEETH_VERTICES = 120
@@ -190,8 +191,7 @@ def _arch(half_width: float, curvature: float) -> tuple[np.ndarray, np.ndarray]:
     x = np.interp(np.linspace(0, length[-1], TEETH_PER_ROW), length, x)
     x = (x - x[::-1]) / 2
     zero = np.zeros_like(x)
-    normals = np.stack([2 * curvature * x, zero, zero + 1], axis=1)
-    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    normals = unit(np.stack([2 * curvature * x, zero, zero + 1], axis=1))
     return np.stack([x, zero, -curvature * x**2], axis=1), normals
 
 

@@ -13,6 +13,7 @@ from ..capture.camera import Camera
 from ..capture.color import srgb_to_linear
 from ..capture.model import Capture, evenly_spread
 from ..errors import StgaError
+from ..flame.quaternions import unit
 from ..progress import Report, counted, ignore
 from ..raster.cpu.layout import CameraFrames, Parameters
 from ..raster.cpu.rasterize import BufferPool, frames_in_camera, render_backward, render_forward
@@ -76,8 +77,7 @@ def fit_linear(avatar: Avatar, capture: Capture, report: Report = ignore) -> np.
 def _seen(avatar: Avatar, mesh: np.ndarray, camera: Camera, behind: float) -> _Seen:
     frames = avatar.frames(mesh)
     world = to_world(avatar.splats, frames)
-    direction: np.ndarray = world.xyz - camera.position.astype(np.float32)
-    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    direction = unit(world.xyz - camera.position.astype(np.float32))
     picture = render(avatar.splats, camera, (behind,) * 3, frames, avatar.antialiased)
     colorless = replace(frames, color=NO_COLUMNS)
     fine = frames_in_camera(colorless, camera.scaled(FINENESS))

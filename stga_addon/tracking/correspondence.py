@@ -11,6 +11,7 @@ from ..capture.mesh_geometry import nearest_in_triangles, rasterize, vertex_norm
 from ..errors import StgaError
 from ..flame.forward import flame_forward, neutral_frame
 from ..flame.model import EYEBALL_WEIGHT, JOINTS, FlameModel
+from ..flame.quaternions import unit
 from .face_networks import FIRST_IRIS_POINT, IRIS_CENTERS, MESH_POINTS, FaceNetworks
 from .fit import MIN_LANDMARKS, Triangulation, triangulate
 from .posed_points import SurfacePoints
@@ -54,8 +55,8 @@ def shaded_image(
     corners = faces[triangle[seen]]
     inside = weights[seen][..., None]
     axes = camera.world_to_camera[:3, :3]
-    normal = (vertex_normals(vertices, faces)[corners] * inside).sum(1) @ axes.T * [1, -1, -1]
-    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-9)
+    smooth = (vertex_normals(vertices, faces)[corners] * inside).sum(1) @ axes.T
+    normal = unit(smooth * [1, -1, -1])
     light = KEY_LIGHT / np.linalg.norm(KEY_LIGHT)
     lit = (1 - AMBIENT) * np.clip(normal @ light, 0, 1)
     brightness = AMBIENT * (0.75 + 0.25 * normal[:, 1]) + lit

@@ -10,11 +10,12 @@ import numpy as np
 from ..capture.mesh_geometry import vertex_normals
 from ..flame.forward import RIGID_SIZE, flame_forward, frame_of
 from ..flame.model import EYEBALL_WEIGHT, JOINTS
+from ..flame.quaternions import unit
 from . import appearance
 from .appearance import Sample, Texture, Views
 from .fit import RecordedTake
 from .head_model import HeadModel
-from .posed_points import PosedPoints, head_rotation, split, unit
+from .posed_points import PosedPoints, head_rotation, split
 from .seen_surface import (
     VisiblePoints,
     facing,

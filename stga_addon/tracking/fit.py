@@ -10,6 +10,7 @@ from ..capture.camera import Camera
 from ..capture.mesh_geometry import Similarity, similarity, vertex_normals
 from ..capture.model import evenly_spread
 from ..flame.forward import POSE_SIZE, RIGID_SIZE, flame_forward, frame_of, moved_pose
+from ..flame.quaternions import unit
 from ..worker.helpers import Step
 from .head_model import HeadModel
 from .posed_points import PosedPoints, SurfacePoints, head_rotation, split
@@ -67,8 +68,7 @@ def rays(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Origin (3,) and unit directions (N, 3) in the world of pixels (N, 2)."""
     flat = (points - [camera.cx, camera.cy]) / [camera.fl_x, camera.fl_y]
     local = np.column_stack([flat, np.ones(len(points))])
-    directions = local @ camera.world_to_camera[:3, :3]
-    return camera.position, directions / np.linalg.norm(directions, axis=1, keepdims=True)
+    return camera.position, unit(local @ camera.world_to_camera[:3, :3])
 
 
 def triangulate(

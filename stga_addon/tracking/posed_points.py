@@ -13,6 +13,7 @@ from ..flame.forward import (
     left_jacobian,
 )
 from ..flame.model import FlameModel
+from ..flame.quaternions import unit
 
 
 @dataclass(frozen=True)
@@ -46,12 +47,6 @@ def head_rotation(parameters: np.ndarray) -> np.ndarray:
 def split(parameters: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Coefficients (K,), and pose with translation (18,), of parameters (K + 18,)."""
     return parameters[:-RIGID_SIZE], parameters[-RIGID_SIZE:]
-
-
-def unit(vectors: np.ndarray, least: float = 1e-9) -> np.ndarray:
-    """(N, 3) of length 1; shorter ones than `least` stay near 0."""
-    length = np.linalg.norm(vectors, axis=-1, keepdims=True)
-    return vectors / np.maximum(length, least)
 
 
 def face_size(pixels: np.ndarray) -> float:

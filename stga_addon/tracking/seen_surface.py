@@ -9,9 +9,10 @@ import numpy as np
 from ..capture.camera import Camera
 from ..capture.mesh_geometry import connected_parts, rasterize, vertex_normals
 from ..flame.model import FlameModel
+from ..flame.quaternions import unit
 from .fit import HeadFit, Pictures, RecordedTake, posed_mesh
 from .head_model import HeadModel
-from .posed_points import SurfacePoints, head_rotation, unit
+from .posed_points import SurfacePoints, head_rotation
 
 PATCH_SAMPLES = 9  # Samples along each side of a patch
 MAX_CAMERAS = 6  # Cameras that a patch is compared in: those that see it most squarely

@@ -14,12 +14,12 @@ from ..capture.mesh_geometry import silhouette
 from ..capture.model import evenly_spread
 from ..flame.forward import RIGID_SIZE, axis_angle_matrices
 from ..flame.model import JOINTS, MIN_TORSO_WEIGHT, torso_faces
-from ..flame.quaternions import from_matrices, to_axis_angle
+from ..flame.quaternions import from_matrices, to_axis_angle, unit
 from . import appearance
 from .appearance import NOISE_LEVELS, PyramidView, inside, sampled, unexplained
 from .fit import HeadFit, posed_mesh
 from .footage.model import FootageCamera
-from .posed_points import PosedPoints, SurfacePoints, head_rotation, split, unit
+from .posed_points import PosedPoints, SurfacePoints, head_rotation, split
 from .stages import Crew, Stage
 
 ROOT = JOINTS.index("root")

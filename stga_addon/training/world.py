@@ -12,7 +12,7 @@ from ..avatar.splats import SH_C0, Splats, joined
 from ..capture.camera import Camera
 from ..capture.images import read_view
 from ..capture.model import Capture, View, evenly_spread
-from ..flame.quaternions import from_matrices
+from ..flame.quaternions import from_matrices, unit
 from ..progress import Progress, Report, counted, ignore
 from .optimize.image_preparation import Correction, exposure_correction
 from .optimize.initial_splats import pixels_of
@@ -225,8 +225,7 @@ def on_shell(camera: Camera, pixels: np.ndarray, center: np.ndarray, radius: flo
     that pass beside the sphere end where they are nearest to the center, and half a radius
     farther."""
     origin = camera.position
-    toward = camera.unproject(pixels, np.ones(len(pixels))) - origin
-    toward /= np.linalg.norm(toward, axis=1, keepdims=True)
+    toward = unit(camera.unproject(pixels, np.ones(len(pixels))) - origin)
     nearest = toward @ (center - origin)
     miss = np.linalg.norm(origin + nearest[:, None] * toward - center, axis=1)
     beyond = np.sqrt(np.maximum(radius**2 - miss**2, radius**2 / 4))

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ...avatar.strain import range_with_margin
+from ...flame.quaternions import unit
 from ...light.harmonics import basis
 from ..optimize.image_preparation import fit_lines
 from .samples import Samples
@@ -146,8 +147,7 @@ def fit_turning_light(samples: Samples, color: np.ndarray, rest: np.ndarray) -> 
     neutral mesh. What follows it is no drift of the exposure, which all triangles share wherever
     they face."""
     judged = np.flatnonzero((~np.isnan(color[..., 0])).sum(0) > 1)
-    normal = rest + samples.signals["normal"]
-    normal = normal / np.maximum(np.linalg.norm(normal, axis=2, keepdims=True), 1e-9)
+    normal = unit(rest + samples.signals["normal"])
     rows = basis(normal.reshape(-1, 3))[:, 1:].reshape(*normal.shape[:2], -1)
     # logarithms of a triangle's color, a view's gain and the light add up
     gains = np.broadcast_to(np.eye(len(color))[:, None], (len(color), len(judged), len(color)))

@@ -10,6 +10,7 @@ from ...capture.model import Capture, cameras_at_once, evenly_spread
 from ...flame.forward import FlameFrame
 from ...flame.model import JOINTS
 from ...flame.parts import PARTS
+from ...flame.quaternions import unit
 from ...flame.sequence import joint_angles
 from ...flame.teeth import lip_pairs
 from ...selection import select_capture
@@ -65,8 +66,7 @@ class CaptureFacts:
         that stays does to a head that turns."""
         colors = self.camera_colors.undo(self.stable_colors, self.samples.camera)
         a, b, c = self.capture.neutral[self.capture.faces[self.samples.faces]].swapaxes(0, 1)
-        normal = np.cross(b - a, c - a)
-        normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-20)
+        normal = unit(np.cross(b - a, c - a), 1e-20)
         return colors / evidence.fit_turning_light(self.samples, colors, normal)
 
     @cached_property
