@@ -1,7 +1,6 @@
 """The commands: the dataclasses whose fields are their options, what they do with them, and the
 progress of that on a terminal."""
 
-import json
 import os
 import sys
 from argparse import ArgumentParser, Namespace
@@ -32,7 +31,6 @@ from ..jobs.track import CAPTURE_FOLDER, RUN_FOLDER, MakeAvatar, Track, read_inp
 from ..jobs.train import Extend, Refine, Resume, Selected, SelectForTake, Train
 from ..options import add_options, flag_of, given_options, like, option, option_fields
 from ..progress import Progress, ignore
-from ..schema import to_json
 from ..selection import SelectionOptions
 from ..training.run.folder import AVATAR, RUN, Run, claimed_folder, has_run, read_run
 from ..training.settings import TrainingSettings, make_settings
@@ -333,14 +331,9 @@ def _info(options: Namespace, head: OpenHead | None) -> None:
         rows += [(name, text.strip()) for name, _, text in (line.partition(":") for line in light)]
         print(*format_table(rows), sep="\n")
         return
-    if options.timed and not options.json:
-        raise StgaError("--presets: has no effect without --json; `stga presets` prints them")
     request = Analyze(**given_options(options, Analyze))
-    capture = None if options.json else open_capture(path, request.flame, request.principal_point)
+    capture = open_capture(path, request.flame, request.principal_point)
     found: Any = carry_out(request, with_bar=False)
-    if capture is None:
-        print(json.dumps(to_json(found)))
-        return
     print(*format_table(summarize_capture(capture)), sep="\n")
     if found.plan:
         from ..training.effects.plan import describe_effects
@@ -466,7 +459,7 @@ COMMANDS = {
     "info": Command(
         _about(Analyze),
         _info,
-        (Analyze, _lone("json", bool, "print the effects alone, as JSON", False)),
+        (Analyze,),
         uses_head=True,
     ),
     "presets": _asking(TimePresets, with_bar=False, uses_head=True),

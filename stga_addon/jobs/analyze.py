@@ -6,7 +6,7 @@ from pathlib import Path
 
 from ..capture.open import open_capture
 from ..format import format_duration
-from ..options import like, option
+from ..options import like
 from ..progress import Progress, Report, Say
 from ..render.device import choose_device
 from ..selection import SelectionOptions, select_capture
@@ -32,7 +32,7 @@ class Analyze(_OfCapture):
 
     effects: Mapping[str, str] | None = like(TrainingSettings, "effects")
     device: str = like(Train, "device")
-    timed: bool = option("with --json: also the presets and their times", False, flag="--presets")
+    timed: bool = False
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,6 @@ from .conftest import refused
 
 REFUSALS = [
     # Options that have no effect, or none there
-    ("info {root} --presets", "--presets: has no effect without --json"),
     (
         "export {run} --format gltf --frames 0:1 --out {o}",
         "--frames cannot be combined with --format gltf, only with ply-sequence, usd, web",

@@ -154,7 +154,7 @@ TRACK: list[Any] = [
 FORMATS = ("ply", "ply-sequence", "gaussian-avatars", "usd", "web", "gltf", "spz", "obj")
 SUFFIXES = {"usd": ".usdc", "web": ".html", "gltf": ".glb", "spz": ".spz"}
 COMMANDS: dict[str, tuple[float, list[Any]]] = {
-    "info": (3, [*CAPTURE, EFFECT, DEVICE, (0.3, "--json"), (0.3, "--presets")]),
+    "info": (3, [*CAPTURE, EFFECT, DEVICE]),
     "select": (3, [
         *CAPTURE, THRESHOLD, (0.2, "--zero-pose", "head", "all", "x"), (0.3, "--out", "@new.npz"),
     ]),

@@ -14,6 +14,8 @@ from stga_addon import report
 from stga_addon.development.benchmark.benchmark import benchmark_chart, report_text
 from stga_addon.development.benchmark.statistics import MeanCurve, Outcome
 from stga_addon.format import describe_figures
+from stga_addon.jobs.analyze import Analyze
+from stga_addon.jobs.perform import perform
 from stga_addon.report import CURVE, report_run, run_chart, summarize_run
 from stga_addon.training import preset_timing
 from stga_addon.training.evaluate.forecast import describe_forecast
@@ -226,7 +228,7 @@ def test_presets(toy_root, capsys, monkeypatch):
         name = f"stga_addon.{module}.choose_device"
         monkeypatch.setattr(name, lambda wanted: ("gpu:Card", "why"))
     assert stga("presets", toy_root, "--device gpu") == 0
-    assert stga("info", toy_root, "--json --presets --device gpu") == 0
+    perform(Analyze(toy_root, device="gpu", timed=True))
     assert timed == ["gpu:Card"] * 6
 
 
