@@ -1,5 +1,6 @@
 """FLAME's forward pass in NumPy: parameters to vertices."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -61,6 +62,24 @@ def neutral_frame(model: FlameModel) -> FlameFrame:
 def axis_angle_matrices(axis_angle: np.ndarray) -> np.ndarray:
     """Rotation matrices (J, 3, 3) of axis-angle vectors (J, 3) in radians."""
     return to_matrices(from_axis_angle(axis_angle))
+
+
+def world_turns(parents: Iterable[int], turns: np.ndarray) -> np.ndarray:
+    """Rotations (5, 3, 3) of the joints in the world, from those in their parents."""
+    world = turns.copy()
+    for joint, parent in enumerate(parents):
+        if parent >= 0:
+            world[joint] = world[parent] @ turns[joint]
+    return world
+
+
+def joint_places(parents: Iterable[int], world: np.ndarray, joints: np.ndarray) -> np.ndarray:
+    """Where joints (5, 3) or (5, 3, K) are in the world, whose rotations are world (5, 3, 3)."""
+    places = joints.copy()
+    for joint, parent in enumerate(parents):
+        if parent >= 0:
+            places[joint] = places[parent] + world[parent] @ (joints[joint] - joints[parent])
+    return places
 
 
 def cross_matrices(vectors: np.ndarray) -> np.ndarray:
@@ -259,12 +278,7 @@ def _posed(model: FlameModel, shaped: np.ndarray, frame: FlameFrame) -> _Posed:
     joints = joint_positions(model, shaped)
     local = axis_angle_matrices(frame.pose)
     corrected = shaped + model.posedirs @ (local[1:] - np.eye(3)).ravel()
-    world = local.copy()
-    places = joints.copy()
-    for joint, parent in enumerate(model.parents.tolist()):
-        if parent >= 0:
-            world[joint] = world[parent] @ local[joint]
-            places[joint] = places[parent] + world[parent] @ (joints[joint] - joints[parent])
-    moved = places - np.einsum("jab,jb->ja", world, joints)
+    world = world_turns(model.parents, local)
+    moved = joint_places(model.parents, world, joints) - np.einsum("jab,jb->ja", world, joints)
     skin = np.einsum("vj,jab->vab", model.weights, world)
     return _Posed(joints, corrected, local, world, moved, skin)

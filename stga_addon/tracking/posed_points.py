@@ -10,7 +10,9 @@ from ..flame.forward import (
     TRANSLATION_SIZE,
     axis_angle_matrices,
     cross_matrices,
+    joint_places,
     left_jacobian,
+    world_turns,
 )
 from ..flame.model import FlameModel
 from ..flame.quaternions import unit
@@ -103,8 +105,8 @@ class PosedPoints:
         by_pose = found[..., first:-TRANSLATION_SIZE]
         # Blending and skinning are one product of (N, 3, 9) and (N, 9, K).
         skin = self._weighted(posed.skin).transpose(0, 2, 1, 3).reshape(count, 3, 9)
-        moved: np.ndarray = self._placed(posed.rotations, self.joint_dirs)
-        moved = moved - posed.rotations @ self.joint_dirs
+        places = joint_places(self.parents, posed.rotations, self.joint_dirs)
+        moved = places - posed.rotations @ self.joint_dirs
         found[..., :first] = skin @ self.dirs.reshape(count, 9, first)
         found[..., :first] += np.tensordot(share.T, moved, 1)
         # Turning a joint turns about it what it and the joints below it carry, each with its share
@@ -134,12 +136,9 @@ class PosedPoints:
             return self._last[1]
         angles = rigid[:POSE_SIZE].reshape(-1, 3)
         local = axis_angle_matrices(angles)
-        rotations = local.copy()
-        for joint, parent in enumerate(self.parents):
-            if parent >= 0:
-                rotations[joint] = rotations[parent] @ rotations[joint]
+        rotations = world_turns(self.parents, local)
         joints = self.joints + self.joint_dirs @ coefficients
-        places = self._placed(rotations, joints[..., None])[..., 0]
+        places = joint_places(self.parents, rotations, joints)
         moved = places - (rotations @ joints[..., None])[..., 0]
         corrected = self.template + self.dirs @ coefficients
         if self.posedirs is not None:
@@ -150,15 +149,6 @@ class PosedPoints:
         found = _Posed(positions, angles, local, rotations, places, moved, corrected, skin, posed)
         self._last = key, found
         return found
-
-    def _placed(self, rotations: np.ndarray, joints: np.ndarray) -> np.ndarray:
-        """World positions (5, 3, K) of joints (5, 3, K), or their derivatives, in which the result
-        is linear."""
-        place = joints.copy()
-        for joint, parent in enumerate(self.parents):
-            if parent >= 0:
-                place[joint] = place[parent] + rotations[parent] @ (joints[joint] - joints[parent])
-        return place
 
     def _weighted(self, values: np.ndarray) -> np.ndarray:
         """Values (3 N, …) at the triangles' corners as (N, 3 corners, …), times the barycentric

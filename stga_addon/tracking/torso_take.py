@@ -12,7 +12,7 @@ from ..avatar.embedding import FaceFrames, face_frames
 from ..capture.camera import Camera
 from ..capture.mesh_geometry import silhouette
 from ..capture.model import evenly_spread
-from ..flame.forward import RIGID_SIZE, axis_angle_matrices
+from ..flame.forward import RIGID_SIZE, axis_angle_matrices, world_turns
 from ..flame.model import JOINTS, MIN_TORSO_WEIGHT, torso_faces
 from ..flame.quaternions import from_matrices, to_axis_angle, unit
 from . import appearance
@@ -134,9 +134,7 @@ class TorsoTake:
         before = posed_mesh(self.fit, parameters)[moved]
         wanted = before + share[moved, None] * (self.rigid(torso, moved) - before)
         wanted += np.broadcast_to(bend, offset.shape)[moved] @ head_rotation(parameters).T
-        turns = joint_turns(parameters)
-        for joint, parent in enumerate(model.parents.tolist()):
-            turns[joint] = turns[parent] @ turns[joint] if parent >= 0 else turns[joint]
+        turns = world_turns(model.parents, joint_turns(parameters))
         skin = np.einsum("vj,jab->vab", model.weights[moved], turns)
         for _ in range(OFFSET_STEPS):
             missed = wanted - posed_mesh(self.fit, parameters, offset)[moved]
