@@ -14,10 +14,14 @@ CHUNK_PIXELS = 1 << 21  # Candidate pixels that are tested at a time, to bound t
 MIN_DEPTH_M = 0.01  # Triangles nearer to the camera's plane, or behind it, are not drawn
 
 
+def triangle_normals(corners: np.ndarray) -> np.ndarray:
+    """(F, 3) of triangles with corners (F, 3, 3), as long as twice their area."""
+    return np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+
+
 def vertex_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """(V, 3) unit normals, weighted by the area of triangles; 0 where a vertex has none."""
-    corners = vertices[faces]
-    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normal = triangle_normals(vertices[faces])
     flat = faces.ravel()
     count = len(vertices)
     total = np.stack([np.bincount(flat, np.repeat(n, 3), count) for n in normal.T], axis=-1)

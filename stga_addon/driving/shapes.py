@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ..capture.mesh_geometry import nearest_in_triangles
+from ..capture.mesh_geometry import nearest_in_triangles, triangle_normals
 from ..errors import StgaError
 from ..files import read_npz
 from ..flame.forward import joint_positions
@@ -127,8 +127,7 @@ class _Surface:
     def __init__(self, vertices: np.ndarray, faces: np.ndarray) -> None:
         self.corners = vertices[faces]
         self.centers = self.corners.mean(axis=1)
-        first, second = (self.corners[:, k] - self.corners[:, 0] for k in (1, 2))
-        self.normals = unit(np.cross(first, second), 1e-20)
+        self.normals = unit(triangle_normals(self.corners), 1e-20)
         self._seen: np.ndarray | None = None
 
     def nearest(

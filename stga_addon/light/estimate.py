@@ -7,7 +7,7 @@ import numpy as np
 from ..avatar.file import AvatarLight
 from ..capture.color import srgb_to_linear
 from ..capture.images import read_view
-from ..capture.mesh_geometry import connected_parts
+from ..capture.mesh_geometry import connected_parts, triangle_normals
 from ..capture.model import Capture, View, ViewExposure, evenly_spread
 from ..errors import StgaError
 from ..progress import Progress, Report, ignore
@@ -66,7 +66,7 @@ def _view_colors(
         for y, x in ((0, 2), (4, 2), (2, 0), (2, 4), (1, 1), (1, 3), (3, 1), (3, 3)):
             usable &= inside[y : y + height, x : x + width]
     corners = mesh[capture.faces]
-    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normal = triangle_normals(corners)
     to_camera = view.camera.position - corners.mean(1)
     lengths = np.linalg.norm(normal, axis=1) * np.linalg.norm(to_camera, axis=1)
     facing = (normal * to_camera).sum(1) > MIN_FACING * lengths

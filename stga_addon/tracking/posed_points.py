@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ..capture.mesh_geometry import triangle_normals
 from ..flame.forward import (
     POSE_SIZE,
     RIGID_SIZE,
@@ -89,8 +90,8 @@ class PosedPoints:
 
     def triangle_normals(self, coefficients: np.ndarray, rigid: np.ndarray) -> np.ndarray:
         """(N, 3) unit normals of the posed triangles that the points lie on."""
-        a, b, c = self._posed(coefficients, rigid).corners.reshape(-1, 3, 3).swapaxes(0, 1)
-        return unit(np.cross(b - a, c - a), 1e-20)
+        corners = self._posed(coefficients, rigid).corners.reshape(-1, 3, 3)
+        return unit(triangle_normals(corners), 1e-20)
 
     def linearized(
         self, coefficients: np.ndarray, rigid: np.ndarray

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ..capture.camera import Camera
-from ..capture.mesh_geometry import connected_parts, rasterize, vertex_normals
+from ..capture.mesh_geometry import connected_parts, rasterize, triangle_normals, vertex_normals
 from ..flame.model import FlameModel
 from ..flame.quaternions import unit
 from .fit import HeadFit, Pictures, RecordedTake, posed_mesh
@@ -199,11 +199,10 @@ class SeenSurface:
 
 def surface_points(head: HeadModel, count: int) -> SurfacePoints:
     """Centers of about `count` triangles, spread evenly over the area of the large parts."""
-    vertices = head.model.v_template
     faces = head.model.faces
     large = large_parts(head.model)
-    a, b, c = (vertices[faces[:, k]] for k in range(3))
-    area = np.cumsum(np.where(large, np.linalg.norm(np.cross(b - a, c - a), axis=1), 0.0))
+    area = np.linalg.norm(triangle_normals(head.model.v_template[faces]), axis=1)
+    area = np.cumsum(np.where(large, area, 0.0))
     face = np.unique(np.searchsorted(area, (np.arange(count) + 0.5) / count * area[-1]))
     return SurfacePoints(face, np.full((len(face), 3), 1 / 3))
 
@@ -333,9 +332,9 @@ def outline_offsets(
     at = begin[:, None] + steps[:, None] * (along / length[:, None])[:, None]
     factor = int(np.clip(PICTURE_SIDE / max(camera.width, camera.height), 1, MAX_ENLARGEMENT))
     # of the mesh, few triangles are drawn: those of the outline near the points
-    a, b, c = (vertices[faces[:, k]] for k in range(3))
-    normal = unit(np.cross(b - a, c - a), 1e-20)
-    rim = faces[np.abs(facing(camera, (a + b + c) / 3, normal)) < RIM_COSINE]
+    triangles = vertices[faces]
+    normal = unit(triangle_normals(triangles), 1e-20)
+    rim = faces[np.abs(facing(camera, triangles.mean(1), normal)) < RIM_COSINE]
     corners = camera.project(vertices)[0][rim]
     center = corners.mean(1)
     radius = np.linalg.norm(corners - center[:, None], axis=2).max(1)

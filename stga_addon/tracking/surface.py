@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from ..capture.mesh_geometry import vertex_normals
+from ..capture.mesh_geometry import triangle_normals, vertex_normals
 from ..capture.model import evenly_spread, parts_of
 from ..flame.forward import RIGID_SIZE
 from ..flame.model import faces_within
@@ -349,8 +349,7 @@ def smooth_offsets(
     rows = np.repeat(np.arange(len(points)), 3)
     places = rows, faces[points.face].ravel()
     at = coo_array((points.barycentric.ravel(), places), shape=(len(points), count)).tocsr()
-    a, b, c = (vertices[faces[:, k]] for k in range(3))
-    share = np.linalg.norm(np.cross(b - a, c - a), axis=1) / 6
+    share = np.linalg.norm(triangle_normals(vertices[faces]), axis=1) / 6
     area = np.bincount(faces.ravel(), np.repeat(share, 3), count)
     laplacian = _laplacian(vertices, faces, area)
     smooth = SMOOTHING_M**4 * laplacian.T @ diags_array(area) @ laplacian

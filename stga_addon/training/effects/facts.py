@@ -6,6 +6,7 @@ from functools import cache, cached_property
 import numpy as np
 
 from ...avatar.lattice import splats_per_triangle
+from ...capture.mesh_geometry import triangle_normals
 from ...capture.model import Capture, cameras_at_once, evenly_spread
 from ...flame.forward import FlameFrame
 from ...flame.model import JOINTS
@@ -65,8 +66,8 @@ class CaptureFacts:
         """(S, K, 3) stable colors without the differences between cameras, and without what light
         that stays does to a head that turns."""
         colors = self.camera_colors.undo(self.stable_colors, self.samples.camera)
-        a, b, c = self.capture.neutral[self.capture.faces[self.samples.faces]].swapaxes(0, 1)
-        normal = unit(np.cross(b - a, c - a), 1e-20)
+        corners = self.capture.neutral[self.capture.faces[self.samples.faces]]
+        normal = unit(triangle_normals(corners), 1e-20)
         return colors / evidence.fit_turning_light(self.samples, colors, normal)
 
     @cached_property
