@@ -69,10 +69,14 @@ class Camera:
         flat = local[:, :2] / np.maximum(depth, MIN_PROJECTION_DEPTH)[:, None]
         return flat * [self.fl_x, self.fl_y] + [self.cx, self.cy], depth
 
+    def at_depth_one(self, pixels: np.ndarray) -> np.ndarray:
+        """Where the rays of pixels (N, 2) are 1 m before the camera: (N, 2) in its own axes."""
+        return (pixels - [self.cx, self.cy]) / [self.fl_x, self.fl_y]
+
     def unproject(self, pixels: np.ndarray, depth: np.ndarray) -> np.ndarray:
         """World points (N, 3) in meters of pixel positions (N, 2) at depths (N,), both as `project`
         returns them."""
-        flat = (pixels - [self.cx, self.cy]) / [self.fl_x, self.fl_y]
+        flat = self.at_depth_one(pixels)
         local = np.concatenate([flat, np.ones((len(flat), 1))], axis=1) * depth[:, None]
         return (local - self.world_to_camera[:3, 3]) @ self.world_to_camera[:3, :3]
 

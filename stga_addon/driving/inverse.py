@@ -32,7 +32,7 @@ def captured_performance(sequence: FlameSequence, name: str, fps: float) -> Perf
     The neck's rotation becomes the head's; other head motion has no place in a performance. `name`
     is what errors call the head.
     """
-    frames = [sequence.frame(timestep) for timestep in sequence.timesteps]
+    frames = sequence.frames()
     weights = arkit_weights(frames, head_map(sequence, name), sequence)
     first = sequence.timesteps[0]
     times = (np.array(sequence.timesteps) - first) / fps

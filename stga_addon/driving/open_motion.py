@@ -292,7 +292,7 @@ def open_motion(
         raise StgaError(f"{path}: {problem}")
     _check_faces(path, capture.flame.model, faces)
     sequence = transferred_motion(capture.flame, neutral)
-    own = [sequence.frame(timestep) for timestep in sequence.timesteps]
+    own = sequence.frames()
     frames, beyond = adapted(own, options, trained)
     moved = _with_frames(sequence, sequence.timesteps, frames)
     return Motion(moved, playback_fps(capture), 0, beyond, capture.flame.warnings)

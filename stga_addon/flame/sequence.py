@@ -85,6 +85,10 @@ class FlameSequence:
     frame: Callable[[int], FlameFrame]
     warnings: tuple[str, ...] = ()
 
+    def frames(self) -> list[FlameFrame]:
+        """The parameters of all timesteps."""
+        return [self.frame(timestep) for timestep in self.timesteps]
+
     def mesh(self, frame: FlameFrame) -> np.ndarray:
         """The person's mesh (V, 3) in meters with a frame's parameters."""
         return flame_forward(self.model, self.shape, frame, self.static_offset)
@@ -259,7 +263,7 @@ def motion_arrays(sequence: FlameSequence, dtype: DTypeLike = np.float64) -> dic
     avatar holds in float32. shape (I,), expr (T, E), rotation, neck_pose, jaw_pose and translation
     (T, 3), eyes_pose (T, 6), static_offset (V, 3), dynamic_offset (T, V, 3), zero where the
     sequence has none; 300 and 100 for I and E with a published FLAME."""
-    frames = [sequence.frame(timestep) for timestep in sequence.timesteps]
+    frames = sequence.frames()
     none = np.zeros_like(sequence.model.v_template)
     static = sequence.static_offset
     offsets = [none if frame.dynamic_offset is None else frame.dynamic_offset for frame in frames]

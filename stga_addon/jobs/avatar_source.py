@@ -164,7 +164,7 @@ def open_avatar_motion(request: Posed, avatar: Avatar, say: Say) -> Motion:
         try:
             own = open_run(source, flame=request.flame).capture.flame
             if own is not None:
-                trained = trained_range([own.frame(timestep) for timestep in own.timesteps])
+                trained = trained_range(own.frames())
         except StgaError as error:
             if options.stay_trained is not None:
                 raise

@@ -206,7 +206,7 @@ def _shapes_of_motion(request: ConvertMotion) -> Performance:
     sequence = _flame_motion(capture, "parameters of expression and pose")
     # of the parameters: what leaks into them are no weights from 0 to 1
     if neutral != "none":
-        frames = [sequence.frame(timestep) for timestep in sequence.timesteps]
+        frames = sequence.frames()
         frames, _ = adapted(frames, MotionOptions(neutral=neutral))
         known = dict(zip(sequence.timesteps, frames, strict=True))
         sequence = replace(sequence, frame=known.__getitem__)
@@ -221,7 +221,7 @@ def _flame_motion(capture: Capture, lacking: str) -> FlameSequence:
 
 def write_motion(path: Path, sequence: FlameSequence) -> None:
     """Write a sequence as FLAME parameters that `read_motion` takes."""
-    frames = [sequence.frame(timestep) for timestep in sequence.timesteps]
+    frames = sequence.frames()
     arrays = {
         name: np.stack([getattr(frame, name) for frame in frames]).astype(np.float32)
         for name in FRAME_FIELDS

@@ -66,8 +66,7 @@ class Triangulation:
 
 def rays(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Origin (3,) and unit directions (N, 3) in the world of pixels (N, 2)."""
-    flat = (points - [camera.cx, camera.cy]) / [camera.fl_x, camera.fl_y]
-    local = np.column_stack([flat, np.ones(len(points))])
+    local = np.column_stack([camera.at_depth_one(points), np.ones(len(points))])
     return camera.position, unit(local @ camera.world_to_camera[:3, :3])
 
 
@@ -279,7 +278,7 @@ def pose_from_one_camera(camera: Camera, pixels: np.ndarray, points: np.ndarray)
     POSIT (DeMenthon and Davis 1995): scaled orthographic pose, corrected for perspective until it
     no longer changes.
     """
-    seen = (pixels - [camera.cx, camera.cy]) / [camera.fl_x, camera.fl_y]
+    seen = camera.at_depth_one(pixels)
     center = points.mean(0)
     system = np.column_stack([points - center, np.ones(len(points))])
     solve = np.linalg.pinv(system, len(system) * np.finfo(np.float64).eps)

@@ -37,7 +37,7 @@ def import_head(capture: Capture, warn: Warn = log_warning, correctives: str = "
     leaves the scene."""
     sequence = capture.flame
     if sequence is not None:
-        frames = [sequence.frame(timestep) for timestep in sequence.timesteps]
+        frames = sequence.frames()
         head = _place_head(capture)
         add_rig(head, sequence, frames, warn, correctives)
         return head

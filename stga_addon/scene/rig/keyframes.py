@@ -200,7 +200,7 @@ def key_tracked_offsets(
 ) -> None:
     """Keyframe the per-frame offsets of the sequence that the head was imported from; numbers: the
     Blender frame of each timestep, ascending."""
-    frames = [sequence.frame(timestep) for timestep in sequence.timesteps]
+    frames = sequence.frames()
     paths = [key_value_path(offset_key(timestep)) for timestep in sequence.timesteps]
     write_triangle_curves(head.data.shape_keys, paths, numbers)
     displacement = np.zeros((len(frames), len(JOINTS), 3))
