@@ -107,7 +107,7 @@ class PosedPoints:
         # Blending and skinning are one product of (N, 3, 9) and (N, 9, K).
         skin = self._weighted(posed.skin).transpose(0, 2, 1, 3).reshape(count, 3, 9)
         places = joint_places(self.parents, posed.rotations, self.joint_dirs)
-        moved = places - posed.rotations @ self.joint_dirs
+        moved: np.ndarray = places - posed.rotations @ self.joint_dirs
         found[..., :first] = skin @ self.dirs.reshape(count, 9, first)
         found[..., :first] += np.tensordot(share.T, moved, 1)
         # Turning a joint turns about it what it and the joints below it carry, each with its share
