@@ -22,6 +22,7 @@ from packaging.tags import Tag, cpython_tags
 from packaging.utils import canonicalize_name, parse_wheel_filename
 
 from ..errors import StgaError
+from ..progress import Say
 from ..worker.training_python import GPU_REQUIREMENT, REQUIREMENTS
 
 TORCH_CPU_INDEX = "https://download.pytorch.org/whl/cpu"
@@ -138,9 +139,9 @@ def this_platform() -> str:
     return found[here]
 
 
-def collect_wheels(folder: Path, target: Target) -> list[Path]:
+def collect_wheels(folder: Path, target: Target, say: Say = lambda line: None) -> list[Path]:
     """The wheels that training needs on the target, downloaded into `folder` where they are
-    missing; sorted by name.
+    missing; sorted by name. say: is told each one.
 
     Raises StgaError where one cannot be had.
     """
@@ -154,9 +155,9 @@ def collect_wheels(folder: Path, target: Target) -> list[Path]:
             continue
         followed.add(str(requirement))
         if name not in wheels:
-            wheels[name] = _present(folder, requirement, target) or _download(
-                folder, requirement, target
-            )
+            present = _present(folder, requirement, target)
+            say(f"{target.name}: {present.name if present else f'downloading {requirement}'}")
+            wheels[name] = present or _download(folder, requirement, target)
         wanted += needs(wheels[name], target, requirement.extras)
     chosen = sorted(wheels.values())
     check_wheels(chosen, target)

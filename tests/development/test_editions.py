@@ -140,7 +140,7 @@ def test_wheels_are_known_by_their_hash(tmp_path, monkeypatch, lock) -> None:
 @pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="only PyPI's torch for Linux needs CUDA")
 def test_only_when_told_to_does_a_zip_have_cuda(tmp_path, monkeypatch, capsys, lock):
-    """Catches gigabytes that nothing uses, and a refusal without a remedy."""
+    """Catches gigabytes that nothing uses, a refusal without a remedy, and minutes without a word."""
     monkeypatch.setattr("stga_addon.development.package.ROOT", tmp_path)
     wheels = wheel_folder(LINUX)
     offered = tmp_path / "offered"
@@ -179,6 +179,7 @@ def test_only_when_told_to_does_a_zip_have_cuda(tmp_path, monkeypatch, capsys, l
         return capsys.readouterr().err
 
     assert built("seen") == {cpu.name}
+    assert "downloading torch" in capsys.readouterr().out
     cpu.unlink()
     (wheels / cpu.name).unlink()
     said = refusal()
