@@ -19,7 +19,7 @@ from ..stga_addon.scene.display.splat_nodes import AS_TRAINED, LIMITS, NATIVE, P
 from ..stga_addon.scene.light import throw_shadow, throws_shadow
 from ..stga_addon.scene.objects import show_progress
 from ..stga_addon.scene.render.scene_splats import forget_frame, relight_frame
-from ..stga_addon.scene.render.viewport_display import is_shown_as_trained
+from ..stga_addon.scene.render.viewport_display import ENGINE, is_shown_as_trained
 from . import common, options
 from .common import Action, Edit, FileImport, file_path, head_of, need
 from .opened_files import run_of
@@ -31,6 +31,7 @@ from .training_python import training_python
 GRAY = ("WIREFRAME", "SOLID")
 """Kinds of shading that show colors of splats as trained only."""
 OFFERED = [mode for mode in LIMITS if mode != NATIVE or compat.NATIVE_SPLATS]
+SURFACES = ("MESH", "CURVE", "SURFACE", "META", "FONT", "CURVES", "POINTCLOUD", "VOLUME")
 UP_ROTATION_DEG = {"Y": 90.0, "-Y": -90.0, "Z": 0.0}
 """Up axis of a file -> rotation about x that turns it to Blender's."""
 
@@ -121,6 +122,26 @@ class ChooseDisplay(Edit, bpy.types.Operator):
             space.shading.type = "MATERIAL"
 
 
+def leaves_out(scene: Any) -> list[str]:
+    """What the engine STGA Splats leaves out of the scene's images; nothing by other engines."""
+    if scene.render.engine != ENGINE:
+        return []
+    others = (thing for thing in scene.objects if tags.KIND not in thing and not thing.hide_render)
+    left_out = ["meshes"] if any(thing.type in SURFACES for thing in others) else []
+    return [*left_out, *(["depth of field"] if _has_blur(scene) else [])]
+
+
+def _has_blur(scene: Any) -> bool:
+    dof = None if scene.camera is None else getattr(scene.camera.data, "dof", None)
+    return dof is not None and dof.use_dof
+
+
+def whole_engine(scene: Any) -> str:
+    """The engine that shows what STGA Splats leaves out: EEVEE blurs camera quads with what is
+    behind them."""
+    return "CYCLES" if _has_blur(scene) and not compat.NATIVE_SPLATS else compat.EEVEE
+
+
 def _own_as_trained(context: Any) -> list[Any]:
     """The splat objects displayed as trained, whose display can be changed: no linked ones."""
     own = [thing for thing in context.view_layer.objects if thing.library is None]
@@ -132,19 +153,30 @@ class PreviewImages(Edit, bpy.types.Operator):
     through the scene's camera as quads that face it, without one as points"""
 
     bl_label = "Preview for EEVEE/Cycles"
-    needs = (need(_own_as_trained, "No splats are displayed as trained"),)
+    needs = (
+        need(
+            lambda context: leaves_out(context.scene) or _own_as_trained(context),
+            "No splats are displayed as trained",
+        ),
+    )
+
+    with_engine: options.boolean(
+        "Choose Engine", "Let EEVEE or Cycles render, whichever shows the whole scene", options=ONCE
+    )
 
     def run(self, context: Any) -> None:
         scene = context.scene
         space = context.space_data
         mode = QUADS if scene.camera is not None else POINTS
         mode = NATIVE if compat.NATIVE_SPLATS else mode
+        shading = "RENDERED" if splat_object.shows_nodes(scene) else "MATERIAL"
         for thing in _own_as_trained(context):
             splat_object.choose_display(thing, mode)
+        if self.with_engine:
+            scene.render.engine = whole_engine(scene)
         splat_object.use_transparent_bounces(scene)
         if getattr(space, "type", "") == "VIEW_3D":  # none where a script calls it
-            # Material Preview is EEVEE, whatever the scene's engine is.
-            space.shading.type = "RENDERED" if splat_object.shows_nodes(scene) else "MATERIAL"
+            space.shading.type = shading  # Material Preview is EEVEE, whatever the engine is
             if mode == QUADS:
                 space.region_3d.view_perspective = "CAMERA"
         if hint := splat_object.view_transform_hint(scene):

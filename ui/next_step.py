@@ -10,7 +10,6 @@ from ..operators import monitor
 from ..operators.common import is_head, rig_or_none
 from ..operators.import_capture import OpenDemo
 from ..operators.pose import is_posing
-from ..operators.show import PreviewImages
 from ..operators.training_python import has_training_python
 from ..stga_addon.errors import StgaError
 from ..stga_addon.jobs.table import Kind
@@ -19,7 +18,7 @@ from ..stga_addon.scene.display.splat_object import splat_modifier
 from ..stga_addon.worker.status import WorkerState
 from ..stga_addon.worker.training_python import PYTHON_VARIABLE
 from .select_panel import has_selection
-from .show_panel import draw_input, left_out_hint
+from .show_panel import draw_input, draw_left_out
 from .sidebar import SidebarPanel, draw_end, draw_running, draw_text
 from .train_panel import draw_missing_python, draw_preferences, draw_train_button
 
@@ -122,11 +121,7 @@ def _draw_what_to_try(layout: Any, context: Any, settings: Any) -> None:
             toggle = {"icon": "RESTRICT_SELECT_OFF", "toggle": True}
             modifier = splat_modifier(settings.splats)
             draw_input(column, modifier, splat_nodes.SHOW_SELECTION, **toggle)
-    left_out = left_out_hint(context.scene)
-    if left_out:
-        draw_text(column, context, left_out, "INFO")
-        if PreviewImages.poll(context):
-            column.operator("stga.preview_images", icon="SHADING_RENDERED")
+    draw_left_out(column, context)
     if draw_running(column, context, Kind.VIDEO):
         return
     video = monitor.state_of(context.scene, Kind.VIDEO)

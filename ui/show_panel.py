@@ -9,15 +9,15 @@ import bpy
 from bpy.app.handlers import persistent
 
 from ..operators.common import AtEnd, register_handlers
-from ..operators.show import GRAY
+from ..operators.show import GRAY, leaves_out, whole_engine
 from ..operators.training_python import has_training_python
 from ..stga_addon.errors import StgaError
 from ..stga_addon.jobs.table import Kind
 from ..stga_addon.render.client import missing_packages
-from ..stga_addon.scene import tags
+from ..stga_addon.scene import compat, tags
 from ..stga_addon.scene.compat import modifier_input_owner
 from ..stga_addon.scene.display import splat_nodes, splat_object
-from ..stga_addon.scene.display.splat_nodes import AS_TRAINED, LIMITS, NATIVE
+from ..stga_addon.scene.display.splat_nodes import AS_TRAINED, LIMITS, NATIVE, QUADS
 from ..stga_addon.scene.display.splat_object import shows_nodes
 from ..stga_addon.scene.gpu.context import has_gpu_context
 from ..stga_addon.scene.light import MODE_CHANGED, lighting_settings, throws_shadow, world_light
@@ -34,7 +34,6 @@ DISPLAY_INPUTS = (
     splat_nodes.SHOW_SELECTION,
     splat_nodes.SELECTED_ONLY,
 )
-SURFACES = ("MESH", "CURVE", "SURFACE", "META", "FONT", "CURVES", "POINTCLOUD", "VOLUME")
 _is_told = False
 """Whether the render job in progress has said what it does not show."""
 
@@ -170,20 +169,23 @@ def _before_image(scene: Any, *_: Any) -> None:
 
 def left_out_hint(scene: Any) -> str | None:
     """A sentence where the engine STGA Splats leaves out what the scene's images are to show."""
-    if scene.render.engine != ENGINE:
-        return None
-    left_out = ["meshes"] if any(map(_is_other, scene.objects)) else []
-    if scene.camera is not None and getattr(scene.camera.data, "dof", None) is not None:
-        left_out += ["depth of field"] if scene.camera.data.dof.use_dof else []
+    left_out = leaves_out(scene)
     if not left_out:
         return None
+    engine = "Cycles" if whole_engine(scene) == "CYCLES" else "EEVEE"
+    display = NATIVE if compat.NATIVE_SPLATS else QUADS
     names = " and ".join(left_out)
-    remedy = "Preview for EEVEE/Cycles, rendered by one of these, shows all in one image"
-    return f"STGA Splats leaves out {names}; {remedy}"
+    whole = f"{engine} with {display} shows all in one image"
+    return f"STGA Splats leaves out {names}; {whole}"
 
 
-def _is_other(thing: Any) -> bool:
-    return thing.type in SURFACES and not thing.hide_render and tags.KIND not in thing
+def draw_left_out(layout: Any, context: Any) -> None:
+    """Say what the engine leaves out of images, with the button that chooses another."""
+    hint = left_out_hint(context.scene)
+    if hint:
+        draw_text(layout, context, hint, "INFO")
+        show = layout.operator("stga.preview_images", text="Show All", icon="SHADING_RENDERED")
+        show.with_engine = True
 
 
 def _pop_up(hint: str) -> None:
@@ -208,6 +210,7 @@ class RenderPanel(bpy.types.Panel):
         layout = self.layout
         has_python = has_training_python(context)
         layout.use_property_split = True
+        draw_left_out(layout, context)
         layout.prop(context.scene.render, "film_transparent", text="Transparent Film")
         layout.prop(context.view_layer, "use_pass_z", text="Depth Pass")
         if missing_packages() and not has_gpu_context():

@@ -8,6 +8,7 @@ import numpy as np
 
 SLOTTED_ACTIONS = bpy.app.version >= (4, 4, 0)
 MODIFIER_INPUT_PROPERTIES = bpy.app.version >= (5, 2, 0)
+EEVEE = "BLENDER_EEVEE" if bpy.app.version >= (5, 0, 0) else "BLENDER_EEVEE_NEXT"
 NATIVE_SPLATS = hasattr(bpy.types, "GeometryNodePointsSetType")  # from 5.3 on
 APPENDED: list[Any] = getattr(bpy.app.handlers, "blend_import_post", [])  # from 4.3 on
 REC709 = "Linear Rec.709"

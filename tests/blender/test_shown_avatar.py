@@ -324,7 +324,8 @@ def test_a_file_says_what_is_missing_without_the_extension(extension, head, tmp_
 
 
 def test_what_the_engine_leaves_out_is_said(extension, head, tmp_path):
-    """Catches F12 by the engine that drops meshes and depth of field without a warning."""
+    """Catches F12 by the engine that drops meshes and depth of field without a warning, and a
+    button that leaves it at that."""
     write_ball_avatar(tmp_path / "avatar.npz")
     bpy.ops.stga.show_avatar(filepath=str(tmp_path / "avatar.npz"))
     scene = bpy.context.scene
@@ -337,5 +338,13 @@ def test_what_the_engine_leaves_out_is_said(extension, head, tmp_path):
     assert "meshes and depth of field" in hint(scene)
     bpy.context.object.hide_render = True
     assert "leaves out depth of field;" in hint(scene)
-    scene.render.engine = "CYCLES"
-    assert hint(scene) is None
+    compat = extension.stga_addon.scene.compat
+    engines = set()
+    for scene.camera.data.dof.use_dof in (True, False):
+        bpy.context.object.hide_render = scene.camera.data.dof.use_dof
+        scene.render.engine = extension.ui.show_panel.ENGINE
+        assert compat.NATIVE_SPLATS or ("Cycles" in hint(scene)) == bpy.context.object.hide_render
+        bpy.ops.stga.preview_images(with_engine=True)
+        assert hint(scene) is None
+        engines.add(scene.render.engine)
+    assert engines == ({compat.EEVEE} if compat.NATIVE_SPLATS else {"CYCLES", compat.EEVEE})
