@@ -196,6 +196,11 @@ class AvatarFromVideo(Action, bpy.types.Operator, FileImport):
         options=ONCE,
     )
     minutes: options.number("Minutes", "Training time", default=5.0, min=0.01)
+    quick: options.boolean(
+        "Quick Look",
+        "Every third frame at half size and half a minute of training, in a folder of its own",
+        options=ONCE,
+    )
     focal: options.field(Track, "focal", "Focal Length", options=ONCE)
     python: options.python("tracks and trains", options={*ONCE, "HIDDEN"})
     filter_glob: options.file_filter(*VIDEO_SUFFIXES)
@@ -211,8 +216,10 @@ class AvatarFromVideo(Action, bpy.types.Operator, FileImport):
 
     def draw(self, context: Any) -> None:
         self.layout.use_property_split = True
-        for name in ("folder", "minutes", "focal"):
-            self.layout.prop(self, name)
+        for name in ("quick", "folder", "minutes", "focal"):
+            column = self.layout.column()
+            column.active = not (self.quick and name == "minutes")
+            column.prop(self, name)
 
     def run(self, context: Any) -> None:
         settings = None
@@ -220,6 +227,7 @@ class AvatarFromVideo(Action, bpy.types.Operator, FileImport):
             began_with = jobs.read_inputs(file_path(self.folder, "folder"))
             self.filepath = str(began_with.get("footage", ""))
             self.focal = began_with.get("focal") or 0.0
+            self.quick = began_with.get("size") == jobs.QUICK["size"]
             settings = self._settings_before()
         video = file_path(self.filepath, "video").resolve()
         if not video.is_file():
@@ -230,7 +238,7 @@ class AvatarFromVideo(Action, bpy.types.Operator, FileImport):
         else:
             capture = proposed_folder(self._tracking(video, Path()))
         if settings is None:
-            seconds = round(60 * self.minutes, DIGITS)
+            seconds = jobs.QUICK_S if self.quick else round(60 * self.minutes, DIGITS)
             settings = make_settings("global", seconds=seconds, effects={})
         train = Train(capture.parent / jobs.RUN_FOLDER, capture, settings)
         request = jobs.MakeAvatar(self._tracking(video, capture), train)
@@ -248,7 +256,8 @@ class AvatarFromVideo(Action, bpy.types.Operator, FileImport):
         return request.train.settings if isinstance(request, jobs.MakeAvatar) else None
 
     def _tracking(self, video: Path, capture: Path) -> Track:
-        return Track(video, None, capture, focal=round(self.focal, DIGITS) or None)
+        quick = jobs.QUICK if self.quick else {}
+        return Track(video, None, capture, focal=round(self.focal, DIGITS) or None, **quick)
 
 
 def proposed_folder(track: Track) -> Path:

@@ -27,7 +27,15 @@ from ..jobs.export import Export
 from ..jobs.finished_run import Evaluate, MakeExact, Relight
 from ..jobs.render import Render
 from ..jobs.table import Request, Result
-from ..jobs.track import CAPTURE_FOLDER, RUN_FOLDER, MakeAvatar, Track, read_inputs
+from ..jobs.track import (
+    CAPTURE_FOLDER,
+    QUICK,
+    QUICK_S,
+    RUN_FOLDER,
+    MakeAvatar,
+    Track,
+    read_inputs,
+)
 from ..jobs.train import Extend, Refine, Resume, Selected, SelectForTake, Train
 from ..options import add_options, flag_of, given_options, like, option, option_fields
 from ..progress import Progress, ignore
@@ -216,16 +224,22 @@ def _refuse_changes(options: Namespace, run: Run) -> None:
 @dataclass(frozen=True)
 class AvatarOptions:
     out: Path = option("folder of capture, run and file", flag="--out", metavar="DIR")
+    quick: bool = option(
+        "a first look: every third frame at half size, half a minute of training", False
+    )
     no_blend: bool = option("write no .blend file", False)
 
 
 def _avatar(options: Namespace, head: OpenHead | None) -> None:
+    tracked = {"model": None, **(QUICK if options.quick else {}), **given_options(options, Track)}
+    if options.quick and not {options.seconds, options.iterations, options.preset} - {None}:
+        options.seconds = QUICK_S
     settings = _settings(options)
     out = options.out
     run = options.out / RUN_FOLDER
     if has_run(run):
         _refuse_changes(options, read_run(run))
-    track = Track(**{"model": None, **given_options(options, Track), "out": out / CAPTURE_FOLDER})
+    track = Track(**{**tracked, "out": out / CAPTURE_FOLDER})
     device = {} if options.device is None else {"device": options.device}
     carry_out(MakeAvatar(track, Train(run, track.out, settings, **device)))
     if options.no_blend:

@@ -98,6 +98,9 @@ class Track:
     start: int = option("first timestep of the footage, counted from 0", 0, 0)
     stop: int | None = option("timestep to stop before (default: all)", None, 1)
     step: int = option("use every nth timestep", 1, 1)
+    size: float = option(
+        "of the images, as a share of the recorded size", 1.0, 0.1, 1.0, metavar="SHARE"
+    )
     offset: Mapping[str, int] | None = option(
         "frames by which a camera's recording is later; may be repeated",
         None,
@@ -173,6 +176,10 @@ class MakeAvatar:
             )
 
 
+QUICK: Mapping[str, Any] = {"step": 3, "size": 0.5}
+"""Fields of `Track` for a first look at an avatar."""
+QUICK_S = 30.0
+"""Of training, for one."""
 WRITER = "tracking is writing this capture"  # Who holds its lock
 MAX_MISFIT = 0.5
 """Median share of the head's pixels, beyond which the avatar is another person's."""
@@ -251,14 +258,16 @@ def _track_by_avatar(request: Track, run: Path, report: Report) -> Written:
 
 
 def _open(request: Track, steps: "_Steps") -> "Footage":
-    from ..tracking.footage.open import open_footage
+    from ..tracking.footage.open import open_footage, sized
     from ..tracking.footage.sequences import FrameRange
 
     steps.report(Stage.OPENING, 0, 1)
     offset = dict(request.offset or {})
     frames = FrameRange(request.start, request.stop, request.step, offset, request.sync)
     mattes = None if request.mattes in MATTES else Path(request.mattes)
-    return open_footage(request.footage, request.cameras, frames, request.focal, mattes=mattes)
+    cameras = request.cameras
+    footage = open_footage(request.footage, cameras, frames, request.focal, mattes=mattes)
+    return footage if request.size == 1 else sized(footage, request.size)
 
 
 def _options(request: Track) -> "TrackingOptions":

@@ -43,7 +43,8 @@ def begin(requests):
 
 
 def test_it_is_the_request_of_the_command_line(extension, asked, video, tmp_path, monkeypatch):
-    """Catches other settings than `stga avatar VIDEO`, and a dropped video that starts nothing."""
+    """Catches other settings than `stga avatar VIDEO`, a dropped video that starts nothing, and a
+    quick look that goes on as another avatar."""
     out = tmp_path / "out"
     opened = list[bool]()
     show_panel = lambda: opened.append(True)  # noqa: E731
@@ -58,7 +59,15 @@ def test_it_is_the_request_of_the_command_line(extension, asked, video, tmp_path
     options = ["--out", str(out), "--budget", "3s", "--focal", "2308.3", "--no-blend"]
     assert main.main(["avatar", str(video), *options]) == 0
     assert asked == made
-    assert opened == [True]
+    look = tmp_path / "look"
+    bpy.ops.stga.avatar_from_video(filepath=str(video), folder=str(look), quick=True)
+    assert main.main(["avatar", str(video), "--out", str(look), "--quick", "--no-blend"]) == 0
+    assert asked == made
+    assert (made[1].track.step, made[1].track.size) == (3, 0.5)
+    begin(asked)
+    bpy.ops.stga.avatar_from_video(folder=str(look))  # continues
+    assert asked[2] == asked[1]
+    assert opened == [True] * 3
 
 
 def test_the_folder_is_proposed_beside_the_file(asked, video, tmp_path):

@@ -21,7 +21,7 @@ from .colmap import is_distorted, model_suffix
 from .focal_tags import photo_focal, video_focal
 from .model import Footage, FootageCamera, Frames, ImageFrames
 from .sequences import FrameRange, Sequence, open_sequence, sequence_size, synchronized
-from .shots import Lens, Shot, listed, undistortion
+from .shots import Lens, Shot, Undistortion, listed, undistortion
 from .sources import (
     CONTAINERS,
     ORIGINALS,
@@ -96,6 +96,16 @@ def open_footage(
     given = find_sources(Path(realpath(mattes)))
     masked = tuple(_masked(camera, sources, given, len(plated) == 1) for camera in plated)
     return replace(footage, cameras=masked)
+
+
+def sized(footage: Footage, size: float) -> Footage:
+    """The footage with images of a share of the recorded size."""
+    cameras = []
+    for own in footage.cameras:
+        ideal = own.camera.scaled(size)
+        known = own.undistortion or Undistortion(own.camera, Lens(), ideal)
+        cameras.append(replace(own, camera=ideal, undistortion=replace(known, camera=ideal)))
+    return replace(footage, cameras=tuple(cameras))
 
 
 def _no_footage(path: Path) -> str:
