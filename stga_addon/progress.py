@@ -87,19 +87,25 @@ MAX_TOLD_SHARE = 0.99
 class Clock:
     """How far work is and how long it takes, as people are told: neither ever goes back."""
 
-    def __init__(self) -> None:
+    def __init__(self, clock: Callable[[], float] = monotonic) -> None:
         self.share = 0.0
+        self._clock = clock
         self._left_s = math.inf
+        self._since_s = 0.0
 
     def told(self, progress: Progress) -> dict[str, float]:
         """The finite figures of some progress; `left_s` is the least so far, and `longer` 1 where
-        it is known to be too little."""
+        it is known to be too little, or as long ago."""
         self.share = max(self.share, min(progress.share, MAX_TOLD_SHARE))
         figures = {n: value for n, value in progress.figures().items() if math.isfinite(value)}
         if "left_s" in figures:
             asked_s = figures["left_s"]
-            self._left_s = min(self._left_s, asked_s)
-            longer = asked_s > MAX_OVERRUN_RATIO * self._left_s + 1
+            now = self._clock()
+            if asked_s < self._left_s:
+                self._left_s = asked_s
+                self._since_s = now
+            missed_s = max(asked_s, now - self._since_s)
+            longer = missed_s > MAX_OVERRUN_RATIO * self._left_s + 1
             figures |= {"left_s": self._left_s, **({"longer": 1.0} if longer else {})}
         return figures
 

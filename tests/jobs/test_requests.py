@@ -29,7 +29,7 @@ from stga_addon.jobs.render import Render
 from stga_addon.jobs.table import JOBS, Result
 from stga_addon.jobs.track import SolveAgain, Track
 from stga_addon.jobs.train import Refine, Resume, Train
-from stga_addon.progress import Progress, TimeLeft, Written
+from stga_addon.progress import Clock, Progress, TimeLeft, Written
 from stga_addon.training.effect_catalog import RELIGHT, WORLD, EffectDecision
 from stga_addon.training.run.folder import Run, write_run
 from stga_addon.training.settings import make_settings
@@ -186,6 +186,15 @@ def test_a_clock_never_goes_back(tmp_path: Path) -> None:
     sentences = [describe_left(status.figures) for status in told]
     assert sentences == [f"{each} min left" if each else "" for each in expected]
     assert [status.progress for status in told] == [0.0, 0.3, 0.3, 0.4, 0.5, 0.6, 0.9, 0.99, 0.99]
+
+
+def test_what_has_not_come_true_is_not_said_again() -> None:
+    """Catches "About 20 s left" for a minute and a half."""
+    seconds = iter((0.0, 20.0, 90.0))
+    clock = Clock(lambda: next(seconds))
+    left = Progress(figures=lambda: {"left_s": 20.0})
+    said = [describe_left(clock.told(left)) for _ in range(3)]
+    assert said == ["About 20 s left", "About 20 s left", "More than 20 s left"]
 
 
 def test_what_follows_training_is_told_ahead(tmp_path: Path, monkeypatch: Any) -> None:

@@ -178,6 +178,7 @@ class _Session:
     tracking_gain TRACKING_GAIN, of which the next evaluation is to tell; NaN: nothing was left out
     interrupts    the first Ctrl-C
     addition      training beyond the budget, if it was asked for
+    fitting_s     what is left of fitting unseen heads after a budget in seconds, at most
     """
 
     capture: Capture
@@ -194,6 +195,7 @@ class _Session:
     tracking_gain: float | None = None
     interrupts: list[int] = field(default_factory=list)
     addition: _Addition | None = None
+    fitting_s: float = 0.0
 
     def begin_addition(self, seconds: float) -> None:
         """Train so long from here on, whatever budget and goals the run began with."""
@@ -208,6 +210,8 @@ class _Session:
 
     def complete(self) -> None:
         """Train until the budget is spent, a goal is reached or the report asks to stop."""
+        if self.trainer.tracking is not None and self._without_training_views():
+            self.fitting_s = TRACKING_TIME_SHARE * (self.run.settings.seconds or 0.0)
         # meanwhile, the splats are shown as they begin
         self._tell("Compiling kernels")
         precompile_kernels(self.run.device)
@@ -290,6 +294,9 @@ class _Session:
         tracking = self.trainer.tracking
         if tracking is None or not tracking.has_moved or tracking.rounds != 1:
             return []
+        return self._without_training_views()
+
+    def _without_training_views(self) -> list[int]:
         every = views_by_timestep(self.capture.all_views)
         return sorted(every.keys() - views_by_timestep(self.capture.views["train"]).keys())
 
@@ -400,6 +407,7 @@ class _Session:
         kept = RefinedTracking(self.capture, settings.convention)
         kept.parameters = folders.read_tracking(self.folder, tracking.sequence)
         found = self._track(avatar, kept, self.capture, unseen, unseen)
+        self.fitting_s = 0.0
         if found is None:
             return None
         tracking.take(found, unseen)
@@ -441,6 +449,8 @@ class _Session:
         the same and those between them, which change as their neighbors do."""
 
         def stops(done: int, total: int) -> bool:
+            if seconds is not None and tracking is not self.trainer.tracking:
+                self.fitting_s = seconds * (1 - done / total)
             told = self._tell(f"Tracking by the avatar: {done} of {total}")
             return told or bool(self.interrupts)
 
@@ -523,7 +533,7 @@ class _Session:
             "iteration": spent.iterations,
             "per_second": self.speed,
             # and the last evaluation and the residuals
-            "left_s": spent.left_s + 2 * last.get("evaluation_s", 0.0),
+            "left_s": spent.left_s + self.fitting_s + 2 * last.get("evaluation_s", 0.0),
             "loss": np.mean(self.losses) if self.losses else None,
             "psnr": last.get("psnr"),
             "psnr_unmatched": last.get(UNMATCHED),
