@@ -19,21 +19,21 @@ Warn = Callable[[str], None]
 log_warning: Warn = logging.getLogger(__name__).warning
 
 
-VIDEO_FOLDER = re.compile(r"(.+) avatar((?: \d+)?)")
-"""Folder for capture and run of a video (`operators.track.proposed_folder`)."""
+AVATAR_SUFFIX = re.compile(r" avatar(?=( \d+)?$)")
+"""Of a folder for capture and run of a video (`operators.track.proposed_folder`)."""
 
 
 def capture_root(source: Path) -> Any:
     """The Empty that is the parent of all imported from the folder or file `source`, made where
-    missing, in a collection of its own, both called like the source, or the video that it was made
-    of. It turns captures, y up, by +90° about X: its children keep the capture's coordinates."""
+    missing, in a collection of its own, both called like the source, or as what a "capture" is in,
+    such as that of a video. It turns captures, y up, by +90° about X: its children keep the
+    capture's coordinates."""
     existing = tags.find(tags.ROOT, source)
     if existing:
         return existing[0]
     name = format_name(source)
-    made = VIDEO_FOLDER.fullmatch(source.resolve().parent.name)
-    if made is not None and name == "capture":
-        name = made[1] + made[2]
+    if name == "capture":
+        name = AVATAR_SUFFIX.sub("", source.resolve().parent.name) or name
     collection = bpy.data.collections.new(name)
     bpy.context.scene.collection.children.link(collection)
     root = bpy.data.objects.new(name, None)

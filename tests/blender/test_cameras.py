@@ -135,6 +135,7 @@ def test_the_parent_is_called_like_the_capture(tmp_path):
     assert capture_root(tmp_path / "anna.v2").name == "anna.v2"
     assert capture_root(tmp_path / "ben.v2.mp4").name == "ben.v2"
     assert capture_root(tmp_path / "clip 1 avatar 2/capture").name == "clip 1 2"
+    assert capture_root(tmp_path / "demo/capture").name == "demo"
 
 
 def test_second_import_replaces_the_first(tmp_path):

@@ -149,7 +149,7 @@ def test_linked_heads_are_left_alone(tmp_path):
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "library.blend"))
     bpy.ops.wm.read_factory_settings(use_empty=True)
     with bpy.data.libraries.load(str(tmp_path / "library.blend"), link=True) as (_, target):
-        target.collections = ["capture"]
+        target.collections = [name.removesuffix(" head")]
     bpy.context.scene.collection.children.link(target.collections[0])
     linked = target.collections[0].objects[name]
     bpy.context.scene.stga.head = linked

@@ -255,11 +255,12 @@ def saved_head(folder: Path) -> Path:
 
 
 def bring(file: Path, how: str) -> None:
+    name = bpy.context.scene.stga.head.parent.name
     bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
     operator: Callable[..., object] = bpy.ops.wm.append if how == "append" else bpy.ops.wm.link
     within = f"{file}/Collection/"
     more = {"instance_collections": how == "instance"}
-    operator(filepath=f"{within}capture", directory=within, filename="capture", **more)
+    operator(filepath=within + name, directory=within, filename=name, **more)
 
 
 @pytest.mark.parametrize("how", ["append", "link", "instance"])
@@ -276,7 +277,7 @@ def test_what_is_brought_into_another_file_is_shown_alike(extension, head, tmp_p
     visible = bpy.context.visible_objects
     assert [tags.CONVENTION in each for each in visible if each.type != "EMPTY"] == [True]
     settings = bpy.context.scene.stga
-    assert settings.head.name == "capture head"
+    assert settings.head.name.endswith(" head")
     assert Path(bpy.path.abspath(settings.avatar)) == tmp_path / "run/avatar.npz"
     bpy.context.scene.frame_set(1)
     assert not np.array_equal(
