@@ -63,12 +63,14 @@ def complete_zip(command: list[str], out: Path, demo: Path) -> Path:
     return build_zip(out, edition=complete(target), demo=demo, kernels=kernels)
 
 
-def blender(command: list[str], home: Path, *arguments: object, background: bool = True) -> None:
-    """Run a Blender in a home folder of its own, without a network."""
+def blender(
+    command: list[str], home: Path, *arguments: object, background: bool = True, **variables: str
+) -> None:
+    """Run a Blender in a home folder of its own, without a network; with environment variables."""
     others = ("PYTHON", "BLENDER", "STGA", "NUMBA")
     kept = {name: value for name, value in os.environ.items() if not name.startswith(others)}
     full = [*offline(), *command, *["--background"] * background, *map(str, arguments)]
-    how = {"env": {**kept, "HOME": str(home)}, "timeout": TIMEOUT_S}
+    how = {"env": {**kept, "HOME": str(home), **variables}, "timeout": TIMEOUT_S}
     output_of(full, cwd=ROOT, **how)
 
 

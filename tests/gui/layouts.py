@@ -76,7 +76,9 @@ class Leaf:
     @property
     def width(self) -> float:
         blf.size(0, bpy.context.preferences.ui_styles[0].widget.points)
-        text = blf.dimensions(0, self.text)[0] + PADDING if self.text else 0.0
+        place = "Operator" if self.kind == "operator" else "*"
+        shown = bpy.app.translations.pgettext_iface(self.text, place)
+        text = blf.dimensions(0, shown)[0] + PADDING if self.text else 0.0
         has_icon = self.options.get("icon", "NONE") != "NONE" or "icon_value" in self.options
         return float(text + (ICON if has_icon else 0) + (NUMBER if self.is_number else 0))
 

@@ -1,8 +1,8 @@
-"""Runs inside a Blender with a window and the complete edition, started by test_newcomer.py: the
-first hour.
+"""Runs inside a Blender with a window, started by test_newcomer.py: the first two hours.
 
 `blender --python newcomer_script.py -- FOLDER [STEP...]`: reads FOLDER/flame.npz and
-FOLDER/own.npz, a head of FLAME; writes FOLDER/result.json with what was seen, and pictures.
+FOLDER/own.npz, a head of FLAME, and FOLDER/demo, a capture; writes FOLDER/result.json with what was
+seen, and pictures.
 """
 
 import socket
@@ -29,6 +29,9 @@ FOLDER = Path(ARGUMENTS[0])
 FIRST = FOLDER / "first.blend"
 NECK_ANGLE = 0.3
 MOUTH = 0.6
+MORE_MINUTES = 0.2
+PATIENCE_S = 1500.0
+"""With one step, such as a training whose kernels are still to be compiled."""
 PORT = 21112
 DRIVEN_S = 5.0
 RATE = 60
@@ -40,6 +43,7 @@ OUTSIDE = ("wm.path_open", "wm.save_mainfile")
 STARTED = time.monotonic()
 monitor = module("operators.monitor")
 kinds = module("stga_addon.jobs.table").Kind
+seen["time left"] = {}
 for name in ("pressed", "clicks", "messages", "undo", "cut", "texts", "images", "seconds"):
     seen[name] = {}
 
@@ -225,16 +229,38 @@ def misunderstand() -> None:
     shot("error")
 
 
+def training() -> Any:
+    return monitor.state_of(bpy.context.scene, kinds.TRAINING)
+
+
+def once(what: str, is_over: Callable[[], bool]) -> Callable[[], bool]:
+    """What waits for the end of something in a training, and notes the clock in the panel."""
+    begin = time.monotonic()
+    noted = seen["time left"].setdefault(what, [])
+
+    def wait() -> bool:
+        status = training().snapshot.status
+        figures = dict(status.figures)
+        if not noted or noted[-1][1:3] != [status.message, figures.get("left_s")]:
+            now = round(time.monotonic() - begin, 1)
+            noted.append([now, status.message, figures.get("left_s"), status.progress])
+        return is_over()
+
+    return wait
+
+
 def train() -> Iterator[Any]:
     begin = time.monotonic()
     settings = {"directory": chosen().run_folder, "minutes": chosen().minutes}
     click("Train", bpy.ops.stga.train, **settings)
-    yield lambda: chosen().splats is not None
+    yield once("Train", lambda: chosen().splats is not None)
     seen["seconds"]["to the preview"] = round(time.monotonic() - begin, 2)
     shot("preview")
-    yield lambda: chosen().result_shown
+    yield once("Train", lambda: chosen().result_shown)
     seen["seconds"]["to the avatar"] = round(time.monotonic() - begin, 2)
     shot("trained")
+    train_panel = drawn_panels.drawn()["3 Train"].text
+    seen["train panel"] = [part for part in ("Quality", "More") if part in train_panel]
 
 
 def pose() -> Iterator[Any]:
@@ -474,8 +500,101 @@ def drop() -> Iterator[Any]:
     subprocess.run(["xdotool", "key", "Escape"], check=True)
 
 
+# The second hour
+
+
+def train_more() -> Iterator[Any]:
+    yield opened(FIRST)
+    before = training().snapshot.status.figures["iteration"]
+    options = {"directory": chosen().run_folder, "minutes": MORE_MINUTES, "more": True}
+    click("Train More", bpy.ops.stga.train, **options)
+    yield once("Train More", lambda: chosen().result_shown and not training().is_running)
+    seen["trained more"] = training().snapshot.status.figures["iteration"] - before
+    shot("trained more")
+
+
+def shown() -> list[Any]:
+    tags = module("stga_addon.scene.tags")
+    return [each for each in bpy.context.scene.objects if each.get(tags.KIND) == tags.SPLATS]
+
+
+def show_again() -> Iterator[Any]:
+    """Show the avatar twice, look at its sliders, and click on it."""
+    for _ in range(2):
+        click("Show Avatar", bpy.ops.stga.show_avatar, filepath=chosen().avatar)
+    seen["splat objects"] = len(shown())
+    keys = chosen().head.data.shape_keys.key_blocks
+    names = ("jawOpen", "identity_000")
+    seen["ranges"] = {n: [keys[n].slider_min, keys[n].slider_max] for n in names if n in keys}
+    with in_viewport():
+        bpy.ops.object.select_all(action="DESELECT")
+    window, _, region = viewport()
+    x = region.x + region.width // 2
+    y = window.height - region.y - region.height // 2
+    subprocess.run(["xdotool", "mousemove", str(x), str(y)], check=True)
+    yield 0.5
+    subprocess.run(["xdotool", "click", "1"], check=True)
+    yield 1.0
+    seen["clicked"] = [thing.type for thing in bpy.context.selected_objects]
+    shot("clicked")
+
+
+def second_head() -> Iterator[Any]:
+    """Import another head beside the first."""
+    scene = bpy.context.scene
+    settings = lambda: [  # noqa: E731
+        scene.frame_end,
+        scene.render.fps,
+        scene.render.resolution_x,
+        scene.camera.name,
+    ]
+    before = settings()
+    first = chosen().head.parent
+    (FOLDER / "ben").symlink_to(FOLDER / "demo")
+    click("Import Capture", bpy.ops.stga.import_capture, directory=str(FOLDER / "ben"))
+    yield 1.0
+    seen["settings kept"] = settings() == before
+    second = chosen().head.parent
+    gap = second.matrix_world.translation - first.matrix_world.translation
+    seen["beside"] = gap.length
+    seen["names"] = [first.name, second.name]
+    shot("second head")
+    with in_viewport():
+        select_only(first)
+    yield lambda: chosen().head.parent == first
+
+
+def left_out() -> Iterator[Any]:
+    """A mesh and a blur that the engine leaves out, and the button that shows all."""
+    scene = bpy.context.scene
+    engine = module("stga_addon.scene.render.engine").ENGINE
+    with in_viewport():
+        bpy.ops.mesh.primitive_cube_add(size=0.1, location=(0.2, 0, 0))
+    seen["shows all"] = []
+    for scene.camera.data.dof.use_dof in (False, True):
+        scene.render.engine = engine
+        yield 0.5
+        shot(f"left out {scene.camera.data.dof.use_dof}")
+        said = drawn_panels.drawn()["Next Step"].text
+        what = "leaves out meshes and depth" if scene.camera.data.dof.use_dof else "out meshes;"
+        name, options = drawn_panels.buttons()["Next Step: Show All"]
+        options = {option: value for option, value in options.items() if option == "with_engine"}
+        click("Show All", getattr(bpy.ops.stga, name.split(".")[1]), **options)
+        seen["shows all"].append(what in said and scene.render.engine != engine)
+
+
+def german() -> Iterator[Any]:
+    """Every panel in another language, which Blender translates where it knows the words."""
+    yield opened(FIRST)
+    view = bpy.context.preferences.view
+    view.language = "de_DE"
+    view.use_translate_interface = view.use_translate_tooltips = True
+    yield from panels_unfolded("German")
+    view.language = "en_US"
+
+
 STEPS = """fresh open_demo misunderstand train pose live display pressed duplicate delete append
-render drop disable"""
+render drop disable train_more show_again second_head left_out german"""
 
 
 def steps() -> Iterator[Any]:
@@ -485,4 +604,4 @@ def steps() -> Iterator[Any]:
     seen["seconds"]["all"] = round(time.monotonic() - STARTED, 2)
 
 
-play(steps(), FOLDER / "result.json")
+play(steps(), FOLDER / "result.json", PATIENCE_S)
