@@ -15,7 +15,7 @@ from stga_addon.capture.camera import camera_from_gl
 from stga_addon.capture.images import image_size, is_plain, read_image, read_mask, read_view
 from stga_addon.capture.model import View
 from stga_addon.errors import StgaError
-from stga_addon.tracking.footage.open import open_footage
+from stga_addon.tracking.footage.open import open_footage, sized
 
 WIDTH = 48
 HEIGHT = 32
@@ -178,6 +178,19 @@ def test_orientation(tmp_path, orientation, suffix):
     # A file that other programs would show turned is not copied into a capture; TIFF is turned by
     # all.
     assert is_plain(path) == (camera.file(0) is not None) == (orientation == 1 or suffix == ".tif")
+
+
+def test_footage_of_half_the_size(tmp_path):
+    """Catches images of another size than their camera, shifted by a part of a pixel."""
+    rng = np.random.default_rng(0)
+    coarse = rng.integers(60, 200, (6, 9, 3))
+    smooth = np.asarray(Image.fromarray(coarse.astype(np.uint8)).resize((90, 60), 2))
+    Image.fromarray(smooth).save(tmp_path / "x.png")
+    camera = sized(open_footage(tmp_path, focal=50), 0.5).cameras[0]
+    assert (camera.camera.width, camera.camera.height, camera.camera.fl_x) == (45, 30, 25)
+    blocks = smooth.reshape(30, 2, 45, 2, 3).mean(axis=(1, 3))
+    assert np.abs(camera.image(0) - blocks).mean() < 0.5
+    assert camera.file(0) is None
 
 
 def test_camera_of_the_stored_pixels(tmp_path):

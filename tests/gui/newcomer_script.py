@@ -5,6 +5,7 @@ FOLDER/own.npz, a head of FLAME, and FOLDER/demo, a capture; writes FOLDER/resul
 seen, and pictures.
 """
 
+import shutil
 import socket
 import struct
 import subprocess
@@ -276,6 +277,7 @@ def pose() -> Iterator[Any]:
     click("Done Posing", bpy.ops.stga.pose_head)
     mouth.value = 0.0
     bpy.context.scene.frame_set(bpy.context.scene.frame_current)  # the neck, which has no keyframe
+    bpy.ops.wm.save_as_mainfile(filepath=str(FIRST))
 
 
 def packet(number: int, opening: float) -> bytes:
@@ -339,7 +341,6 @@ def drive(head: str) -> Iterator[Any]:
 def live() -> Iterator[Any]:
     """Drive the demo's head, and one of FLAME, by a phone."""
     yield from drive("demo")
-    bpy.ops.wm.save_as_mainfile(filepath=str(FIRST))
     bpy.ops.wm.read_homefile(app_template="")
     yield 0.3
     files = {name: str(FOLDER / f"{name}.npz") for name in ("own", "flame")}
@@ -520,6 +521,7 @@ def shown() -> list[Any]:
 
 def show_again() -> Iterator[Any]:
     """Show the avatar twice, look at its sliders, and click on it."""
+    yield opened(FIRST)
     for _ in range(2):
         click("Show Avatar", bpy.ops.stga.show_avatar, filepath=chosen().avatar)
     seen["splat objects"] = len(shown())
@@ -527,7 +529,10 @@ def show_again() -> Iterator[Any]:
     names = ("jawOpen", "identity_000")
     seen["ranges"] = {n: [keys[n].slider_min, keys[n].slider_max] for n in names if n in keys}
     with in_viewport():
+        select_only(chosen().splats)
+        bpy.ops.view3d.view_selected()
         bpy.ops.object.select_all(action="DESELECT")
+    yield 0.5
     window, _, region = viewport()
     x = region.x + region.width // 2
     y = window.height - region.y - region.height // 2
@@ -550,7 +555,7 @@ def second_head() -> Iterator[Any]:
     ]
     before = settings()
     first = chosen().head.parent
-    (FOLDER / "ben").symlink_to(FOLDER / "demo")
+    shutil.copytree(FOLDER / "demo", FOLDER / "ben")
     click("Import Capture", bpy.ops.stga.import_capture, directory=str(FOLDER / "ben"))
     yield 1.0
     seen["settings kept"] = settings() == before
