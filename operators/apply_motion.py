@@ -108,7 +108,7 @@ class ApplyMotion(Edit, bpy.types.Operator, FileImport):
     stay_trained: stay_trained_property(options=ONCE)
     smoothing: options.field(MotionOptions, "smoothing", soft_max=0.2, options=ONCE)
     mirror: options.field(MotionOptions, "mirror", options=ONCE)
-    face_gain: _gain_property("Face", "the face's shapes")
+    face_gain: _gain_property("Face Shapes", "the face's shapes")
     jaw_gain: _gain_property("Jaw", "the jaw's shapes")
     eyes_gain: _gain_property("Eyes", "the gaze")
     head_gain: _gain_property("Head", "the head's rotation, which turns the neck")

@@ -35,7 +35,7 @@ class MotionPanel(SidebarPanel, bpy.types.Panel):
 
 
 class FacePanel(SidebarPanel, bpy.types.Panel):
-    bl_label = "Face"
+    bl_label = "Face Shapes"
     bl_parent_id = MotionPanel.bl_idname
 
     @classmethod
