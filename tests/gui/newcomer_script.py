@@ -529,7 +529,7 @@ def show_again() -> Iterator[Any]:
     names = ("jawOpen", "identity_000")
     seen["ranges"] = {n: [keys[n].slider_min, keys[n].slider_max] for n in names if n in keys}
     with in_viewport():
-        select_only(chosen().splats)
+        select_only(chosen().head.parent)
         bpy.ops.view3d.view_selected()
         bpy.ops.object.select_all(action="DESELECT")
     yield 0.5
