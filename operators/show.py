@@ -169,14 +169,14 @@ class PreviewImages(Edit, bpy.types.Operator):
         space = context.space_data
         mode = QUADS if scene.camera is not None else POINTS
         mode = NATIVE if compat.NATIVE_SPLATS else mode
-        shading = "RENDERED" if splat_object.shows_nodes(scene) else "MATERIAL"
         for thing in _own_as_trained(context):
             splat_object.choose_display(thing, mode)
         if self.with_engine:
             scene.render.engine = whole_engine(scene)
         splat_object.use_transparent_bounces(scene)
         if getattr(space, "type", "") == "VIEW_3D":  # none where a script calls it
-            space.shading.type = shading  # Material Preview is EEVEE, whatever the engine is
+            # Material Preview is EEVEE, whatever the scene's engine is.
+            space.shading.type = "RENDERED" if splat_object.shows_nodes(scene) else "MATERIAL"
             if mode == QUADS:
                 space.region_3d.view_perspective = "CAMERA"
         if hint := splat_object.view_transform_hint(scene):
