@@ -338,8 +338,10 @@ class FileImport(ImportHelper):
         if self.filepath:
             return self.execute(context)
         beside = bpy.data.filepath
-        if is_head(context.scene.stga.head):
-            beside = context.scene.stga.head[tags.CAPTURE]
+        head = context.scene.stga.head
+        demo = bpy.utils.resource_path("USER")  # where nobody keeps files
+        if is_head(head) and not head[tags.CAPTURE].startswith(demo):
+            beside = head[tags.CAPTURE]
         if beside:  # else Blender proposes the .blend file's own name
             self.filepath = os.path.join(os.path.dirname(beside), "")
         return super().invoke(context, event)
