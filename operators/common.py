@@ -339,8 +339,8 @@ class FileImport(ImportHelper):
             return self.execute(context)
         beside = bpy.data.filepath
         head = context.scene.stga.head
-        demo = bpy.utils.resource_path("USER")  # where nobody keeps files
-        if is_head(head) and not head[tags.CAPTURE].startswith(demo):
+        hidden = bpy.utils.resource_path("USER")  # where the demo lies
+        if is_head(head) and not head[tags.CAPTURE].startswith(hidden):
             beside = head[tags.CAPTURE]
         if beside:  # else Blender proposes the .blend file's own name
             self.filepath = os.path.join(os.path.dirname(beside), "")
