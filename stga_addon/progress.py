@@ -15,6 +15,7 @@ Item = TypeVar("Item")
 
 PACE_SHARE = 0.1  # Share of the work, the last that was done, whose pace says how much time is left
 MAX_OVERRUN_RATIO = 1.25  # Times what was said to be left, from which on that was too little
+PROMISE_RATIO = 0.9  # Of what was said to be left, below which it is a new promise
 MAX_STEP_SHARE = 0.03  # Of a step; beyond, an interrupted call had done it before
 
 
@@ -91,7 +92,8 @@ class Clock:
         self.share = 0.0
         self._clock = clock
         self._left_s = math.inf
-        self._since_s = 0.0
+        self._promise = math.inf, 0.0
+        """Seconds that were said to be left, and when."""
 
     def told(self, progress: Progress) -> dict[str, float]:
         """The finite figures of some progress; `left_s` is the least so far, and `longer` 1 where
@@ -101,11 +103,11 @@ class Clock:
         if "left_s" in figures:
             asked_s = figures["left_s"]
             now = self._clock()
-            if asked_s < self._left_s:
-                self._left_s = asked_s
-                self._since_s = now
-            missed_s = max(asked_s, now - self._since_s)
-            longer = missed_s > MAX_OVERRUN_RATIO * self._left_s + 1
+            self._left_s = min(self._left_s, asked_s)
+            if asked_s < PROMISE_RATIO * self._promise[0]:
+                self._promise = asked_s, now
+            missed_s = max(asked_s, now - self._promise[1])
+            longer = missed_s > MAX_OVERRUN_RATIO * self._promise[0] + 1
             figures |= {"left_s": self._left_s, **({"longer": 1.0} if longer else {})}
         return figures
 

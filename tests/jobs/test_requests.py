@@ -192,8 +192,8 @@ def test_what_has_not_come_true_is_not_said_again() -> None:
     """Catches "About 20 s left" for a minute and a half."""
     seconds = iter((0.0, 20.0, 90.0))
     clock = Clock(lambda: next(seconds))
-    left = Progress(figures=lambda: {"left_s": 20.0})
-    said = [describe_left(clock.told(left)) for _ in range(3)]
+    left = (Progress(figures=lambda s=s: {"left_s": s}) for s in (20.0, 19.9, 19.8))
+    said = [describe_left(clock.told(each)) for each in left]
     assert said == ["About 20 s left", "About 20 s left", "More than 20 s left"]
 
 
