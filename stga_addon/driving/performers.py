@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ..errors import StgaError
-from ..files import matching
+from ..files import is_file, is_folder, matching
 from ..progress import Report, ignore
 from ..tracking.footage.sources import VIDEO_SUFFIXES
 from .performance import Performance
@@ -55,8 +55,8 @@ RECORDED_SUFFIXES = tuple(suffix for suffix in PERFORMERS if suffix not in READ_
 def performer_of(path: Path) -> Performer | None:
     """By a file's suffix; None for what is no performance. The folder of a Live Link Face take is
     read as its table."""
-    if path.is_dir():
-        is_capture = (path / "flame_param").is_dir() or matching(path, "transforms*.json")
+    if is_folder(path):
+        is_capture = is_folder(path / "flame_param") or matching(path, "transforms*.json")
         return None if is_capture or not _tables(path) else PERFORMERS[".csv"]
     return PERFORMERS.get(path.suffix.lower())
 
@@ -75,7 +75,7 @@ def read_performance(path: Path, report: Report = ignore) -> Performance:
     iFacialMocap's packets as lines of text; a video of a face. Columns are found by name. Raises
     StgaError naming the file, the row, and the shapes that are missing.
     """
-    if path.is_dir():
+    if is_folder(path):
         files = _tables(path)
         own = [path for path in files if not path.stem.lower().endswith(TAKE_EXTRAS)] or files
         if len(own) != 1:
@@ -92,4 +92,4 @@ def read_performance(path: Path, report: Report = ignore) -> Performance:
 
 
 def _tables(folder: Path) -> list[Path]:
-    return [path for path in matching(folder, "*.[cC][sS][vV]") if path.is_file()]
+    return [path for path in matching(folder, "*.[cC][sS][vV]") if is_file(path)]

@@ -13,6 +13,8 @@ import numpy as np
 import scipy.sparse
 from avatar.conftest import random_mesh, random_splats
 from capture import factory
+from driving.live.wire import facial_mocap
+from driving.test_performance_files import codes_of, write_csv
 from flame.conftest import model_of, random_arrays
 from PIL import Image
 from tracking import scenes, test_calibrations, test_head_model
@@ -26,6 +28,8 @@ from stga_addon.capture.meshes import read_mesh, read_regions
 from stga_addon.capture.model import View
 from stga_addon.capture.open import read_face_ids, read_soup
 from stga_addon.capture.transforms import read_transforms
+from stga_addon.driving.performance import ARKIT_SHAPES
+from stga_addon.driving.performers import read_performance
 from stga_addon.export.ply import PROPERTIES, splat_columns, write_ply
 from stga_addon.export.splat_files import read_splats
 from stga_addon.export.spz import write_spz
@@ -180,6 +184,13 @@ def linear_head(path: Path) -> None:
     np.savez(path, mean=np.eye(4, 3), faces=np.array([[0, 1, 2]]), **bases, **skeleton)
 
 
+def performance(path: Path) -> None:
+    found = read_performance(path)
+    assert np.isfinite(found.weights).all()
+    assert np.isfinite(found.times).all()
+
+
+TAKE = {"fps": 25, "names": ARKIT_SHAPES, "frames": np.full((3, 52), 0.3).tolist()}
 COLMAP = ("cameras.txt", "images.txt", "cameras.bin", "images.bin")
 TARGETS = {
     name: Target(*row)
@@ -207,6 +218,17 @@ TARGETS = {
             "head.glb",
             lambda p: p.write_bytes(test_head_model.simple()),
             read_head_model,
+        ),
+        "performance csv": (
+            "a.csv",
+            lambda p: write_csv(p, codes_of(6), np.full((6, 52), 0.3)),
+            performance,
+        ),
+        "performance json": ("a.json", lambda p: p.write_text(json.dumps(TAKE)), performance),
+        "performance text": (
+            "a.txt",
+            lambda p: p.write_bytes(facial_mocap({"jawOpen": 0.5}, (1, 2, 3))),
+            performance,
         ),
         "avatar": ("a.npz", avatar, read_avatar),
         "splats": ("a.ply", lambda p: write_ply(p, random_splats(1, 4, 1)), read_splats),
