@@ -27,6 +27,7 @@ import pytest
 from capture import factory
 from flame.conftest import random_arrays
 from tracking import test_calibrations
+from tracking.scenes import rewrite
 from tracking.test_head_model import glb as head_glb
 from tracking.test_head_model import simple
 from training.test_folder import make_checkpoint
@@ -523,17 +524,12 @@ FRAME_VALUES: dict[str, dict[str, Any]] = {
     "far focal length": {"fl_x": 1e30},
     "no focal length": {"fl_x": 1e-30},
     "no angle": {"fl_x": None, "camera_angle_x": 5e-324},
-    "huge size": {"w": 10**400},
     "size of gigapixels": {"w": 10**6, "h": 10**6},
-    "huge centre": {"cx": 10**400},
     "far centre": {"cy": -1e30},
     "huge timestep": {"timestep_index": 10**400},
     "far timestep": {"timestep_index": 10**15},
-    "huge camera": {"camera_index": 10**400},
     "huge matrix": {"transform_matrix": [[10**400] * 4] * 4},
     "matrix of lists": {"transform_matrix": [[[]] * 4] * 4},
-    "number as list": {"w": [40]},
-    "matrix of text": {"transform_matrix": [["1"] * 4] * 4},
     "camera of lists": {"camera_id": [[["x"]]], "camera_index": None},
 }
 
@@ -572,9 +568,7 @@ def rewritten(path: Path, change: Any) -> None:
     """change: (old, new) text; new values of an npz's arrays, None removes one; of a JSON object,
     or of the second of its frames."""
     if isinstance(change, tuple):
-        text = path.read_text(encoding="utf-8")
-        assert change[0] in text
-        path.write_text(text.replace(*change), encoding="utf-8")
+        rewrite(path, change)
     elif path.suffix == ".json":
         document = read_json(path)
         document["frames"][1].update(change)

@@ -36,6 +36,11 @@ def write_footage(folder, cameras, timesteps, picture):
     return folder
 
 
+def seen_landmarks(head, places, meshes, camera):
+    """(T, N, 2) exact pixels."""
+    return np.stack([camera.project(places.on(mesh, head.model.faces))[0] for mesh in meshes])
+
+
 def record(
     folder, head, picture=lambda mesh, camera: np.zeros((SIZE, SIZE, 3), np.uint8), timesteps=5
 ):
@@ -50,7 +55,7 @@ def record(
     write_flame(head.model, folder / "head.npz")
     write_places(folder / "points/head_model.npz", places, np.ones(LANDMARKS, bool))
     for number, camera in enumerate(cameras):
-        points = np.stack([camera.project(places.on(mesh, head.model.faces))[0] for mesh in meshes])
+        points = seen_landmarks(head, places, meshes, camera)
         confidence = np.ones(points.shape[:2])
         confidence[2] = 0
         arrays = {"timesteps": np.arange(timesteps), "points": points, "confidence": confidence}

@@ -22,6 +22,15 @@ def write_image(path, value=128, size=(WIDTH, HEIGHT)):
     Image.new("RGB", size, (value, 10, 20)).save(path)
 
 
+def rewrite(path, *changes):
+    """Change a text in place: what is found in it, and what stands there then."""
+    text = path.read_text(encoding="utf-8")
+    for old, new in changes:
+        assert old in text
+        text = text.replace(old, new)
+    path.write_text(text, encoding="utf-8")
+
+
 def encode(path, frames, codec="libx264", options=None, rate=25, times=None, set_up=None):
     """A video of images (H, W, 3) uint8, or of PyAV's frames; times: of each, in frames; set_up: of
     the encoder."""

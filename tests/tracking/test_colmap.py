@@ -9,7 +9,7 @@ from stga_addon.errors import StgaError
 from stga_addon.tracking.footage.colmap import LENSES, read_colmap
 from stga_addon.tracking.footage.open import open_footage
 
-from .scenes import HEIGHT, WIDTH, rig, write_colmap_text, write_image
+from .scenes import HEIGHT, WIDTH, rewrite, rig, write_colmap_text, write_image
 
 RANDOM = np.random.default_rng(3)
 PARAMETERS = {"FOV": (0.7,), "DIVISION": (-0.1,), "SIMPLE_DIVISION": (-0.1,)}
@@ -54,21 +54,6 @@ def test_projections_are_colmaps(tmp_path, kind):
         np.testing.assert_allclose(found, expected, atol=1e-6, err_msg=shot.label)
 
 
-def test_model_beside_the_images(tmp_path):
-    """Catches COLMAP's usual folders not being found, and images without points that shift the
-    lines after them."""
-    names = ["left.png", "middle.png", "right.png"]
-    write_colmap_text(tmp_path / "sparse/0", rig(), names)
-    for number, name in enumerate(names):
-        write_image(tmp_path / "images" / name, 50 * number)
-    footage = open_footage(tmp_path)
-    assert [camera.name for camera in footage.cameras] == ["left", "middle", "right"]
-    assert [camera.image(0)[0, 0, 0] for camera in footage.cameras] == [0, 50, 100]
-    for camera, expected in zip(footage.cameras, rig(), strict=True):
-        found = camera.camera.world_to_camera
-        np.testing.assert_allclose(found, expected.world_to_camera, atol=1e-9)
-
-
 DEPTH = repr(float(rig(1)[0].world_to_camera[2, 3]))
 NO_IMAGE = "has no image, folder or video of the name"
 
@@ -107,10 +92,7 @@ def test_models_that_do_not_fit_are_named(tmp_path, file, old, new, message):
     write_colmap_text(tmp_path / "sparse/0", rig(2), ["left.png", "right.png"])
     for name in ("left.png", "right.png"):
         write_image(tmp_path / name)
-    path = tmp_path / f"sparse/0/{file}.txt"
-    text = path.read_text(encoding="utf-8")
-    assert old in text
-    path.write_text(text.replace(old, new), encoding="utf-8")
+    rewrite(tmp_path / f"sparse/0/{file}.txt", (old, new))
     with pytest.raises(StgaError, match=message):
         open_footage(tmp_path)
 

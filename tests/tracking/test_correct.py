@@ -5,10 +5,10 @@ import shutil
 
 import numpy as np
 import pytest
+from command_line import stga
 from flame.small_head import small_head
 
 from stga_addon.capture.open import open_capture
-from stga_addon.cli.main import main
 from stga_addon.errors import StgaError
 from stga_addon.files import read_json, read_npz, write_json, write_npz
 from stga_addon.flame.forward import RIGID_SIZE, flame_forward, frame_of
@@ -139,10 +139,6 @@ def changed(name, **values):
     return damage
 
 
-def replaced(name, content):
-    return lambda out: (out / name).write_bytes(content)
-
-
 def solved(**arrays):
     return lambda out: write_npz(out / SOLVED_FILE, arrays)
 
@@ -165,15 +161,14 @@ DAMAGES = {
     "report missing": (lambda out: (out / REPORT_FILE).unlink(), REPORT_FILE, "cannot be read"),
     "no landmark counts": (unconfident, LANDMARKS_FOLDER, "has no landmarks of a face"),
     "solved folder": (lambda out: (out / SOLVED_FILE).mkdir(), SOLVED_FILE, "is not a regular"),
-    "solved empty": (replaced(SOLVED_FILE, b""), SOLVED_FILE, "is not a readable npz"),
-    **{
-        f"report {content}": (replaced(REPORT_FILE, content), REPORT_FILE, INTERPOLATED)
-        for content in (b"[1]", b"null")
-    },
-    "report cut": (replaced(REPORT_FILE, b'{"interpolated": ['), REPORT_FILE, "is not valid JSON"),
+    "report null": (
+        lambda out: (out / REPORT_FILE).write_text("null"),
+        REPORT_FILE,
+        INTERPOLATED,
+    ),
     **{
         f"interpolated {own}": (changed(REPORT_FILE, interpolated=own), REPORT_FILE, INTERPOLATED)
-        for own in (None, 3, [[1]], ["2"], [float("nan")])
+        for own in (None, [[1]], ["2"])
     },
     **{
         f"misfit {own}": (changed(REPORT_FILE, image_misfit={"face": own}), REPORT_FILE, MISFIT)
@@ -184,7 +179,6 @@ DAMAGES = {
         for name, arrays, message in (
             ("without parameters", {"timesteps": FIVE}, PARAMETERS),
             ("of fewer timesteps", {"timesteps": FIVE, "parameters": TAKE[:4]}, PARAMETERS),
-            ("as text", {"timesteps": FIVE, "parameters": POSES.astype(str)}, PARAMETERS),
             ("as complex", {"timesteps": FIVE, "parameters": POSES.astype(complex)}, PARAMETERS),
             ("not a number", {"timesteps": FIVE, "parameters": np.nan * POSES}, PARAMETERS),
             ("astronomic", {"timesteps": FIVE, "parameters": POSES + 1e300}, PARAMETERS),
@@ -205,7 +199,7 @@ def test_a_damaged_capture_is_named(tracked, tmp_path, capsys, name):
     (tmp_path / "out" / SOLVED_FILE).unlink(missing_ok=True)
     write_request(tmp_path / "job", SolveAgain(tmp_path / "out", model, {1: before[1]}))
     damage(tmp_path / "out")
-    assert main(["perform", str(tmp_path / "job")]) == 2
+    assert stga("perform", tmp_path / "job") == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert str(tmp_path / "out" / file) in line
     assert re.search(message, line)
@@ -219,7 +213,7 @@ def test_a_key_that_is_none_is_named(tracked, tmp_path, capsys, key):
     """Catches heads that are written from a request whose arrays are damaged."""
     out, model, before = tracked
     write_request(tmp_path / "job", SolveAgain(out, model, {1: key}))
-    assert main(["perform", str(tmp_path / "job")]) == 2
+    assert stga("perform", tmp_path / "job") == 2
     message = rf"key at timestep 1: expected \({SIZE},\) finite numbers"
     assert re.search(message, capsys.readouterr().err)
     np.testing.assert_array_equal(parameters_in(out, model), before)

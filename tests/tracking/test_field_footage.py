@@ -1,6 +1,5 @@
 """Calibrations and footage as other programs and people leave them: read, or refused by name."""
 
-import json
 import struct
 from pathlib import Path
 
@@ -9,10 +8,20 @@ import pytest
 from PIL import Image
 
 from stga_addon.errors import StgaError
+from stga_addon.files import write_json
 from stga_addon.tracking.footage.open import open_footage
 
-from .scenes import HEIGHT, WIDTH, quaternion, rig, write_colmap_text, write_image, write_video
-from .test_calibrations import HEADER, csv_line, entry, write_export, write_xmp
+from .scenes import (
+    HEIGHT,
+    WIDTH,
+    quaternion,
+    rewrite,
+    rig,
+    write_colmap_text,
+    write_image,
+    write_video,
+)
+from .test_calibrations import HEADER, csv_line, entry, intrinsics, write_export, write_xmp
 
 NAMES = ["cam0.png", "cam1.png", "cam2.png"]
 
@@ -81,14 +90,14 @@ def test_text_models_with_and_without_points(tmp_path, change, encoding):
     write_images(tmp_path / "images")
     footage = open_footage(tmp_path)
     is_rig(footage, rig())
+    assert reds(footage) == [0, 50, 100]
     assert footage.warnings == ()
 
 
 def test_a_line_that_is_neither_image_nor_points(tmp_path):
     """Catches a damaged line of points that is skipped, and with it the camera behind it."""
     write_colmap_text(tmp_path / "sparse/0", rig(), NAMES)
-    path = tmp_path / "sparse/0/images.txt"
-    path.write_text(path.read_text().replace("1.5 2.5 -1", "1.5 2.5 -1 7", 1))
+    rewrite(tmp_path / "sparse/0/images.txt", ("1.5 2.5 -1", "1.5 2.5 -1 7"))
     write_images(tmp_path / "images")
     message = r"images.txt: line 3: expected number, quaternion, .* or its points by 3 numbers each"
     with pytest.raises(StgaError, match=message):
@@ -182,12 +191,15 @@ TABLES = {
 @pytest.mark.parametrize("kind", TABLES)
 def test_tables_of_realitycapture(tmp_path, kind):
     """Catches photos of a rig taken for a video of one camera, because the headings are those of
-    another version, or the table was saved by another program."""
+    another version, or the table was saved by another program; angles of another order or sense,
+    and a principal point in another unit."""
     (tmp_path / "cameras.csv").write_bytes(TABLES[kind])
     write_images(tmp_path / "images")
     footage = open_footage(tmp_path)
     is_rig(footage, rig())
-    assert footage.cameras[0].camera.cx == pytest.approx(WIDTH / 2 + 0.01 * WIDTH)
+    assert reds(footage) == [0, 50, 100]
+    lens = WIDTH / 2, WIDTH / 2, 0.51 * WIDTH, HEIGHT / 2 - 0.02 * WIDTH
+    assert intrinsics(footage.cameras[0].camera) == pytest.approx(lens)
     assert footage.warnings == ()
 
 
@@ -239,11 +251,18 @@ def test_other_tables_are_no_calibrations(tmp_path, name):
 
 
 def test_xmp_in_folders_of_cameras(tmp_path):
-    """Catches XMP files of images named alike, and those of a photo program taken for cameras."""
+    """Catches XMP files of images named alike, those of images that were not aligned, and those of
+    a photo program taken for cameras."""
     for number, camera in enumerate(rig()):
         write_xmp(tmp_path / f"cam{number}/IMG_1.xmp", camera, "perspective", "0 0 0 0 0 0")
         write_image(tmp_path / f"cam{number}/IMG_1.jpg", 50 * number)
     is_rig(open_footage(tmp_path), rig())
+    rewrite(tmp_path / "cam2/IMG_1.xmp", ("xcr:Rotation>", "xcr:Other>"))
+    footage = open_footage(tmp_path)
+    is_rig(footage, rig(2))
+    left_out = f"{tmp_path}: left out cameras without a pose: cam2/IMG_1"
+    unused = f"{tmp_path}: 1 of 3 images have no camera in {tmp_path}: cam2/IMG_1.jpg"
+    assert footage.warnings == (left_out, unused)
     single = tmp_path / "single"
     write_images(single / "images")
     photo = '<x:xmpmeta xmlns:x="adobe:ns:meta/" xmlns:crs="http://ns.adobe.com/camera-raw/"/>'
@@ -264,14 +283,7 @@ def test_groups_of_metashape(tmp_path):
         parts[number] = f'<group id="{number}" label="cam{number - 1}"><camera {parts[number]}'
         parts[number] = parts[number].replace("</camera>", "</camera></group>", 1)
     text = "".join(parts).replace('<group id="0" label="Group 1" type="folder">', "", 1)
-    path.write_text(
-        text.replace("</group></cameras>", "</cameras>").replace(
-            '</group><camera id="8"', '<camera id="8"'
-        ),
-        encoding="utf-8",
-    )
-    text = path.read_text(encoding="utf-8").replace("</group></group>", "</group>")
-    path.write_text(text, encoding="utf-8")
+    path.write_text(text.replace("</group></group>", "</group>"), encoding="utf-8")
     for number in range(3):
         write_image(tmp_path / f"cam{number}/IMG_1.jpg", 50 * number)
     pytest.importorskip("cv2")
@@ -283,11 +295,7 @@ def test_groups_of_metashape(tmp_path):
 
 def changed_export(folder, changes):
     write_export(folder / "cameras.xml", rig(), ["cam0", "cam1", "cam2"], intrinsics={"f": 50.0})
-    text = (folder / "cameras.xml").read_text(encoding="utf-8")
-    for old, new in changes:
-        assert old in text
-        text = text.replace(old, new)
-    (folder / "cameras.xml").write_text(text, encoding="utf-8")
+    rewrite(folder / "cameras.xml", *changes)
     write_images(folder / "images")
 
 
@@ -379,7 +387,7 @@ def test_matrices_and_names_of_exporters(tmp_path, change, sentences, timed):
         del frame["w"], frame["h"]
         timestep = {"timestep_index": 0, "camera_index": number} if timed else {}
         frames.append(change(frame) | timestep)
-    (tmp_path / "transforms.json").write_text(json.dumps({"frames": frames}), encoding="utf-8")
+    write_json(tmp_path / "transforms.json", {"frames": frames})
     footage = open_footage(tmp_path)
     is_rig(footage, rig())
     assert len(footage.warnings) == sentences
@@ -398,13 +406,13 @@ def test_transforms_with_paths_of_elsewhere(tmp_path, folder):
     slash = "\\" if "\\" in folder else "/"
     paths = [f"{folder}{slash}{name}" for name in NAMES]
     frames = [entry(camera, path) for camera, path in zip(rig(), paths, strict=True)]
-    (tmp_path / "transforms.json").write_text(json.dumps({"frames": frames}), encoding="utf-8")
+    write_json(tmp_path / "transforms.json", {"frames": frames})
     write_images(tmp_path / "images")
     footage = open_footage(tmp_path)
     is_rig(footage, rig())
     assert reds(footage) == [0, 50, 100]
     frames[0]["file_path"] = "/etc/passwd"
-    (tmp_path / "transforms.json").write_text(json.dumps({"frames": frames}), encoding="utf-8")
+    write_json(tmp_path / "transforms.json", {"frames": frames})
     with pytest.raises(StgaError, match="has no image, folder or video of the name '/etc/passwd'"):
         open_footage(tmp_path)
 
@@ -412,7 +420,7 @@ def test_transforms_with_paths_of_elsewhere(tmp_path, folder):
 def test_transforms_of_another_name(tmp_path):
     """Catches photos taken for a video because the file is not called transforms.json."""
     frames = [entry(camera, f"images/{n}") for n, camera in zip(NAMES, rig(), strict=True)]
-    (tmp_path / "cameras.json").write_text(json.dumps({"frames": frames}), encoding="utf-8")
+    write_json(tmp_path / "cameras.json", {"frames": frames})
     write_images(tmp_path / "images")
     is_rig(open_footage(tmp_path), rig())
 

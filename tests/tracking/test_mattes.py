@@ -4,9 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from command_line import refused
 from PIL import Image
 
-from stga_addon.cli.main import main
 from stga_addon.errors import StgaError
 from stga_addon.tracking import mattes
 from stga_addon.tracking.footage.open import open_footage
@@ -147,5 +147,6 @@ def test_a_folder_that_is_none(tmp_path, capsys):
     take(tmp_path)
     words = {"--model": "none.npz", "--out": "out", "--mattes": "nowhere"}
     more = [word for name, file in words.items() for word in (name, str(tmp_path / file))]
-    assert main(["track", str(tmp_path / "footage"), *more]) == 2
-    assert "nowhere: is not a folder; expected one of mattes" in capsys.readouterr().err
+    assert "nowhere: is not a folder; expected one of mattes" in refused(
+        capsys, "track", tmp_path / "footage", *more
+    )

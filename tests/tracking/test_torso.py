@@ -1,7 +1,7 @@
 """The torso's motion against generated takes in which shoulders are a body of their own, that moves
 as told."""
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +18,6 @@ from stga_addon.flame.forward import (
     FlameFrame,
     axis_angle_matrices,
     flame_forward,
-    frame_of,
     joint_positions,
 )
 from stga_addon.flame.model import MIN_TORSO_WEIGHT, torso_faces
@@ -47,7 +46,6 @@ from stga_addon.tracking.torso_take import (
     NECK,
     ROOT,
     BothWays,
-    Carrier,
     PosedTorso,
     TorsoPose,
     TorsoTake,
@@ -56,7 +54,7 @@ from stga_addon.tracking.torso_take import (
 from stga_addon.tracking.track import track
 from stga_addon.worker.helpers import Helpers
 
-from .recording import write_footage
+from .recording import seen_landmarks, write_footage
 from .test_fit import places_on
 
 SIZE = 105, 142
@@ -295,43 +293,6 @@ def test_without_masks_the_torso_is_not_told_from_the_wall(head):
     assert_unchanged(followed, parameters)
 
 
-def test_turning_the_root_leaves_the_head_in_its_place(head):
-    """Catches a neck that turns about another point than the model's."""
-    one = person(head, np.zeros(head.model.n_identity))
-    rng = np.random.default_rng(0)
-    expr = rng.normal(0, 0.3, one.model.n_expression)
-    root = rng.normal(0, 0.4, 3)
-    neck = rng.normal(0, 0.2, 3)
-    frame = FlameFrame(expr, root, neck, np.zeros(3), rng.normal(0, 1, 3), np.zeros(6))
-    # the throat's correctives are another thing
-    model = replace(one.model, posedirs=np.zeros_like(one.model.posedirs))
-    joints = joint_positions(model, model.v_template + model.shapedirs @ frame.expr)
-    rotation = axis_angle_matrices(rng.normal(0, 0.5, (1, 3)))[0]
-    changed = with_root(frame.parameters, rotation, joints[NECK] - joints[ROOT])
-    before, after = (flame_forward(model, np.zeros(0), own) for own in (frame, frame_of(changed)))
-    apart = model.weights[:, ROOT] == 0
-    np.testing.assert_allclose(after[apart], before[apart], atol=1e-12)
-    turned = axis_angle_matrices(frame_of(changed).rotation[None])[0]
-    np.testing.assert_allclose(turned, rotation, atol=1e-12)
-
-
-def test_points_are_carried_by_the_triangles_that_they_lie_on(fine_head):
-    """Catches points that the wrong triangle carries: near the neck, each moves otherwise."""
-    one = person(fine_head, np.zeros(fine_head.model.n_identity))
-    first, last = np.zeros((2, one.model.n_expression + 18))
-    last[-18:-15] = [0.1, 0.5, 0.0]
-    last[-15:-12] = [0.0, -0.5, 0.1]
-    fit = HeadFit(one, np.zeros(0), {0: first, 1: last}, HERE)
-    torso = TorsoTake(fit, fit.parameters, [])
-    meshes = [posed_mesh(fit, own)[one.model.faces[torso.torso]] for own in (first, last)]
-    at, expected = (corners.mean(axis=1) for corners in meshes)
-    found = Carrier(torso, PosedTorso(first), at).carried(PosedTorso(last))(at)
-    away = np.linalg.norm(found - expected, axis=1)
-    assert np.linalg.norm(expected - at, axis=1).max() > 0.02
-    assert np.median(away) < 1e-4
-    assert away.max() < 2e-3
-
-
 @pytest.mark.parametrize(("earlier", "bends"), [(True, True), (False, True), (True, False)])
 def test_a_take_on_its_torso_has_the_vertices_that_motion_and_cloth_say(fine_head, earlier, bends):
     """Catches a drape that offsets repeat, or that template or static offset lack, an earlier
@@ -401,7 +362,7 @@ def test_track_writes_the_torso_as_flames_neck(tmp_path, head, lifted, monkeypat
     write_places(tmp_path / "points" / PLACES_FILE, places, np.ones(200, bool))
     for number, camera in enumerate(cameras):
         meshes = [posed_mesh(fit, parameters[timestep]) for timestep in range(TIMESTEPS)]
-        points = np.stack([camera.project(places.on(mesh, head.model.faces))[0] for mesh in meshes])
+        points = seen_landmarks(head, places, meshes, camera)
         arrays = {"timesteps": np.arange(TIMESTEPS), "points": points}
         write_npz(tmp_path / f"points/cam{number}.npz", arrays)
     footage = open_footage(tmp_path / "footage")

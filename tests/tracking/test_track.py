@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from command_line import stga
 from flame.small_head import write_flame
 from scipy.spatial.transform import Rotation
 
@@ -35,7 +36,7 @@ from stga_addon.tracking.stages import Crew, Stage
 from stga_addon.tracking.track import track
 from stga_addon.worker.helpers import Helpers
 
-from .recording import LANDMARKS, SIZE, record, rig, write_footage
+from .recording import LANDMARKS, SIZE, record, rig, seen_landmarks, write_footage
 from .scenes import write_video
 from .test_fit import frame_at, places_on
 from .test_sequences import write_folders
@@ -60,7 +61,7 @@ def recorded(tmp_path, take, monkeypatch):
 def command(folder, *more):
     named = {"--model": "head.npz", "--out": "out", "--landmarks": "points"}
     paths = [word for name, file in named.items() for word in (name, str(folder / file))]
-    return main(["track", str(folder / "footage"), *paths, *more])
+    return stga("track", folder / "footage", *paths, *more)
 
 
 def assert_projects_as(capture, meshes, vertices, skipped=2):
@@ -242,7 +243,7 @@ def test_a_mirrored_rig_is_named(recorded, capsys, head):
     mirrored = places_on(head, LANDMARKS).on(template, faces) * [-1, 1, 1]
     twins, _ = nearest_points(template, faces, mirrored)
     for number, camera in enumerate(rig()):
-        points = np.stack([camera.project(twins.on(mesh, faces))[0] for mesh in meshes])
+        points = seen_landmarks(head, twins, meshes, camera)
         # a detector calls the left eye of a mirrored face its right one
         change(folder / f"points/cam{number}.npz", points=points * [-1, 1] + [SIZE, 0])
     assert command(folder) == 2
@@ -370,6 +371,16 @@ class Remembering:
         return [self.landmarks[int(image[0, 0, 0])]]
 
 
+def numbered_take(folder, head):
+    """Footage whose images are of different brightness; places on the head, and (25, N, 2) their
+    landmarks by image."""
+    number = iter(range(25))
+    meshes = record(folder, head, lambda *_: np.full((SIZE, SIZE, 3), next(number), np.uint8))
+    places = places_on(head, LANDMARKS)
+    points = [seen_landmarks(head, places, meshes, camera) for camera in rig()]
+    return open_footage(folder / "footage"), places, np.concatenate(points)
+
+
 def use_detector(monkeypatch, detector, places):
     """Let `track` use a detector whose landmarks lie at some places of the head model."""
     monkeypatch.setattr("stga_addon.tracking.recorded.FaceNetworks", lambda: detector)
@@ -380,16 +391,9 @@ def use_detector(monkeypatch, detector, places):
 def test_a_canceled_run_ends_as_an_unbroken_one(tmp_path, head, monkeypatch):
     """Catches landmarks in another precision on disk than in memory: the same track, with other
     numbers."""
-    number = iter(range(25))
-    meshes = record(tmp_path, head, lambda *_: np.full((SIZE, SIZE, 3), next(number), np.uint8))
-    places = places_on(head, LANDMARKS)
-    rng = np.random.default_rng(0)
-    exact = [
-        camera.project(places.on(mesh, head.model.faces))[0] for camera in rig() for mesh in meshes
-    ]
-    noisy = [points + rng.normal(0, 0.1, points.shape) for points in exact]
+    footage, places, exact = numbered_take(tmp_path, head)
+    noisy = exact + np.random.default_rng(0).normal(0, 0.1, exact.shape)
     use_detector(monkeypatch, Remembering(noisy), places)
-    footage = open_footage(tmp_path / "footage")
     model = tmp_path / "head.npz"
     track(footage, model, tmp_path / "unbroken")
     with pytest.raises(KeyboardInterrupt):
@@ -494,13 +498,7 @@ class Glimpsing(Remembering):
 def test_a_face_that_is_hardly_ever_found_is_no_capture(tmp_path, head, monkeypatch):
     """Catches a take of five timesteps that is written from one face, with exit code 0; and one
     that shows the face half of the time and is refused."""
-    number = iter(range(25))
-    meshes = record(tmp_path, head, lambda *_: np.full((SIZE, SIZE, 3), next(number), np.uint8))
-    places = places_on(head, LANDMARKS)
-    points = [
-        camera.project(places.on(mesh, head.model.faces))[0] for camera in rig() for mesh in meshes
-    ]
-    footage = open_footage(tmp_path / "footage")
+    footage, places, points = numbered_take(tmp_path, head)
     model = tmp_path / "head.npz"
     use_detector(monkeypatch, Glimpsing(points, {3}), places)
     message = r"is found at 1 of 5 timesteps, expected 33% .* crop the video to head and shoulders"
@@ -543,6 +541,6 @@ def test_no_face_is_found_on_the_back_of_a_head(recorded, capsys, head):
     turned = replace(head.model, v_template=head.model.v_template * [-1, 1, -1])
     write_flame(turned, folder / "turned.npz")
     words = ["--model", str(folder / "turned.npz"), "--out", str(folder / "out")]
-    assert main(["track", str(folder / "footage"), *words]) == 2
+    assert stga("track", folder / "footage", *words) == 2
     assert re.search(r"turned\.npz: shows a face in . of 9 pictures", capsys.readouterr().err)
     assert not (folder / "out").exists()
