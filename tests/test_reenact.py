@@ -5,13 +5,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 from capture import factory
+from command_line import refused, stga
 from PIL import Image
 
 from stga_addon.avatar.file import read_avatar
 from stga_addon.capture.open import open_capture
-from stga_addon.cli.main import main
 from stga_addon.flame.forward import FlameFrame, flame_forward
 from stga_addon.render.render import render_avatar, to_uint8
+
+RENDER = "render {avatar} --cameras {cameras} --motion {motion} --out"
 
 
 @pytest.fixture
@@ -33,18 +35,8 @@ def parts(tmp_path: Path) -> dict[str, Path]:
     }
 
 
-def render(parts: dict[str, Path], out: Path, *more: object) -> int:
-    arguments = [
-        "render",
-        parts["avatar"],
-        "--cameras",
-        parts["cameras"],
-        "--motion",
-        parts["motion"],
-        "--out",
-        out,
-    ]
-    return main([str(a) for a in [*arguments, *more]])
+def render(parts, out, *more):
+    return stga(RENDER.format(**parts), out, *more)
 
 
 def test_the_other_person_moves_the_avatar(parts, tmp_path):
@@ -57,7 +49,6 @@ def test_the_other_person_moves_the_avatar(parts, tmp_path):
     capture = open_capture(parts["capture"], parts["model"])
     own = capture.flame
     view = next(view for view in capture.views["train"] if view.camera_index == 1)
-    assert own is not None
     arrays = np.load(parts["motion"])
     pose = arrays["pose"][1]
     frame = FlameFrame(arrays["expr"][1], pose[:3], pose[3:6], pose[6:9], np.zeros(3), pose[9:])
@@ -65,24 +56,22 @@ def test_the_other_person_moves_the_avatar(parts, tmp_path):
     expected = to_uint8(
         render_avatar(read_avatar(parts["avatar"]), mesh, view.camera, (1.0, 1.0, 1.0))
     )
-    with Image.open(out / "00001_01.png") as image:
-        drawn = np.asarray(image)
-    assert np.abs(drawn.astype(int) - expected.astype(int)).max() <= 1
-    assert (
-        np.abs(drawn.astype(int) - np.asarray(Image.open(out / "00000_01.png")).astype(int)).max()
-        > 50
-    )
+    first, drawn = (np.asarray(Image.open(out / f"0000{t}_01.png")).astype(int) for t in (0, 1))
+    assert np.abs(drawn - expected).max() <= 1
+    assert np.abs(drawn - first).max() > 50
 
 
 def test_mistakes(parts, tmp_path, capsys):
     """Catches tracebacks for what a person gets wrong first."""
-    assert render(parts, tmp_path / "out") == 2
-    assert "give the FLAME model file" in capsys.readouterr().err
     meshes = factory.write_mesh_capture(tmp_path / "meshes")
-    assert render(parts | {"motion": meshes}, tmp_path / "out", "--flame", parts["model"]) == 2
-    assert "was not tracked with FLAME" in capsys.readouterr().err
-    (tmp_path / "scan.ply").write_bytes(b"ply\n")
-    scan = parts | {"avatar": tmp_path / "scan.ply"}
-    assert render(scan, tmp_path / "out", "--flame", parts["model"]) == 2
-    assert "scan.ply: holds splats in the world" in capsys.readouterr().err
+    scan = tmp_path / "scan.ply"
+    scan.write_bytes(b"ply\n")
+    flame = "--flame", parts["model"]
+    for other, more, message in (
+        ({}, (), "give the FLAME model file"),
+        ({"motion": meshes}, flame, "was not tracked with FLAME"),
+        ({"avatar": scan}, flame, "scan.ply: holds splats in the world"),
+    ):
+        words = RENDER.format(**parts | other), tmp_path / "out", *more
+        assert message in refused(capsys, *words)
     assert not (tmp_path / "out").exists()

@@ -50,6 +50,11 @@ def scipy_rotation(wxyz: np.ndarray) -> Rotation:
     return Rotation.from_quat(wxyz[..., [1, 2, 3, 0]])
 
 
+def covariance(splats):
+    axes = scipy_rotation(splats.rotation).as_matrix() * np.exp(splats.log_scale)[:, None]
+    return axes @ axes.transpose(0, 2, 1)
+
+
 @pytest.mark.parametrize("convention", CONVENTIONS)
 def test_frames_are_the_published_ones(convention):
     """Catches swapped axes, a flipped normal, a scale of the wrong kind, or half an area, triangle
@@ -75,10 +80,6 @@ def test_world_covariance_is_the_transformed_local_one(convention):
     frames = face_frames(random_mesh(1)[0], faces, neutral, convention)
     splats = random_splats(3, 40, len(faces))
     world = to_world(splats, frames)
-
-    def covariance(s):
-        axes = scipy_rotation(s.rotation).as_matrix() * np.exp(s.log_scale)[:, None, :]
-        return axes @ axes.transpose(0, 2, 1)
 
     linear = frames.rotation[splats.face] * frames.scale[splats.face, None, None]
     expected = linear @ covariance(splats) @ linear.transpose(0, 2, 1)
@@ -147,14 +148,9 @@ def test_splats_are_placed_by_any_matrix(kind: str) -> None:
     matrix[:3, 3] = 1, 2, 3
     splats = random_splats(1, 40, 1)
     found = placed(splats, matrix)
-    covariance = []
-    for each in (splats, found):
-        axes = Rotation.from_quat(each.rotation[:, [1, 2, 3, 0]]).as_matrix()
-        axes = axes * np.exp(each.log_scale)[:, None]
-        covariance.append(axes @ axes.transpose(0, 2, 1))
-    expected = linear @ covariance[0] @ linear.T
+    expected = linear @ covariance(splats) @ linear.T
     size = np.abs(expected).max((1, 2), keepdims=True)
-    np.testing.assert_allclose(covariance[1] / size, expected / size, atol=1e-5)
+    np.testing.assert_allclose(covariance(found) / size, expected / size, atol=1e-5)
     np.testing.assert_allclose(found.xyz, splats.xyz @ linear.T + [1, 2, 3], atol=1e-6)
     left, _, right = np.linalg.svd(linear)
     seen = np.random.default_rng(0).normal(size=(40, 3))

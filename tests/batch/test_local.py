@@ -11,8 +11,8 @@ from pathlib import Path
 
 import pytest
 from capture.factory import write_mesh_capture
+from command_line import refused, stga
 
-from stga_addon.cli.main import main
 from stga_addon.jobs.batch.engines import LocalEngine
 from stga_addon.jobs.batch.plan import read_plan
 from stga_addon.jobs.batch.run import Batch, JobState
@@ -93,7 +93,7 @@ def test_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert "train-bad" in report
     assert "1 failed, 1 stopped" in report
     assert not re.findall(r"(?:src|href)=\"(?!data:|#)[^\"]*\"", report)
-    assert main(["batch", str(tmp_path / "plan.toml"), "--dry-run"]) == 0
+    assert stga("batch", tmp_path / "plan.toml", "--dry-run") == 0
     printed = capsys.readouterr().out
     assert re.search(r"train-good +Train +1 thread, 0\.5 GB +6 s", printed)
     assert "2 jobs, 2 to do; 12 s of work" in printed
@@ -106,18 +106,17 @@ def test_captures_of_the_command(tmp_path, capsys, monkeypatch):
     capture = str(tmp_path / "capture")
     out = str(tmp_path / "out")
     options = "--iterations 2 --device cpu --threads 1 --principal-point opencv --seed 5"
-    assert main(["batch", capture, "--out", out, *options.split()]) == 0
+    assert stga("batch", capture, "--out", out, options) == 0
     assert "1 of 1 jobs finished" in capsys.readouterr().out
     run = read_run(tmp_path / "out/train-capture")
     found = run.principal_point, run.settings.iterations, run.settings.seed, run.device
     assert found == ("opencv", 2, 5, "cpu")
-    assert main(["batch", capture, "--preset", "draft"]) == 2
-    assert "--out: is missing" in capsys.readouterr().err
-    assert main(["batch", capture, "--out", out]) == 2
-    assert "--preset: is missing" in capsys.readouterr().err
+    assert "--out: is missing" in refused(capsys, "batch", capture, "--preset draft")
+    assert "--preset: is missing" in refused(capsys, "batch", capture, "--out", out)
     (tmp_path / "plan.toml").write_text("")
-    assert main(["batch", str(tmp_path / "plan.toml"), "--seed", "2"]) == 2
-    assert "--seed: has no effect with a plan" in capsys.readouterr().err
+    assert "--seed: has no effect with a plan" in refused(
+        capsys, "batch", tmp_path / "plan.toml", "--seed 2"
+    )
 
 
 def test_commands_carry_out_the_batch(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -126,11 +125,11 @@ def test_commands_carry_out_the_batch(tmp_path: Path, capsys: pytest.CaptureFixt
     look = '[job.{}]\nrequest = "select"\ncapture = "a capture"\nafter = {}\n'
     plan = tmp_path / "plan.toml"
     plan.write_text('out = "runs"\n' + look.format("again", ["look"]) + look.format("look", []))
-    assert main(["batch", str(plan), "--commands"]) == 0
+    assert stga("batch", plan, "--commands") == 0
     first, second = capsys.readouterr().out.splitlines()
     assert second.endswith("  # after look")
     subprocess.run(["sh", "-c", first], check=True, cwd="/")
-    assert main(["batch", str(plan), "--commands"]) == 0
+    assert stga("batch", plan, "--commands") == 0
     (left,) = capsys.readouterr().out.splitlines()
     assert left == second.partition("  #")[0]
     subprocess.run(["sh", "-c", second], check=True, cwd="/")

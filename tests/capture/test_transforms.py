@@ -19,6 +19,12 @@ def read_one(folder, entry, principal_point="vhap", **shared):
     return read_transforms(path, principal_point)[0]
 
 
+def views_of(folder, frames):
+    """The views of a single file of frames."""
+    (folder / "transforms.json").write_text(json.dumps({"frames": frames}))
+    return [frame.view for frame in read_splits(folder).frames]
+
+
 @pytest.mark.parametrize(
     ("convention", "cx", "cy"), [("vhap", 19.0, 36.0), ("opencv", 19.0, 24.0), ("center", 20, 30)]
 )
@@ -81,31 +87,17 @@ def test_cameras_of_a_single_file(tmp_path):
     frames[1]["transform_matrix"] = matrix.tolist()
     for entry in frames:
         del entry["camera_index"], entry["camera_id"]
-    (tmp_path / "transforms.json").write_text(json.dumps({"frames": frames}))
-    assert [frame.view.camera_index for frame in read_splits(tmp_path).frames] == [0, 0, 1]
-    entries = [
-        factory.frame(0, 0),
-        factory.frame(1, 0),
-        factory.frame(2, 0),
-        factory.frame(3, 0),
-        factory.frame(4, 1),
-    ]
-    entries[2]["fl_x"] += 1.0
-    entries[3]["cy"] += 1.0
-    (tmp_path / "transforms.json").write_text(json.dumps({"frames": entries}))
-    cameras = [frame.view.camera for frame in read_splits(tmp_path).frames]
+    assert [view.camera_index for view in views_of(tmp_path, frames)] == [0, 0, 1]
+    frames = [factory.frame(timestep, int(timestep == 4)) for timestep in range(5)]
+    frames[2]["fl_x"] += 1.0
+    frames[3]["cy"] += 1.0
+    cameras = [view.camera for view in views_of(tmp_path, frames)]
     assert cameras[0] is cameras[1]
     assert len({id(camera) for camera in cameras}) == 4
     assert cameras[2].fl_x == cameras[0].fl_x + 1
     assert cameras[3].cy != cameras[0].cy
-    frames = [factory.frame(0, camera) for camera in range(3)]
-    (tmp_path / "transforms.json").write_text(json.dumps({"frames": frames}))
     splits = read_splits(tmp_path).splits
-    assert [(name, len(own)) for name, own in splits.items()] == [
-        ("train", 3),
-        ("val", 0),
-        ("test", 0),
-    ]
+    assert {name: len(own) for name, own in splits.items()} == {"train": 5, "val": 0, "test": 0}
 
 
 def test_static_capture_without_timesteps(tmp_path):
@@ -165,9 +157,9 @@ def test_timesteps_of_monocular_trackers(tmp_path, names, timesteps, field):
     frames = [factory.frame(0, 0, **{field: name}) for name in names]
     for frame in frames:
         del frame["timestep_index"]
-    (tmp_path / "transforms.json").write_text(json.dumps({"frames": frames}))
-    for found in (read_transforms(tmp_path / "transforms.json"), read_splits(tmp_path).frames):
-        assert [frame.view.timestep for frame in found] == timesteps
+    assert [view.timestep for view in views_of(tmp_path, frames)] == timesteps
+    found = read_transforms(tmp_path / "transforms.json")
+    assert [frame.view.timestep for frame in found] == timesteps
 
 
 def test_union_paths_stay_beside_the_capture(tmp_path):
@@ -235,6 +227,5 @@ def test_missing_fields_are_named(tmp_path, field):
     silently becomes timestep 0 among others."""
     frames = [factory.frame(4, 0), factory.frame(4, 1)]
     del frames[1][field]
-    (tmp_path / "transforms.json").write_text(json.dumps({"frames": frames}))
     with pytest.raises(StgaError, match=rf"frames\[1\]\.{field}: .*missing"):
-        read_splits(tmp_path)
+        views_of(tmp_path, frames)

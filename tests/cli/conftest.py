@@ -4,8 +4,7 @@ from pathlib import Path
 
 import pytest
 from capture import factory
-
-from stga_addon.cli.main import main
+from command_line import stga
 
 TIMESTEPS = (0, 1, 3)
 CAMERAS = range(3)
@@ -21,14 +20,5 @@ def trained(root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run of ten iterations of the paper's schedule, with a threshold of its own."""
     out = tmp_path_factory.mktemp("runs") / "run"
     options = "--iterations 10 --schedule paper --threshold 0.005"
-    assert main(["train", str(root), "--out", str(out), *options.split()]) == 0
+    assert stga("train", root, "--out", out, options) == 0
     return out
-
-
-def refused(capsys: pytest.CaptureFixture[str], *arguments: object) -> str:
-    """Run a command that must fail: exit code 2 and one sentence on stderr, which is returned."""
-    capsys.readouterr()
-    assert main([str(a) for a in arguments]) == 2
-    lines = [line for line in capsys.readouterr().err.splitlines() if line.startswith("stga: ")]
-    assert len(lines) == 1
-    return lines[0]

@@ -5,7 +5,7 @@ from contextlib import redirect_stdout
 from io import StringIO
 
 import pytest
-from command_line import stga
+from command_line import refused, stga
 
 from stga_addon.capture.open import open_capture
 from stga_addon.cli import commands
@@ -94,8 +94,7 @@ def test_other_inputs_are_refused(made, take, capsys, more, expected):
 def test_a_wrong_folder_is_left_as_it_is(take, tmp_path, capsys):
     """Catches a folder that remembers a mistake, and somebody's run taken for a part of it."""
     files = "--model", take / "head.npz", "--out", tmp_path / "out"
-    assert stga("avatar", tmp_path / "nowhere", *files) == 2
-    assert "nowhere: does not exist" in capsys.readouterr().err
+    assert "nowhere: does not exist" in refused(capsys, "avatar", tmp_path / "nowhere", *files)
     assert not (tmp_path / "out").exists()
     (tmp_path / "out").mkdir()
     assert stga("avatar", tmp_path / "nowhere", *files) == 2

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from capture import factory
 from capture.factory import edit, write_avatar_of, write_flame_capture, write_mesh_capture
-from command_line import stga
+from command_line import refused, stga
 from export.web.web_data import read_web_data
 from PIL import Image
 
@@ -22,7 +22,6 @@ from stga_addon.avatar.embedding import to_world
 from stga_addon.avatar.file import read_avatar
 from stga_addon.capture.open import open_capture
 from stga_addon.cli import commands
-from stga_addon.cli.main import main
 from stga_addon.errors import StgaError
 from stga_addon.export.ply import read_ply
 from stga_addon.jobs.render import unique_names
@@ -32,7 +31,7 @@ from stga_addon.training.run.checkpoint import read_checkpoint
 from stga_addon.training.run.folder import read_run
 from stga_addon.training.run.metrics_log import read_metrics
 
-from .conftest import CAMERAS, TIMESTEPS, refused
+from .conftest import CAMERAS, TIMESTEPS
 
 
 def pictures(folder: Path) -> list[str]:
@@ -51,7 +50,7 @@ def pixels(path: Path) -> np.ndarray:
 def test_select(root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Catches a threshold that is ignored, and masks or lines of another timestep."""
     out = tmp_path / "selection.npz"
-    assert main(["select", str(root), "--threshold", "0.0008", "--out", str(out)]) == 0
+    assert stga("select", root, "--threshold 0.0008 --out", out) == 0
     lines = capsys.readouterr().out.splitlines()
     assert lines[0] == "threshold 0.8 mm, 320 triangles"
     assert [int(line.split()[0]) for line in lines[1:]] == list(TIMESTEPS)
@@ -63,7 +62,7 @@ def test_select(root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) 
     assert chosen[3][mouth].all()
     assert chosen[3].mean() < 0.5
     assert "mouth" in lines[3]
-    assert main(["select", str(root), "--threshold", "1"]) == 0
+    assert stga("select", root, "--threshold 1") == 0
     assert all("0.0%" in line for line in capsys.readouterr().out.splitlines()[1:])
 
 
@@ -76,7 +75,7 @@ def test_train_and_eval(trained, root, capsys):
     assert run.settings.selection == SelectionOptions(threshold=0.005, zero_pose="all")
     assert len(read_avatar(trained / "avatar.npz").splats) >= 15 * 320
     for split, views in (("val", 2), ("test", 3), ("train", 4)):
-        assert main(["eval", str(trained), "--split", split]) == 0
+        assert stga("eval", trained, "--split", split) == 0
         assert f"{split}: {views} views, PSNR " in capsys.readouterr().out
         quality = json.loads((trained / f"quality_{split}.json").read_text())
         assert quality["views"] == views
@@ -145,8 +144,8 @@ def test_export_of_frames(trained, root, tmp_path, capsys):
     meshes = {None: avatar.neutral, 3: capture.mesh(3)}
     for timestep, mesh in meshes.items():
         out = tmp_path / f"{timestep}.ply"
-        chosen = [] if timestep is None else ["--timestep", str(timestep)]
-        assert main(["export", str(trained), "--format", "ply", "--out", str(out), *chosen]) == 0
+        chosen = "" if timestep is None else f"--timestep {timestep}"
+        assert stga("export", trained, "--format ply --out", out, chosen) == 0
         expected = to_world(avatar.splats, avatar.frames(mesh))
         again = read_ply(out)
         np.testing.assert_allclose(again.xyz, expected.xyz, atol=1e-6)
@@ -154,9 +153,9 @@ def test_export_of_frames(trained, root, tmp_path, capsys):
     posed, neutral = (read_ply(tmp_path / f"{name}.ply").xyz for name in ("3", "None"))
     assert np.abs(posed - neutral).max() > 0.002
     assert np.linalg.norm(neutral, axis=1).mean() == pytest.approx(0.1, abs=0.01)
-    sequence = ["export", str(trained), "--format", "ply-sequence"]
     for span, said in (("1:999999", True), ("0:3", False), ("0:2", False)):
-        assert main([*sequence, "--frames", span, "--out", str(tmp_path / span[2:])]) == 0
+        words = f"--format ply-sequence --frames {span} --out"
+        assert stga("export", trained, words, tmp_path / span[2:]) == 0
         message = f"--frames {span}: the capture has timesteps 0 to 3\n"
         assert (message in capsys.readouterr().out) == said
     files = sorted((tmp_path / "3").glob("*.ply"))
@@ -197,13 +196,13 @@ def test_files_that_have_moved(tmp_path, capsys, trained, root):
         assert len(data["expr"]) >= 3
     model.rename(elsewhere)
     assert "cannot be read" in refused(capsys, "eval", out)
-    assert main(["eval", str(out), "--flame", str(elsewhere)]) == 0
+    assert stga("eval", out, "--flame", elsewhere) == 0
     run = Path(shutil.copytree(trained, tmp_path / "copy"))
     moved = Path(shutil.copytree(root, tmp_path / "moved"))
     factory.edit(run / "run.json", lambda document: document.update(capture=str(tmp_path / "gone")))
     assert "gone" in refused(capsys, "eval", run)
-    assert main(["eval", str(run), "--capture", str(moved)]) == 0
-    assert main(["eval", str(trained)]) == 0
+    assert stga("eval", run, "--capture", moved) == 0
+    assert stga("eval", trained) == 0
     qualities = [(path / "quality_val.json").read_text() for path in (run, trained)]
     assert qualities[0] == qualities[1]
     val = moved / "transforms_val.json"
@@ -258,7 +257,7 @@ def test_commands_need_few_packages(root: Path, trained: Path, tmp_path: Path) -
     traceback where Blender, with numpy alone, lacks a package."""
     flame, model = factory.write_flame_capture(tmp_path / "flame")
     ply = tmp_path / "a.ply"
-    exported = ["export", str(trained / "avatar.npz"), "--format", "ply", "--out", str(ply)]
+    exported = f"export {trained}/avatar.npz --format ply --out {ply}"
     known = "162 vertices, 320 triangles", "40 x 60", "view-color"
     meshes = {
         suffix: factory.write_mesh_capture(tmp_path / suffix, suffix=f".{suffix}")
@@ -269,16 +268,17 @@ def test_commands_need_few_packages(root: Path, trained: Path, tmp_path: Path) -
         factory.edit(path, lambda document: [entry.pop("w") for entry in document["frames"]])
     pillow = "frames[0].w: w and h are missing; to take them from the image needs Pillow"
     for missing, arguments, says in (
-        ("torch numba wgpu", ["info", str(root)], known),
-        (NUMPY_ALONE, ["select", str(flame), "--flame", str(model)], ("320 triangles",)),
-        (NUMPY_ALONE, ["select", str(meshes["ply"])], ("320 triangles",)),
-        (NUMPY_ALONE, ["select", str(meshes["stl"])], "reading STL needs the Python package"),
-        (NUMPY_ALONE, ["select", str(unsized)], pillow),
+        ("torch numba wgpu", f"info {root}", known),
+        (NUMPY_ALONE, f"select {flame} --flame {model}", ("320 triangles",)),
+        (NUMPY_ALONE, f"select {meshes['ply']}", ("320 triangles",)),
+        (NUMPY_ALONE, f"select {meshes['stl']}", "reading STL needs the Python package"),
+        (NUMPY_ALONE, f"select {unsized}", pillow),
         (NUMPY_ALONE, exported, ()),
     ):
-        command = [sys.executable, "-c", WITHOUT, missing, *arguments]
-        here = Path(__file__).parents[2]
-        done = subprocess.run(command, capture_output=True, text=True, cwd=here)
+        command = [sys.executable, "-c", WITHOUT, missing, *arguments.split()]
+        done = subprocess.run(
+            command, capture_output=True, text=True, cwd=Path(__file__).parents[2]
+        )
         if isinstance(says, str):
             assert done.returncode == 2
             assert says in done.stderr
@@ -298,7 +298,7 @@ def test_interruption_and_mistakes_have_their_codes(root, monkeypatch, capsys):
         monkeypatch.setitem(commands.COMMANDS, "info", replace(commands.COMMANDS["info"], run=run))
 
     fails_with(KeyboardInterrupt())
-    assert main(["info", str(root)]) == 130
+    assert stga("info", root) == 130
     fails_with(StgaError("the sentence"))
     assert refused(capsys, "info", root) == "stga: the sentence"
     fails_with(StgaError("long " * 100_000 + "\n\ud800"))
@@ -333,17 +333,17 @@ def test_refine_and_extend(trained, tmp_path, capsys, root):
     assert f"avatar: {tmp_path / 'anna_2' / 'avatar.npz'}" in printed
     assert stga("refine", tmp_path / "anna_2", "--region mouth --iterations 3 --growth 0.5") == 0
     assert read_checkpoint(tmp_path / "anna_3").iteration == 3
-    assert main(["refine", str(tmp_path / "anna_3"), "--resume"]) == 0
-    assert main(["eval", str(tmp_path / "anna_3")]) == 0
+    assert stga("refine", tmp_path / "anna_3", "--resume") == 0
+    assert stga("eval", tmp_path / "anna_3") == 0
     take = Path(shutil.copytree(root, tmp_path / "smile"))
-    assert main(["extend", str(runs), str(take), "--iterations", "6"]) == 0
+    assert stga("extend", runs, take, "--iterations 6") == 0
     printed = capsys.readouterr().out
     assert "take 1: " in printed
     assert "take 2: " in printed
     out = tmp_path / "anna_4"
-    assert main(["eval", str(out)]) == 0
-    assert main(["refine", str(out), "--region", "mouth", "--iterations", "3"]) == 0
-    assert main(["extend", str(out), "--resume"]) == 0
+    assert stga("eval", out) == 0
+    assert stga("refine", out, "--region mouth --iterations 3") == 0
+    assert stga("extend", out, "--resume") == 0
     assert "is a take of this run already" in refused(capsys, "extend", out, take)
 
 
@@ -353,27 +353,27 @@ def test_names_that_a_terminal_would_obey(root, tmp_path, capsys):
     evil = "eyes\x1b]0;title\x07\nfolder\x9b2J"
     factory.edit(capture / "regions.json", lambda document: document.update({evil: [0]}))
     for command in ("info", "select"):
-        assert main([command, str(capture)]) == 0
+        assert stga(command, capture) == 0
         printed = capsys.readouterr().out
         assert not set(printed) & set(map(chr, (*range(10), *range(11, 32), *range(127, 160))))
         assert "\nfolder" not in printed.removeprefix("folder")
-    assert main(["info", str(capture)]) == 0
+    assert stga("info", capture) == 0
     assert r"eyes\x1b]0;title\x07\nfolder\x9b2J" in capsys.readouterr().out
 
 
 def test_refinements_at_once_have_folders_of_their_own(trained, tmp_path, monkeypatch):
     """Catches two refinements that train into one folder, and a folder left of none."""
     shutil.copytree(trained, tmp_path / "run")
-    command = ["refine", str(tmp_path / "run"), "--region", "mouth", "--iterations", "1"]
+    command = f"refine {tmp_path}/run --region mouth --iterations 1"
     runs = []
 
     def meanwhile(request, *_):
         runs.append(request.run.name)
         if len(runs) < 3:
-            assert main(command) == 0
+            assert stga(command) == 0
 
     monkeypatch.setattr("stga_addon.cli.commands.carry_out", meanwhile)
-    assert main(command) == 0
+    assert stga(command) == 0
     assert runs == ["run_2", "run_3", "run_4"]
     assert [path.name for path in tmp_path.iterdir()] == ["run"]
 
@@ -384,8 +384,8 @@ def test_frames_cameras_and_selection_of_a_capture(tmp_path):
     avatar_file = write_avatar_of(capture, tmp_path / "anna.npz", order=2, sh_degree=1)
     first = capture.timesteps[1]
     last = capture.timesteps[-1]
-    words = ["--capture", str(capture.root), "--frames", f"{first}:{last}", "--fps", "30"]
-    assert stga("export", avatar_file, "--format web", *words, "--out", tmp_path / "a.stga") == 0
+    words = f"--format web --capture {capture.root} --frames {first}:{last} --fps 30 --out"
+    assert stga("export", avatar_file, words, tmp_path / "a.stga") == 0
     header, arrays = read_web_data((tmp_path / "a.stga").read_bytes())
     frames = len(capture.timesteps) - 1
     assert (header["title"], header["fps"]) == ("anna", 30)
@@ -393,15 +393,15 @@ def test_frames_cameras_and_selection_of_a_capture(tmp_path):
     cameras = {view.camera_index for views in capture.views.values() for view in views}
     assert {view["name"] for view in header["views"]} == {f"Camera {index}" for index in cameras}
     edit(tmp_path / "capture/transforms_train.json", lambda document: document.update(fps=60))
-    words = ["--capture", str(tmp_path / "capture"), "--out"]
-    assert stga("export", avatar_file, "--format web", *words, tmp_path / "a.stga") == 0
+    words = f"--capture {capture.root} --out"
+    assert stga("export", avatar_file, "--format web", words, tmp_path / "a.stga") == 0
     assert read_web_data((tmp_path / "a.stga").read_bytes())[0]["fps"] == 60
     assert stga("export", avatar_file, "--format web --out", tmp_path / "a.html") == 0
     text = (tmp_path / "a.html").read_text(encoding="utf-8")
     assert "<title>anna</title>" in text
     assert "{{" not in text.partition('<script type="module">')[0]
     usd = pytest.importorskip("pxr.Usd", reason="the package usd-core is not installed")
-    assert stga("export", avatar_file, "--format usd", *words, tmp_path / "a.usdc") == 0
+    assert stga("export", avatar_file, "--format usd", words, tmp_path / "a.usdc") == 0
     assert usd.Stage.Open(str(tmp_path / "a.usdc")).GetTimeCodesPerSecond() == 60
 
 

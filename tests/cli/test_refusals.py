@@ -8,11 +8,9 @@ import numpy as np
 import pytest
 import trimesh
 from capture import factory
+from command_line import refused, stga
 
-from stga_addon.cli.main import main
 from stga_addon.training.run.folder import read_run
-
-from .conftest import refused
 
 REFUSALS = [
     # Options that have no effect, or none there
@@ -226,10 +224,10 @@ def test_refusals(refusable, capsys, command, says):
 
 def test_a_threshold_is_given_again_when_a_run_is_resumed(root: Path, tmp_path: Path) -> None:
     """Catches `train --resume` that refuses the threshold that the run began with."""
-    run = ["train", str(root), "--out", str(tmp_path / "run"), "--device", "cpu"]
-    chosen = ["--threshold", "0.01", "--schedule", "paper", "--iterations", "1"]
-    assert main([*run, *chosen]) == 0
-    assert main([*run, *chosen, "--resume"]) == 0
-    assert main([*run, "--threshold", "0.01", "--resume"]) == 0
-    assert main([*run, "--threshold", "0.02", "--resume"]) == 2
+    run = f"train {root} --out {tmp_path}/run --device cpu"
+    chosen = "--threshold 0.01 --schedule paper --iterations 1"
+    assert stga(run, chosen) == 0
+    assert stga(run, chosen, "--resume") == 0
+    assert stga(run, "--threshold 0.01 --resume") == 0
+    assert stga(run, "--threshold 0.02 --resume") == 2
     assert read_run(tmp_path / "run").settings.selection.threshold == 0.01

@@ -6,6 +6,7 @@ import av
 import numpy as np
 import pytest
 from capture import factory
+from command_line import stga
 from PIL import Image
 
 from stga_addon.avatar.file import read_avatar
@@ -98,7 +99,7 @@ def test_turntable_of_a_ply(parts: dict[str, Path], tmp_path: Path) -> None:
     ply = tmp_path / "scan.ply"
     cameras = parts["capture"] / "transforms_train.json"
     write_ply(ply, read_avatar(parts["avatar"]).splats)
-    assert main(["render", str(ply), "--video", str(tmp_path / "v.mp4"), "--turntable"]) == 2
+    assert stga("render", ply, "--video", tmp_path / "v.mp4", "--turntable") == 2
     arguments = ["--turntable", "--cameras", str(cameras), "--seconds", "0.2"]
-    assert main(["render", str(ply), "--video", str(tmp_path / "v.mp4"), *arguments]) == 0
+    assert stga("render", ply, "--video", tmp_path / "v.mp4", *arguments) == 0
     assert len(decoded(tmp_path / "v.mp4")[1]) == 5

@@ -5,9 +5,8 @@ from pathlib import Path
 
 import pytest
 from capture.factory import write_flame_capture
+from command_line import refused
 from rights import as_a_user
-
-from .conftest import refused
 
 COMMANDS = {
     "info {capture}": "capture",

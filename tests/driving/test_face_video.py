@@ -2,8 +2,8 @@
 
 import numpy as np
 import pytest
+from command_line import refused, stga
 
-from stga_addon.cli.main import main
 from stga_addon.driving.face_video import CAMERA_FIELD_OF_VIEW_DEG
 from stga_addon.driving.head_map import head_turns
 from stga_addon.driving.performance import COLUMN
@@ -40,7 +40,7 @@ def test_a_video_becomes_a_performance(network, tmp_path):
     with video_writer(video, 25) as append:
         for number in range(10):
             append(np.full((64, 64, 3), 0 if number == 5 else 60 + 10 * number, np.uint8))
-    assert main(["drive", str(video), "--out", str(tmp_path / "a.csv")]) == 0
+    assert stga("drive", video, "--out", tmp_path / "a.csv") == 0
     take = read_performance(tmp_path / "a.csv")
     assert take.fps == pytest.approx(25, rel=1e-4)
     np.testing.assert_allclose(take.times, np.arange(10) / 25, atol=1e-4)
@@ -54,6 +54,7 @@ def test_a_video_without_a_face(tmp_path, capsys):
     pytest.importorskip("cv2")
     with video_writer(tmp_path / "dark.mp4", 25) as append:
         append(np.zeros((64, 64, 3), np.uint8))
-    assert main(["drive", str(tmp_path / "dark.mp4"), "--out", str(tmp_path / "a.csv")]) == 2
-    assert "no face was found in any of its 1 frames" in capsys.readouterr().err
+    assert "no face was found in any of its 1 frames" in refused(
+        capsys, "drive", tmp_path / "dark.mp4", "--out", tmp_path / "a.csv"
+    )
     assert not (tmp_path / "a.csv").exists()

@@ -34,9 +34,9 @@ def head():
     return flame_model(None)
 
 
-def posed(head, **changed):
+def posed(head, shape=None, **changed):
     frame = replace(neutral_frame(head), **changed)
-    return flame_forward(head, np.zeros(head.n_identity), frame)
+    return flame_forward(head, np.zeros(head.n_identity) if shape is None else shape, frame)
 
 
 def expression(head, **weights):
@@ -97,8 +97,7 @@ def test_eyeballs_turn_in_their_lids(head):
 def seen_eyeball(model, shape, **weights):
     """Square millimeters of the left eyeball that are seen from the front between the lids, and
     through their skin."""
-    frame = replace(neutral_frame(model), expr=expression(model, **weights))
-    mesh = flame_forward(model, shape, frame)
+    mesh = posed(model, shape, expr=expression(model, **weights))
     joint = JOINTS.index("left_eye")
     at = mesh[model.masks["left_eyeball"]].mean(0)
     eye = at + np.array([0, 0, 0.5])
@@ -136,8 +135,7 @@ def test_lids_close_before_the_eyeballs(head):
 
 def back_sides(model, shape, weights):
     """Pixels below the lips that show the back of a triangle, from the front."""
-    frame = replace(neutral_frame(model), expr=expression(model, **weights))
-    mesh = flame_forward(model, shape, frame)
+    mesh = posed(model, shape, expr=expression(model, **weights))
     lips = mesh[model.masks["lips"]]
     at = np.array([lips[:, 0].mean(), lips[:, 1].min() - 0.004, lips[:, 2].max()])
     eye = at + np.array([0, 0, 0.5])

@@ -10,14 +10,14 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, get_args
 
-import av
 import numpy as np
 import pytest
 from capture.factory import edit, write_avatar_of, write_mesh_capture
+from cli.test_render_video import decoded
+from command_line import stga
 
 from stga_addon.avatar.file import Avatar, read_avatar, write_avatar
 from stga_addon.capture.open import open_capture
-from stga_addon.cli.main import main
 from stga_addon.errors import StgaError
 from stga_addon.files import read_npz
 from stga_addon.format import describe_left
@@ -242,26 +242,25 @@ def test_a_worker_renders_and_exports_what_the_command_line_would(tmp_path, capt
     pytest.importorskip("numba")
     avatar = write_avatar_of(open_capture(capture), tmp_path / "a.npz", is_colored=True)
     cameras = capture / "transforms_val.json"
-    given = [str(avatar), "--capture", str(capture)]
-    turned = ["--turntable", "120", "--seconds", "0.5", "--fps", "8", "--camera", "1"]
-    turned += ["--device", "cpu"]
+    given = f"{avatar} --capture {capture}"
+    turned = "--turntable 120 --seconds 0.5 --fps 8 --camera 1 --device cpu"
     turn = {"turntable": 120.0, "camera": 1, "fps": 8.0, "seconds": 0.5, "device": "cpu"}
     black = {"cameras": cameras, "background": (0.0, 0.0, 0.0)}
-    asked_for: dict[str, tuple[list[str], Any]] = {
+    asked_for = {
         "pictures": (
-            ["render", *given, "--cameras", str(cameras), "--background", "black", "--out"],
+            f"render {given} --cameras {cameras} --background black --out",
             Render(avatar, tmp_path / "pictures", capture=capture, **black),
         ),
         "film.mp4": (
-            ["render", *given, *turned, "--video"],
+            f"render {given} {turned} --video",
             Render(avatar, tmp_path / "film.mp4", True, capture=capture, **turn),
         ),
         "plys": (
-            ["export", *given, "--format", "ply-sequence", "--frames", "1:3", "--out"],
+            f"export {given} --format ply-sequence --frames 1:3 --out",
             Export(avatar, tmp_path / "plys", "ply-sequence", capture, frames=(1, 3)),
         ),
         "page.stga": (
-            ["export", *given, "--format", "web", "--fps", "30", "--out"],
+            f"export {given} --format web --fps 30 --out",
             Export(avatar, tmp_path / "page.stga", "web", capture, fps=30.0),
         ),
     }
@@ -273,12 +272,11 @@ def test_a_worker_renders_and_exports_what_the_command_line_would(tmp_path, capt
         assert jobs.read_result(folder) == Written(tmp_path / name)
         here = tmp_path / "here" / name
         there = tmp_path / name
-        assert main([*words, str(here)]) == 0
+        assert stga(words, here) == 0
         assert contents(there)
         # Kernels of another process may round another way, and the encoder then chooses another.
         if name.endswith(".mp4"):
-            found = film(here)
-            expected = film(there)
+            found, expected = (np.stack(decoded(path)[1]) for path in (here, there))
             assert found.shape == expected.shape
             assert len(found) == 4
             difference = np.abs(found.astype(int) - expected)
@@ -286,12 +284,6 @@ def test_a_worker_renders_and_exports_what_the_command_line_would(tmp_path, capt
             assert difference.max() < 30
         else:
             assert contents(here) == contents(there)
-
-
-def film(path: Path) -> np.ndarray:
-    """The images (N, H, W, 3) of a video."""
-    with av.open(str(path)) as container:
-        return np.stack([frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)])
 
 
 def contents(path: Path) -> dict[str, bytes]:
@@ -398,12 +390,12 @@ def test_previews_while_it_trains(tmp_path, capture, monkeypatch):
 def test_mistakes_reach_the_folder_and_the_exit_code(tmp_path, capture, capsys):
     """Catches a failure that only the log shows, and a command that ends well in spite of it."""
     pytest.importorskip("torch")
-    assert main(["perform", str(tmp_path / "nothing")]) == 2
+    assert stga("perform", tmp_path / "nothing") == 2
     assert "holds no request" in capsys.readouterr().err
     assert not (tmp_path / "nothing").exists()
     folder = asked(training(tmp_path / "run", capture))
     (capture / "meshes/00003.obj").write_text("v 0 0 nan\n")
-    assert main(["perform", str(folder)]) == 2
+    assert stga("perform", folder) == 2
     seen = inspect_worker(folder)
     assert seen.state == WorkerState.FAILED
     assert "00003.obj" in seen.status.error

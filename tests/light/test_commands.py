@@ -8,13 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 from capture import factory
-from command_line import stga
+from command_line import refused, stga
 from PIL import Image
 
 from stga_addon.avatar.file import read_avatar, write_avatar
 from stga_addon.capture.color import srgb_to_linear
 from stga_addon.capture.open import open_capture
-from stga_addon.cli.main import main
 from stga_addon.errors import StgaError
 from stga_addon.export.ply import read_ply
 from stga_addon.jobs import train as train_job
@@ -61,14 +60,14 @@ def test_a_run_ends_with_its_light(run, capsys, root, tmp_path):
     write_avatar(without, replace(avatar, light=None))
     grown = (run / "avatar.npz").stat().st_size - without.stat().st_size
     assert grown < 30 * len(avatar.neutral) + 2500
-    assert main(["info", str(run)]) == 0
+    assert stga("info", run) == 0
     assert "recorded colors differ" in capsys.readouterr().out
-    assert main(["info", str(without)]) == 0
+    assert stga("info", without) == 0
     assert "stga relight" in capsys.readouterr().out
-    assert main(["info", str(root), "--effect", "relight=off"]) == 0
+    assert stga("info", root, "--effect relight=off") == 0
     assert "lights of a scene" in capsys.readouterr().out
-    arguments = ["train", str(root), "--out", str(tmp_path / "run"), "--iterations", "2"]
-    assert main([*arguments, "--effect", "relight=off"]) == 0
+    words = "--iterations 2 --effect relight=off"
+    assert stga("train", root, "--out", tmp_path / "run", words) == 0
     assert read_avatar(tmp_path / "run/avatar.npz").light is None
 
 
@@ -97,7 +96,7 @@ def test_a_gray_card_sets_the_level_and_a_running_trainings_avatar_is_kept(
     shutil.copytree(run, copy)
     before = (copy / "avatar.npz").read_bytes()
     with locked(copy):  # as a training has it
-        assert main(["relight", str(copy)]) == 2
+        assert stga("relight", copy) == 2
     problem = f"another run is working in this folder (process {os.getpid()})"
     assert problem in capsys.readouterr().err
     assert (copy / "avatar.npz").read_bytes() == before
@@ -111,7 +110,7 @@ def test_a_gray_card_sets_the_level_and_a_running_trainings_avatar_is_kept(
     found = []
     for level in (0.5, 0.25):
         value = str(1.055 * level ** (1 / 2.4) - 0.055)
-        assert main(["relight", str(copy), "--gray-card", f"{value},{value},{value}"]) == 0
+        assert stga("relight", copy, "--gray-card", f"{value},{value},{value}") == 0
         light = read_avatar(copy / "avatar.npz").light
         assert light.source == "gray_card"
         found.append(light.irradiance.mean(0))
@@ -157,21 +156,19 @@ def test_render_under_lights(run, root, tmp_path, capsys):
     left = rendered(run, root, tmp_path / "left", "--light", str(lights))
     brighter = (right - left)[20:40].sum((0, 2))  # rows of the ball
     assert brighter[: len(brighter) // 2 - 5].sum() < 0 < brighter[len(brighter) // 2 + 5 :].sum()
-    cameras = ["--cameras", str(root / "transforms_val.json"), "--out", str(tmp_path / "p")]
-    for source, option, value, message in (
-        ([stripped / "avatar.npz", "--capture", root], "--light", lights, "stga relight RUN"),
-        ([run], "--light-turn", 90, "--light-turn: has no effect"),
-        ([run], "--light", tmp_path / "none.hdr", "none.hdr"),
+    cameras = f"--cameras {root}/transforms_val.json --out {tmp_path}/p"
+    for source, light, message in (
+        (f"{stripped}/avatar.npz --capture {root}", f"--light {lights}", "stga relight RUN"),
+        (f"{run}", "--light-turn 90", "--light-turn: has no effect"),
+        (f"{run}", f"--light {tmp_path}/none.hdr", "none.hdr"),
     ):
-        capsys.readouterr()
-        assert main(["render", *map(str, source), *cameras, option, str(value)]) == 2
-        assert message in capsys.readouterr().err
+        assert message in refused(capsys, "render", source, cameras, light)
 
 
 def test_albedo_as_ply(run: Path, tmp_path: Path) -> None:
     """Catches an export that keeps the recorded light, or loses splats."""
     out = tmp_path / "albedo.ply"
-    assert main(["export", str(run), "--format", "ply", "--albedo", "--out", str(out)]) == 0
+    assert stga("export", run, "--format ply --albedo --out", out) == 0
     avatar = read_avatar(run / "avatar.npz")
     splats = read_ply(out)
     assert not splats.sh[:, 1:].any()

@@ -7,10 +7,10 @@ from pathlib import Path
 import av
 import numpy as np
 import pytest
+from avatar.conftest import splats_of
 from PIL import Image
 
 from stga_addon.avatar.embedding import WORLD
-from stga_addon.avatar.splats import Splats
 from stga_addon.capture.camera import look_at
 from stga_addon.errors import StgaError
 from stga_addon.jobs.blender import RenderRecording
@@ -152,11 +152,9 @@ def record(
 
 def layer(seed: int, to_world: np.ndarray | None = None, count: int = 40) -> PosedSplats:
     rng = np.random.default_rng(seed)
-    floats = {"xyz": rng.normal(0, 0.3, (count, 3)), "rotation": rng.normal(size=(count, 4))}
-    floats |= {"log_scale": np.full((count, 3), -2.5), "opacity": np.ones(count)}
-    floats["sh"] = rng.normal(size=(count, 1, 3))
-    arrays = {name: values.astype(np.float32) for name, values in floats.items()}
-    splats = Splats(**arrays, face=np.zeros(count, np.int32), unbound=np.zeros(count, bool))
+    xyz = rng.normal(0, 0.3, (count, 3))
+    sh = rng.normal(size=(count, 1, 3))
+    splats = splats_of(xyz, rng.normal(size=(count, 4)), log_scale=-2.5, opacity=1, sh=sh)
     return PosedSplats(splats, WORLD, np.eye(4) if to_world is None else to_world)
 
 

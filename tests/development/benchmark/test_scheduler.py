@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 from batch.simulated import InProcessEngine
 from capture import factory
-from command_line import stga
+from command_line import refused, stga
 
 import stga_addon.development.commands  # noqa: F401 (adds its requests)
 from stga_addon.capture.model import Capture
@@ -197,8 +197,9 @@ def test_impossible_benchmarks(toy_root, tmp_path, capsys):
         (toy_root, "--only draft --knobs", "--only: 'draft' is not one of standard, scale-0.5"),
         (blind, "", "has no views to"),
     ):
-        assert stga("benchmark", capture, "--out", tmp_path / "out", arguments) == 2
-        assert message in capsys.readouterr().err
+        assert message in refused(
+            capsys, "benchmark", capture, "--out", tmp_path / "out", arguments
+        )
         assert not (tmp_path / "out").exists()
 
 
@@ -208,7 +209,7 @@ def test_slices_are_jobs_of_a_batch(toy_root, tmp_path, capsys, monkeypatch):
     out = str(tmp_path / "out")
     options = ["--budget", "1s", "--only", "draft", "--threads", "1"]
     command = ["benchmark", str(toy_root), "--out", out, "--seeds", "2", *options]
-    assert main([*command, "--dry-run"]) == 0
+    assert stga(*command, "--dry-run") == 0
     printed = capsys.readouterr().out
     assert re.search(r"benchmark-seed0 +Benchmark +1 thread, 1 GB +1 s\n", printed)
     assert "2 jobs, 2 to do; 2 s of work" in printed
