@@ -1,6 +1,7 @@
 """Commands that are refused: one sentence, exit code 2, and nothing written."""
 
 import json
+import re
 import shutil
 from pathlib import Path
 
@@ -12,164 +13,136 @@ from command_line import refused, stga
 
 from stga_addon.training.run.folder import read_run
 
-REFUSALS = [
-    # Options that have no effect, or none there
-    (
-        "export {run} --format gltf --frames 0:1 --out {o}",
-        "--frames cannot be combined with --format gltf, only with ply-sequence, usd, web",
-    ),
-    (
-        "export {run} --format usd --timestep 1 --out {o}",
-        "--timestep cannot be combined with --format usd",
-    ),
-    (
-        "export {run} --format ply --motion-only --out {o}",
-        "--motion-only cannot be combined with --format ply, only with web",
-    ),
-    (
-        "export {run} --format usd --out {o}.usda",
-        "o.usda: expected a name that ends in .usdc or .usdz",
-    ),
-    ("export {avatar} --format web --out {o}.txt", ".html"),
-    *(
-        (f"render {{run}} {options}", says)
-        for options, says in (
-            ("--video {o}.avi", "ends in .mp4"),
-            ("--video {o}.mp4 --camera 7", "there are only 0, 1, 2"),
-            ("--video {o}.mp4 --fps 0", "frame rate (--fps) must be from 0.01"),
-            ("--out {o}", "needs --cameras"),
-            ("--out {o} --camera 1", "--camera: has no effect without --video or --turntable"),
-            (
-                "--out {o} --turntable --seconds 1e9",
-                "--seconds 1e+09: is 25000000000 images at 25 frames per second; "
-                "expected up to 100000",
-            ),
-            (
-                "--out {o} --cameras {cameras} --frames 7:9",
-                "--frames 7:9: there is no such timestep",
-            ),
-            ("--out {o} --turntable 90 --frames 1:3", "--frames: has no effect with --turntable"),
-        )
-    ),
-    ("refine {run}", "--region: is missing"),
-    ("extend {run}", "CAPTURE: is missing"),
-    # Options that another replaces, or that have no effect without another
-    *(
-        (f"train {{root}} --out {{o}} --iterations 1 {options}", says)
-        for options, says in (
-            (
-                "--schedule paper --strategy gaussian-avatars",
-                "--schedule paper: cannot be combined with --strategy "
-                "gaussian-avatars, which has settings of its own",
-            ),
-            (
-                "--schedule paper --preset draft",
-                "--preset: cannot be combined with --schedule paper",
-            ),
-            (
-                "--preset final --strategy gaussian-avatars",
-                "--preset: cannot be combined with --strategy gaussian-avatars",
-            ),
-            (
-                "--threshold 0.01",
-                "--threshold: has no effect without --strategy selective, or --schedule paper",
-            ),
-            (
-                "--threshold 0.01 --strategy global --schedule paper",
-                "--threshold: has no effect without",
-            ),
-        )
-    ),
-    (
-        "avatar {root} --model m.npz --out {o} --threshold 0.01",
-        "--threshold: has no effect without --strategy",
-    ),
-    (
-        "render {avatar} --video v.mp4 --capture {root} --principal-point opencv",
-        "--principal-point: has no effect without --cameras",
-    ),
-    (
-        "export {avatar} --format ply --out {o}.ply --motion take.csv",
-        "--motion: has no effect with --format ply without --timestep",
-    ),
-    # A resumed run goes on as it began
-    *(
-        (
-            f"train {{root}} --out {{run}} --resume {option}",
-            f"{option.split()[0]}: this run began with",
-        )
-        for option in ("--stop-when-flat", "--preset final")
-    ),
-    *(
-        (
-            f"{command} {{none}} {option} --resume",
-            f"{option.split()[0] if option.startswith('-') else 'CAPTURE'}: cannot be combined "
-            "with --resume, which continues RUN as it began",
-        )
-        for command, option in (
-            ("refine", "--region mouth"),
-            ("refine", "--frames 1-3"),
-            ("refine", "--budget 1m"),
-            ("refine", "--out anna_2"),
-            ("extend", "--seed 1"),
-            ("extend", "smile"),
-        )
-    ),
-    ("refine {run} --resume", "does not continue another run"),
-    # Captures that are missing, broken, or others
-    ("train {none} --out {o} --iterations 3", "is not a folder"),
-    *(
-        (f"{command} {{broken}}{options}", "transforms_val.json: is not valid JSON")
-        for command, options in (
-            ("train", " --out {o} --iterations 3"),
-            ("info", ""),
-            ("select", ""),
-        )
-    ),
-    ("train {bare} --out {o} --iterations 3", "has no training views"),
-    (
-        "render {avatar} --capture {coarse} --cameras {cameras} --out {o}",
-        "{coarse}: its mesh has other triangles",
-    ),
-    (
-        "export {run} --capture {coarse} --format ply-sequence --out {o}",
-        "{coarse}: its mesh has other triangles",
-    ),
-    (
-        "export {run} --format gaussian-avatars --out {o}",
-        "needs the FLAME parameters of a FLAME capture",
-    ),
-    # Runs and avatars that are missing, broken, or there already
-    ("train {root} --out {run} --iterations 3", "already holds a run; resume it"),
-    ("refine {run} --region mouth --out {run}", "already holds a run"),
-    ("train {root} --out {none} --resume", "holds no run"),
-    ("train {root} --out {file} --iterations 3", "cannot be written"),
-    ("eval {avatar}", "avatar.npz"),
-    ("eval {root}", "holds no run"),
-    *(
-        (
-            f"render {{folder}}/{name} --capture {{root}} --cameras {{cameras}} --out {{o}}",
-            f"{name}: ",
-        )
-        for name in ("half.npz", "foreign.npz", "none.npz")
-    ),
-    ("render {folder}/mesh.ply --cameras {cameras} --out {o}", "mesh.ply: "),
-    ("render {folder}/none.ply --cameras {cameras} --out {o}", "none.ply: "),
-    # What a capture has not, or is to keep
-    ("render {avatar} --cameras {cameras} --out {o}", "give --capture"),
-    ("export {avatar} --format ply-sequence --out {o}", "give --capture"),
-    ("export {avatar} --format ply --timestep 1 --out {o}.ply", "give --capture"),
-    ("export {avatar} --format web --frames 1:2 --out {o}.html", "give --capture"),
-    ("export {run} --format ply-sequence --frames 7:9 --out {o}", "has no timestep from 7 to 9"),
-    ("export {run} --format ply --timestep 2 --out {o}.ply", "has no timestep 2"),
-    ("render {run} --cameras {later} --out {o}", "has no mesh for timestep 2"),
-    ("refine {run} --region chin", "neither a region of the capture"),
-    (
-        "render {run} --cameras {cameras} --out {root}/meshes/../images --device cpu",
-        "is an image of the capture; choose another --out",
-    ),
-]
-"""Command -> part of the sentence that refuses it, with the names of `refusable`."""
+REFUSALS = """
+# Options that have no effect, or none there
+$ export {run} --format gltf --frames 0:1 --out {o}
+--frames cannot be combined with --format gltf, only with ply-sequence, usd, web
+$ export {run} --format usd --timestep 1 --out {o}
+--timestep cannot be combined with --format usd
+$ export {run} --format ply --motion-only --out {o}
+--motion-only cannot be combined with --format ply, only with web
+$ export {run} --format usd --out {o}.usda
+o.usda: expected a name that ends in .usdc or .usdz
+$ export {avatar} --format web --out {o}.txt
+.html
+$ render {run} --video {o}.avi
+ends in .mp4
+$ render {run} --video {o}.mp4 --camera 7
+there are only 0, 1, 2
+$ render {run} --video {o}.mp4 --fps 0
+frame rate (--fps) must be from 0.01
+$ render {run} --out {o}
+needs --cameras
+$ render {run} --out {o} --camera 1
+--camera: has no effect without --video or --turntable
+$ render {run} --out {o} --turntable --seconds 1e9
+--seconds 1e+09: is 25000000000 images at 25 frames per second; expected up to 100000
+$ render {run} --out {o} --cameras {cameras} --frames 7:9
+--frames 7:9: there is no such timestep
+$ render {run} --out {o} --turntable 90 --frames 1:3
+--frames: has no effect with --turntable
+$ refine {run}
+--region: is missing
+$ extend {run}
+CAPTURE: is missing
+# Options that another replaces, or that have no effect without another
+$ train {root} --out {o} --iterations 1 --schedule paper --strategy gaussian-avatars
+--schedule paper: cannot be combined with --strategy gaussian-avatars, which has settings of its own
+$ train {root} --out {o} --iterations 1 --schedule paper --preset draft
+--preset: cannot be combined with --schedule paper
+$ train {root} --out {o} --iterations 1 --preset final --strategy gaussian-avatars
+--preset: cannot be combined with --strategy gaussian-avatars
+$ train {root} --out {o} --iterations 1 --threshold 0.01
+--threshold: has no effect without --strategy selective, or --schedule paper
+$ train {root} --out {o} --iterations 1 --threshold 0.01 --strategy global --schedule paper
+--threshold: has no effect without
+$ avatar {root} --model m.npz --out {o} --threshold 0.01
+--threshold: has no effect without --strategy
+$ render {avatar} --video v.mp4 --capture {root} --principal-point opencv
+--principal-point: has no effect without --cameras
+$ export {avatar} --format ply --out {o}.ply --motion take.csv
+--motion: has no effect with --format ply without --timestep
+# A resumed run goes on as it began
+$ train {root} --out {run} --resume --stop-when-flat
+--stop-when-flat: this run began with
+$ train {root} --out {run} --resume --preset final
+--preset: this run began with
+$ refine {none} --region mouth --resume
+--region: cannot be combined with --resume, which continues RUN as it began
+$ refine {none} --frames 1-3 --resume
+--frames: cannot be combined with --resume, which continues RUN as it began
+$ refine {none} --budget 1m --resume
+--budget: cannot be combined with --resume, which continues RUN as it began
+$ refine {none} --out anna_2 --resume
+--out: cannot be combined with --resume, which continues RUN as it began
+$ extend {none} --seed 1 --resume
+--seed: cannot be combined with --resume, which continues RUN as it began
+$ extend {none} smile --resume
+CAPTURE: cannot be combined with --resume, which continues RUN as it began
+$ refine {run} --resume
+does not continue another run
+# Captures that are missing, broken, or others
+$ train {none} --out {o} --iterations 3
+is not a folder
+$ train {broken} --out {o} --iterations 3
+transforms_val.json: is not valid JSON
+$ info {broken}
+transforms_val.json: is not valid JSON
+$ select {broken}
+transforms_val.json: is not valid JSON
+$ train {bare} --out {o} --iterations 3
+has no training views
+$ render {avatar} --capture {coarse} --cameras {cameras} --out {o}
+{coarse}: its mesh has other triangles
+$ export {run} --capture {coarse} --format ply-sequence --out {o}
+{coarse}: its mesh has other triangles
+$ export {run} --format gaussian-avatars --out {o}
+needs the FLAME parameters of a FLAME capture
+# Runs and avatars that are missing, broken, or there already
+$ train {root} --out {run} --iterations 3
+already holds a run; resume it
+$ refine {run} --region mouth --out {run}
+already holds a run
+$ train {root} --out {none} --resume
+holds no run
+$ train {root} --out {file} --iterations 3
+cannot be written
+$ eval {avatar}
+avatar.npz
+$ eval {root}
+holds no run
+$ render {folder}/half.npz --capture {root} --cameras {cameras} --out {o}
+half.npz: 
+$ render {folder}/foreign.npz --capture {root} --cameras {cameras} --out {o}
+foreign.npz: 
+$ render {folder}/none.npz --capture {root} --cameras {cameras} --out {o}
+none.npz: 
+$ render {folder}/mesh.ply --cameras {cameras} --out {o}
+mesh.ply: 
+$ render {folder}/none.ply --cameras {cameras} --out {o}
+none.ply: 
+# What a capture has not, or is to keep
+$ render {avatar} --cameras {cameras} --out {o}
+give --capture
+$ export {avatar} --format ply-sequence --out {o}
+give --capture
+$ export {avatar} --format ply --timestep 1 --out {o}.ply
+give --capture
+$ export {avatar} --format web --frames 1:2 --out {o}.html
+give --capture
+$ export {run} --format ply-sequence --frames 7:9 --out {o}
+has no timestep from 7 to 9
+$ export {run} --format ply --timestep 2 --out {o}.ply
+has no timestep 2
+$ render {run} --cameras {later} --out {o}
+has no mesh for timestep 2
+$ refine {run} --region chin
+neither a region of the capture
+$ render {run} --cameras {cameras} --out {root}/meshes/../images --device cpu
+is an image of the capture; choose another --out
+"""
+"""Command, and part of the sentence that refuses it, with the names of `refusable`."""
+ROWS = re.findall(r"^\$ (.*)\n(.*)$", REFUSALS, re.MULTILINE)
 
 
 @pytest.fixture(scope="session")
@@ -207,7 +180,7 @@ def refusable(root, trained, tmp_path_factory):
     return names
 
 
-@pytest.mark.parametrize(("command", "says"), REFUSALS, ids=[command for command, _ in REFUSALS])
+@pytest.mark.parametrize(("command", "says"), ROWS, ids=[command for command, _ in ROWS])
 def test_refusals(refusable, capsys, command, says):
     """Catches a traceback, talk of something else, and files that a refused command leaves."""
 

@@ -582,9 +582,6 @@ def full(value: Any, *shape: int) -> np.ndarray:
     return np.full(shape, value)
 
 
-DIGITS = "9" * 5000
-XMP = test_calibrations.XMP_COEFFICIENTS
-CSV = "cam0.png,1,2,3,10,20,30,24.3"
 LANDMARK_ROWS = [
     ({"points": full(0.0, 4, 3)}, r"points has shape \(4, 3\), expected \(4, any, 2\)"),
     ({"points": full("x", 4, 6, 2)}, "points holds <U1, expected floating-point numbers"),
@@ -662,55 +659,111 @@ MODEL_ROWS = [
     ({"n_identity": np.array(13)}, "n_identity is 13, expected one number from 0 to 12"),
 ]
 FOLDS = "the distortion of its lens folds the image"
-WIDE = "expected a focal length of 1 to 1e7"
-COUNT = "expected a whole number, not '999"
-FOCAL = f"<f>{test_calibrations.INTRINSICS['f']}</f>"
+WRONG_TEXTS = r"""
+# colmap cameras.txt
+PINHOLE → EQUIRECTANGULAR
+    camera 1: model 'EQUIRECTANGULAR' is not one of
+PINHOLE → OPENCV
+    camera 1: expected 8 parameters of OPENCV, not 4
+50.0 → nan
+    line 2: expected finite numbers
+1 PINH → {digits} PINH
+    {count}
+# colmap images.txt
+ 2 cam1.png →  7 cam1.png
+    image 'cam1.png': names camera 7, which .*cameras.txt
+ 1 cam0.png →
+    line 2: expected number, quaternion, translation, camera and name
+ 1 cam0.png →  {digits} cam0.png
+    line 2: {count}
+# metashape
+</document> →
+    is not valid XML
+<document → <!DOCTYPE a [<!ENTITY b 'c'>]><document
+    declares a document type
+<k1> → <k1>1e308</k1><k1>
+    {folds}
+<b1> → <b1>1e308</b1><b1>
+    {folds}
+{focal} →
+    sensor '0': has no calibration with f
+{focal} → <f>wide</f>
+    sensor '0': f: expected 1 finite number, not 'wide'
+{focal} → <f>0</f>
+    sensor '0': f: {wide}
+type="frame" → type="spherical"
+    sensor '0': type 'spherical' is not one of frame
+sensor_id="0" component → sensor_id="3" component
+    sensor_id '3' is no sensor of
+<p1> → <p3>0.1</p3><p1>
+    sensor '0': p3 and p4 are not supported
+<transform> → <transform>-
+    expected a rotation without|its axes are mirrored
+</transform> →  1</transform>
+    transform: expected 16 finite numbers, not
+# realitycapture csv
+{csv} → a.png,1,2
+    line 2: expected 16 columns, not 11
+{csv} → a.png,1,2,3,0,0,west,18
+    line 2: roll: expected 1 finite number, not 'west'
+{csv} → a.png,1e308,-1e308,1e308,9,9,9,18
+    line 2: expected a camera within 1e\+12
+0.1,0.02 → 1e308,-1e308
+    line 2: {folds}
+{csv} → {long}
+    line 2: is not readable CSV
+heading → direction
+    has no column heading; expected internal and external
+# realitycapture xmp
+"brown4t2" → "division"
+    xcr:DistortionModel 'division' is not one of perspective
+</xcr:Rotation> →  1</xcr:Rotation>
+    xcr:Rotation: expected 9 finite numbers, not
+xcr:FocalLength35mm="24.3765359225552" →
+    xcr:FocalLength35mm is missing
+24.3765359225552 → long
+    xcr:FocalLength35mm: expected 1 finite number, not 'long'
+</x:xmpmeta> →
+    is not valid XML
+24.3765359225552 → 1e-320
+    {wide}
+24.3765359225552 → 1e308
+    {wide}
+AspectRatio="1" → AspectRatio="1e308"
+    {wide}
+-0.0046 → -1e308
+    expected a principal point within 1e\+07 pixels
+{xmp} → 1e308 -1e308
+    {folds}
+# regions
+[0, 1, 2] → 3
+    nose: expected a list of vertex indices from 0 to 11
+[0, 1, 2] → ["a"]
+    nose: expected a list of vertex indices from 0 to 11
+[0, 1, 2] → [-1]
+    nose: expected a list of vertex indices from 0 to 11
+[0, 1, 2] → [12]
+    nose: expected a list of vertex indices from 0 to 11
+[0, 1, 2] → [1.5]
+    nose: expected a list of vertex indices from 0 to 11
+# run
+"lattice": null → "lattice": 1000000000
+    settings.lattice: expected
+"views_per_visit":  → "views_per_visit": -
+    settings.views_per_visit: expected
+"""
+"""Reader; what stands in its file and what is written there; what is said of it."""
+NAMES_OF_TEXTS = {
+    "digits": "9" * 5000,
+    "long": "a" * 200_000,
+    "csv": "cam0.png,1,2,3,10,20,30,24.3",
+    "xmp": test_calibrations.XMP_COEFFICIENTS,
+    "focal": f"<f>{test_calibrations.INTRINSICS['f']}</f>",
+    "folds": FOLDS,
+    "wide": "expected a focal length of 1 to 1e7",
+    "count": "expected a whole number, not '999",
+}
 WRONG: dict[str, list[tuple[Any, str]]] = {
-    "colmap cameras.txt": [
-        (("PINHOLE", "EQUIRECTANGULAR"), "camera 1: model 'EQUIRECTANGULAR' is not one of"),
-        (("PINHOLE", "OPENCV"), "camera 1: expected 8 parameters of OPENCV, not 4"),
-        (("50.0", "nan"), "line 2: expected finite numbers"),
-        (("1 PINH", f"{DIGITS} PINH"), COUNT),
-    ],
-    "colmap images.txt": [
-        ((" 2 cam1.png", " 7 cam1.png"), "image 'cam1.png': names camera 7, which .*cameras.txt"),
-        ((" 1 cam0.png", ""), "line 2: expected number, quaternion, translation, camera and name"),
-        ((" 1 cam0.png", f" {DIGITS} cam0.png"), f"line 2: {COUNT}"),
-    ],
-    "metashape": [
-        (("</document>", ""), "is not valid XML"),
-        (("<document ", "<!DOCTYPE a [<!ENTITY b 'c'>]><document "), "declares a document type"),
-        (("<k1>", "<k1>1e308</k1><k1>"), FOLDS),
-        (("<b1>", "<b1>1e308</b1><b1>"), FOLDS),
-        ((FOCAL, ""), "sensor '0': has no calibration with f"),
-        ((FOCAL, "<f>wide</f>"), "sensor '0': f: expected 1 finite number, not 'wide'"),
-        ((FOCAL, "<f>0</f>"), f"sensor '0': f: {WIDE}"),
-        (('type="frame"', 'type="spherical"'), "sensor '0': type 'spherical' is not one of frame"),
-        (('sensor_id="0" component', 'sensor_id="3" component'), "sensor_id '3' is no sensor of"),
-        (("<p1>", "<p3>0.1</p3><p1>"), "sensor '0': p3 and p4 are not supported"),
-        (("<transform>", "<transform>-"), "expected a rotation without|its axes are mirrored"),
-        (("<transform>", "<transform>1 "), "transform: expected 16 finite numbers, not"),
-    ],
-    "realitycapture csv": [
-        ((CSV, "a.png,1,2"), "line 2: expected 16 columns, not 11"),
-        ((CSV, "a.png,1,2,3,0,0,west,18"), "line 2: roll: expected 1 finite number, not 'west'"),
-        ((CSV, "a.png,1e308,-1e308,1e308,9,9,9,18"), r"line 2: expected a camera within 1e\+12"),
-        (("0.1,0.02", "1e308,-1e308"), f"line 2: {FOLDS}"),
-        ((CSV, "a" * 200_000), "line 2: is not readable CSV"),
-        (("heading", "direction"), "has no column heading; expected internal and external"),
-    ],
-    "realitycapture xmp": [
-        (('"brown4t2"', '"division"'), "xcr:DistortionModel 'division' is not one of perspective"),
-        (("<xcr:Rotation>", "<xcr:Rotation>1 "), "xcr:Rotation: expected 9 finite numbers, not"),
-        (('xcr:FocalLength35mm="24.3765359225552"', ""), "xcr:FocalLength35mm is missing"),
-        (("24.3765359225552", "long"), "xcr:FocalLength35mm: expected 1 finite number, not 'long'"),
-        (("</x:xmpmeta>", ""), "is not valid XML"),
-        (("24.3765359225552", "1e-320"), WIDE),
-        (("24.3765359225552", "1e308"), WIDE),
-        (('AspectRatio="1"', 'AspectRatio="1e308"'), WIDE),
-        (("-0.0046", "-1e308"), r"expected a principal point within 1e\+07 pixels"),
-        ((XMP, "1e308 -1e308"), FOLDS),
-    ],
     "nerfstudio": [
         ({"k1": "much"}, r"frames\[1\].k1: expected a finite number, not 'much'"),
         ({"camera_model": "WIDE"}, r"frames\[1\].camera_model: 'WIDE' is not one of"),
@@ -720,21 +773,17 @@ WRONG: dict[str, list[tuple[Any, str]]] = {
         ({"k1": 10**400}, r"frames\[1\].k1: expected a finite number"),
         ({"mask_path": "../../x"}, r"frames\[1\].mask_path: '../../x' leads outside"),
     ],
-    "regions": [
-        (("[0, 1, 2]", text), "nose: expected a list of vertex indices from 0 to 11")
-        for text in ("3", '["a"]', "[-1]", "[12]", "[1.5]")
-    ],
     "landmarks": LANDMARK_ROWS,
     "places": PLACE_ROWS,
     "head model npz": HEAD_ROWS,
     "flame frame": FRAME_ROWS,
     "flame motion": MOTION_ROWS,
     "flame npz": MODEL_ROWS,
-    "run": [
-        (('"lattice": null', '"lattice": 1000000000'), "settings.lattice: expected"),
-        (('"views_per_visit": ', '"views_per_visit": -'), "settings.views_per_visit: expected"),
-    ],
 }
+for reader, rows in re.findall(r"# (.*)\n([^#]*)", WRONG_TEXTS):
+    for row in re.findall(r"^(.*) →(?: (.*))?\n    (.*)$", rows, re.MULTILINE):
+        old, new, message = (part.format(**NAMES_OF_TEXTS) for part in row)
+        WRONG.setdefault(reader, []).append(((old, new), message))
 
 
 @pytest.mark.parametrize(

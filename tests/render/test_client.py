@@ -17,7 +17,7 @@ from stga_addon.raster.cpu.compose import compose
 from stga_addon.raster.posed_splats import PosedSplats
 from stga_addon.render import client as render_client
 from stga_addon.render.client import RenderClient, receive
-from stga_addon.render.render import render
+from stga_addon.render.render import render, render_layers
 
 HERE = np.eye(4)
 AHEAD = np.array([0, 0, 1.2])
@@ -71,7 +71,8 @@ def test_one_layer_gives_the_pixels_of_render():
 
 
 def test_layers_are_sorted_together():
-    """Catches layers composited one over the other, and depth that is not divided by alpha."""
+    """Catches layers composited one over the other, depth that is not divided by alpha, and a
+    background that is only behind a single layer."""
     splats = cloud()
     half = np.arange(len(splats)) % 2 == 0
     whole, halves = (
@@ -80,6 +81,9 @@ def test_layers_are_sorted_together():
     )
     np.testing.assert_allclose(halves.rgb, whole.rgb, atol=2e-6)
     np.testing.assert_allclose(halves.depth, whole.depth, atol=1e-5)
+    green = 0.2, 0.9, 0.4
+    found = render_layers([world(splats.rows(half)), world(splats.rows(~half))], CAMERA, green)
+    np.testing.assert_allclose(found, render(splats, CAMERA, green), atol=2e-6)
     xyz = np.array([[0, 0, 3]], np.float32)
     log_scale = np.full((1, 3), -1, np.float32)
     splats = replace(cloud(1), xyz=xyz, log_scale=log_scale)
