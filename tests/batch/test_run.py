@@ -13,6 +13,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from refusal import refusal
 
 from stga_addon.errors import StgaError
 from stga_addon.jobs.batch import engines
@@ -365,7 +366,7 @@ def test_two_batches_cannot_take_one_folder(tmp_path, locks, monkeypatch):
     try:
         assert held.wait(30)
         expected = r"another batch is working in this folder \(process \d+"
-        with pytest.raises(StgaError, match=expected), hold_batch(tmp_path):
+        with refusal(expected), hold_batch(tmp_path):
             pass
         other.kill()  # which leaves the lease behind
         other.join()
@@ -389,7 +390,7 @@ def test_a_lease_that_was_taken_is_noticed(tmp_path: Path, monkeypatch: pytest.M
         time.sleep(0.5)
         return None, ""
 
-    with pytest.raises(StgaError, match="another batch has taken this folder"):
+    with refusal("another batch has taken this folder"):
         carry_out(plan, SimulatedEngine(outcome))
 
 

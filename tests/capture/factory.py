@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import trimesh
+from numpy.random import default_rng
 from PIL import Image
 
 from stga_addon.avatar.file import Avatar, write_avatar
@@ -123,7 +124,7 @@ def write_mesh(path: Path, vertices: np.ndarray, faces: np.ndarray) -> None:
 def write_flame_model(path: Path, seed: int = 0) -> Path:
     """A model file in FLAME's format with the ball as template, four identity and two expression
     components."""
-    random = np.random.default_rng(seed)
+    random = default_rng(seed)
     vertices, faces = ball()
     weights = random.random((len(vertices), 5))
     regressor = random.random((5, len(vertices)))
@@ -146,7 +147,7 @@ def write_flame_model(path: Path, seed: int = 0) -> Path:
 
 def flame_parameters(timestep: int) -> dict[str, np.ndarray]:
     """One timestep's file as VHAP writes it, with a leading 1."""
-    random = np.random.default_rng(100 + timestep)
+    random = default_rng(100 + timestep)
     vertices = len(ball()[0])
     return {
         "shape": np.full(4, 0.3, np.float32),
@@ -196,7 +197,7 @@ def write_avatar_of(capture: Capture, path: Path, is_colored: bool = False, **la
     """An avatar of a capture's head; is_colored: each splat has a color of its own."""
     splats = lattice_splats(capture.neutral, capture.faces, **{"order": 0, **lattice})
     if is_colored:
-        splats.sh[:, 0] = np.random.default_rng(0).normal(0, 1.5, (len(splats), 3))
+        splats.sh[:, 0] = default_rng(0).normal(0, 1.5, (len(splats), 3))
     neutral = capture.neutral.astype(np.float32)
     faces = capture.faces.astype(np.int32)
     write_avatar(path, Avatar(splats, "stga", neutral, faces))

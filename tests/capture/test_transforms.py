@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+from refusal import refusal
 
 from stga_addon.capture.transforms import inside, read_splits, read_transforms
-from stga_addon.errors import StgaError
 
 from . import factory
 
@@ -192,7 +192,7 @@ def test_union_paths_stay_beside_the_capture(tmp_path):
 def test_paths_that_leave_are_refused(tmp_path, path, field):
     """Catches path traversal: a downloaded capture must not read files elsewhere, on any operating
     system."""
-    with pytest.raises(StgaError, match=rf"transforms\.json: frames\[0\]\.{field}: "):
+    with refusal(rf"transforms\.json: frames\[0\]\.{field}: "):
         read_one(tmp_path, {**factory.frame(0, 0), field: path})
 
 
@@ -217,7 +217,7 @@ def test_malformed_fields(tmp_path, field, value):
     """Catches a wrong value that passes, or ends in a traceback, instead of an error that names
     file and field."""
     named = "w" if field == "h" and value is True else field
-    with pytest.raises(StgaError, match=rf"transforms\.json: frames\[0\]\.({named}|{field}): "):
+    with refusal(rf"transforms\.json: frames\[0\]\.({named}|{field}): "):
         read_one(tmp_path, {**factory.frame(0, 0), field: value})
 
 
@@ -227,5 +227,5 @@ def test_missing_fields_are_named(tmp_path, field):
     silently becomes timestep 0 among others."""
     frames = [factory.frame(4, 0), factory.frame(4, 1)]
     del frames[1][field]
-    with pytest.raises(StgaError, match=rf"frames\[1\]\.{field}: .*missing"):
+    with refusal(rf"frames\[1\]\.{field}: .*missing"):
         views_of(tmp_path, frames)

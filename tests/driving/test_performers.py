@@ -3,13 +3,12 @@
 import wave
 
 import numpy as np
-import pytest
+from refusal import refusal
 
 from stga_addon.driving import performers
 from stga_addon.driving.open_motion import check_motion
 from stga_addon.driving.performance import COLUMN, COUNT, Performance
 from stga_addon.driving.performers import Performer, performer_of, read_performance
-from stga_addon.errors import StgaError
 from stga_addon.jobs.convert_motion import ConvertMotion
 from stga_addon.jobs.perform import perform
 
@@ -38,7 +37,7 @@ def test_a_row_is_all_that_a_kind_of_recording_needs(tmp_path, monkeypatch):
     assert performer_of(path) is None
     known = {**performers.PERFORMERS, ".wav": Performer("a sound", heard, False)}
     monkeypatch.setattr(performers, "PERFORMERS", known)
-    with pytest.raises(StgaError, match="stga drive makes a motion of a sound"):
+    with refusal("stga drive makes a motion of a sound"):
         check_motion(path)
     perform(ConvertMotion(path, tmp_path / "voice.csv"))
     jaw = read_performance(tmp_path / "voice.csv").weights[:, COLUMN["jawOpen"]]

@@ -1,9 +1,11 @@
 """The head model that comes with the package, against ICT-FaceKit's own arrays and rigid motion."""
 
+import pickle
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from numpy.linalg import norm
 from scipy.spatial import cKDTree
 
 from stga_addon.capture.camera import look_at
@@ -84,7 +86,7 @@ def test_eyeballs_turn_in_their_lids(head):
     for side, joint in (("left", "left_eye"), ("right", "right_eye")):
         eyeball = head.masks[f"{side}_eyeball"]
         center = joints[JOINTS.index(joint)]
-        radius = [np.linalg.norm(mesh[eyeball] - center, axis=1) for mesh in (straight, looking)]
+        radius = [norm(mesh[eyeball] - center, axis=1) for mesh in (straight, looking)]
         np.testing.assert_allclose(*radius, atol=1e-9)
         assert np.ptp(radius[0]) < 0.0025  # a ball with a cornea
         front = eyeball[straight[eyeball, 2].argmax()]
@@ -169,9 +171,9 @@ def test_neck_turns_the_skull_alone(head):
     assert np.isin(head.masks["teeth"], skull).all()
     assert np.isin(head.masks["nose"], skull).all()
     both = (mesh[skull] - mesh[skull].mean(0) for mesh in (straight, turned))
-    np.testing.assert_allclose(*(np.linalg.norm(mesh, axis=1) for mesh in both), atol=1e-9)
+    np.testing.assert_allclose(*(norm(mesh, axis=1) for mesh in both), atol=1e-9)
     torso = np.unique(head.faces[torso_faces(head)])
-    assert np.linalg.norm(turned[torso] - straight[torso], axis=1).max() < 0.012
+    assert norm(turned[torso] - straight[torso], axis=1).max() < 0.012
     bottom = torso[straight[torso, 1] < -0.15]
     np.testing.assert_allclose(turned[bottom], straight[bottom], atol=1e-9)
 
@@ -181,7 +183,7 @@ def test_lips_part_when_the_jaw_opens(head):
     upper, lower = lip_pairs(head)
     assert len(upper) > 10
     meshes = posed(head), posed(head, expr=expression(head, jawOpen=1.0))
-    gaps = [np.linalg.norm(mesh[upper] - mesh[lower], axis=1) for mesh in meshes]
+    gaps = [norm(mesh[upper] - mesh[lower], axis=1) for mesh in meshes]
     assert gaps[0].max() < 0.002
     assert gaps[1].max() > 0.02
 
@@ -203,11 +205,13 @@ def test_arkits_weights_are_its_coefficients(head):
 
 
 def test_a_changed_model_file_is_read_again(tmp_path):
-    """Catches a model that is remembered although its file has changed, and one that every button
-    reads again."""
+    """Catches a model that is remembered although its file has changed, or masks were laid beside
+    it, and one that every button reads again."""
     path = tmp_path / "model.npz"
-    write_flame(small_head(0), path)
+    write_flame(replace(small_head(0), masks={}), path)
     first = flame_model(path)
     assert flame_model(path) is first
+    (tmp_path / "FLAME_masks.pkl").write_bytes(pickle.dumps({"nose": np.arange(5)}, 2))
+    assert "nose" in flame_model(path).masks
     write_flame(small_head(1), path)
     assert not np.array_equal(flame_model(path).v_template, first.v_template)

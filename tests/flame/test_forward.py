@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.random import default_rng
 from scipy.spatial.transform import Rotation
 
 from stga_addon.flame.forward import (
@@ -23,8 +24,8 @@ def test_same_as_four_by_four_matrices_vertex_by_vertex(tiny_flame):
     """Catches transposed rotations, wrong joint order and a wrong feature order, with scipy's
     rotations as witness; and a dynamic offset that is dropped or replaces the static one."""
     model = tiny_flame
-    shape = np.random.default_rng(6).normal(size=8)
-    offsets = np.random.default_rng(7).normal(0, 0.01, (2, 40, 3))
+    shape = default_rng(6).normal(size=8)
+    offsets = default_rng(7).normal(0, 0.01, (2, 40, 3))
     frame = replace(random_frame(5, 4), dynamic_offset=offsets[1])
     shaped = model.v_template + model.shapedirs @ np.r_[shape, frame.expr] + offsets.sum(0)
     joints = model.j_regressor @ shaped
@@ -54,7 +55,7 @@ def test_equals_smplx(tmp_path):
     (tmp_path / "FLAME_NEUTRAL.pkl").write_bytes(pickle.dumps(arrays, protocol=2))
     model = read_flame(tmp_path / "FLAME_NEUTRAL.pkl")
     assert (model.n_identity, model.n_expression) == (300, 100)
-    shape = np.random.default_rng(12).normal(size=300)
+    shape = default_rng(12).normal(size=300)
     frame = random_frame(13, 100)
     ours = flame_forward(model, shape, frame)
     assert np.abs(ours - np.load(Path(__file__).with_name("smplx_vertices.npy"))).max() < 1e-5
@@ -68,7 +69,7 @@ STENCIL = {1: 3 / 4, 2: -3 / 20, 3: 1 / 60}
 @pytest.mark.parametrize("frame", [random_frame(8, 4), frame_of(np.zeros(22))])
 def test_the_gradient_is_that_of_differences(tiny_flame, frame):
     """Catches a joint, a corrective or a joint's place left out, and 0/0 at an angle of zero."""
-    offset, outer = np.random.default_rng(9).normal(0, 0.01, (2, 40, 3))
+    offset, outer = default_rng(9).normal(0, 0.01, (2, 40, 3))
     person = replace(tiny_flame, v_template=tiny_flame.v_template + 0.01)
     shape = np.zeros(8)
 

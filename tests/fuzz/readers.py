@@ -16,6 +16,7 @@ from capture import factory
 from driving.live.wire import facial_mocap
 from driving.test_performance_files import codes_of, write_csv
 from flame.conftest import model_of, random_arrays
+from numpy.random import default_rng
 from PIL import Image
 from tracking import scenes, test_calibrations, test_head_model
 from tracking.test_field_footage import write_colmap_binary
@@ -102,11 +103,11 @@ def transforms(path: Path) -> None:
 
 
 def mesh(path: Path) -> None:
-    factory.write_mesh(path, np.random.default_rng(0).normal(size=(12, 3)), FACES)
+    factory.write_mesh(path, default_rng(0).normal(size=(12, 3)), FACES)
 
 
 def picture(path: Path) -> None:
-    image = Image.fromarray(np.random.default_rng(0).integers(0, 255, (6, 5, 4), np.uint8))
+    image = Image.fromarray(default_rng(0).integers(0, 255, (6, 5, 4), np.uint8))
     image.convert("RGB" if path.suffix == ".jpg" else "RGBA").save(path)
 
 
@@ -170,7 +171,7 @@ def nerfstudio(path: Path) -> None:
 
 
 def landmarks(path: Path) -> None:
-    points = np.random.default_rng(0).uniform(0, 40, (4, 6, 2)).astype(np.float32)
+    points = default_rng(0).uniform(0, 40, (4, 6, 2)).astype(np.float32)
     np.savez(path, timesteps=np.arange(4), points=points, confidence=np.ones((4, 6), np.float32))
 
 

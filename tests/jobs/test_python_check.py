@@ -7,8 +7,8 @@ import tomllib
 from pathlib import Path
 
 import pytest
+from refusal import refusal
 
-from stga_addon.errors import StgaError
 from stga_addon.jobs.python_check import describe_check, finish_check, start_check
 from stga_addon.worker import training_python
 from stga_addon.worker.training_python import (
@@ -36,12 +36,12 @@ def test_check_is_described():
     """Catches an interpreter reported as usable that cannot train."""
     assert describe_check("p", FOUND) == "Python 3.11.7, torch 1.0, numba 1.0, CPU with 4 threads"
     old = {**FOUND, "python": "3.9.1"}
-    with pytest.raises(StgaError, match=r"p: is Python 3\.9\.1, training needs 3\.11 or newer"):
+    with refusal(r"p: is Python 3\.9\.1, training needs 3\.11 or newer"):
         describe_check("p", old)
     failures = {"torch": "ModuleNotFoundError: No module", "PIL": "OSError: libjpeg.so"}
     bare = {**FOUND, "failures": failures}
     sentence = r"p: Python 3\.11\.7 lacks torch, pillow \(OSError: libjpeg\.so\); install"
-    with pytest.raises(StgaError, match=sentence):
+    with refusal(sentence):
         describe_check("p", bare)
 
 
@@ -51,15 +51,15 @@ def test_what_cannot_train_is_refused(tmp_path):
     subprocess.run(make, check=True)
     python = next(path for path in (tmp_path / "venv").glob("*/python*") if path.stem == "python")
     sentence = r"lacks numpy, torch, numba, scipy, .*av, opencv-python-headless; install"
-    with pytest.raises(StgaError, match=sentence):
+    with refusal(sentence):
         check(python)
-    with pytest.raises(StgaError, match="cannot be started as a Python interpreter"):
+    with refusal("cannot be started as a Python interpreter"):
         check(tmp_path / "python")
-    with pytest.raises(StgaError, match=r"is not a Python that runs this add-on \(exit status 1\)"):
+    with refusal(r"is not a Python that runs this add-on \(exit status 1\)"):
         check("false")
     (tmp_path / "slow").write_text("#!/bin/sh\nexec sleep 60\n")
     (tmp_path / "slow").chmod(0o755)
-    with pytest.raises(StgaError, match="slow: did not answer within"):
+    with refusal("slow: did not answer within"):
         check(tmp_path / "slow", timeout_s=0.2)
 
 
@@ -80,7 +80,7 @@ def test_order_of_choices(monkeypatch):
     monkeypatch.delenv(PYTHON_VARIABLE, raising=False)
     monkeypatch.setattr(training_python, "missing_packages", lambda: ["torch"])
     sentence = rf"lacks torch\. Install the complete edition .* or by {PYTHON_VARIABLE}"
-    with pytest.raises(StgaError, match=sentence):
+    with refusal(sentence):
         find_training_python()
     assert find_training_python("/preferred/python") == "/preferred/python"
     monkeypatch.setattr(training_python, "missing_packages", list)

@@ -15,6 +15,7 @@ import pytest
 from capture.factory import edit, write_avatar_of, write_mesh_capture
 from cli.test_render_video import decoded
 from command_line import stga
+from refusal import refusal
 
 from stga_addon.avatar.file import Avatar, read_avatar, write_avatar
 from stga_addon.capture.open import open_capture
@@ -118,19 +119,19 @@ def test_the_next_request_forgets_the_last(tmp_path: Path, capture: Path) -> Non
 def test_refusals(tmp_path: Path, capture: Path) -> None:
     """Catches a run overwritten, or resumed where none is, only after a worker was started."""
     run = tmp_path / "run"
-    with pytest.raises(StgaError, match=r"holds no run \(run\.json is missing\)"):
+    with refusal(r"holds no run \(run\.json is missing\)"):
         check(Resume(run))
     assert not run.exists()
     write_run(run, Run(capture, None, "vhap", make_settings(iterations=5)))
-    with pytest.raises(StgaError, match="already holds a run; resume it, or choose another folder"):
+    with refusal("already holds a run; resume it, or choose another folder"):
         check(training(run, capture))
     check(Resume(run))
     folder = asked(Resume(run))
-    with status_writer(folder), pytest.raises(StgaError, match="another worker is running"):
+    with status_writer(folder), refusal("another worker is running"):
         write_request(folder, Resume(run))
-    with pytest.raises(StgaError, match="holds no tracked capture to solve again"):
+    with refusal("holds no tracked capture to solve again"):
         check(SolveAgain(tmp_path / "nothing", Path("m"), {}))
-    with pytest.raises(StgaError, match="already holds a capture"):
+    with refusal("already holds a capture"):
         check(Track(Path("f"), Path("m"), capture))
 
 
@@ -148,7 +149,7 @@ def test_damaged_requests(tmp_path: Path, name: str) -> None:
         edit(tmp_path / jobs.REQUEST, lambda values: values.update({name: DAMAGES[name]}))
     else:
         (tmp_path / jobs.REQUEST).write_text(name)
-    with pytest.raises(StgaError, match=r"request\.json: ") as caught:
+    with refusal(r"request\.json: ") as caught:
         jobs.read_request(tmp_path)
     expected = rf"{name}|not a request that this version reads"
     assert name in TEXTS or re.search(expected, str(caught.value))
@@ -331,7 +332,7 @@ def test_a_request_continues_what_it_began(tmp_path, capture):
     assert inspect_worker(folder).state == WorkerState.CANCELLED
     assert (request.run / "avatar.npz").exists()
     asked(request)
-    with pytest.raises(StgaError, match="already holds a run"):
+    with refusal("already holds a run"):
         perform_in_folder(folder)
     asked(request)
     iterations = []

@@ -10,6 +10,7 @@ import pytest
 from capture import factory
 from command_line import refused, stga
 from PIL import Image
+from refusal import refusal
 
 from stga_addon.avatar.file import read_avatar, write_avatar
 from stga_addon.capture.color import srgb_to_linear
@@ -102,7 +103,7 @@ def test_a_gray_card_sets_the_level_and_a_running_trainings_avatar_is_kept(
     assert (copy / "avatar.npz").read_bytes() == before
 
     def estimate(*given: object) -> object:
-        with pytest.raises(StgaError, match="another run is working"), locked(copy):
+        with refusal("another run is working"), locked(copy):
             pytest.fail("a training could begin between reading and writing")
         return estimate_light(*given)
 

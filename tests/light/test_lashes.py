@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import trimesh
+from numpy.linalg import norm
 
 from light.scenes import blocked, lit_avatar, middle_splats
 from stga_addon.avatar.file import Avatar, AvatarLight
@@ -36,7 +37,7 @@ def avatar_with(offset: tuple[float, float, float], color: float = 0.05) -> Avat
     vertices, faces = eye_below_a_lid()
     transfer, occlusion = transfer_of(vertices, faces, 64)
     irradiance = np.full((len(vertices), 3), np.pi, np.float32)
-    wet = np.where(np.linalg.norm(vertices, axis=1) < 0.0121, 0.2, 0).astype(np.float32)
+    wet = np.where(norm(vertices, axis=1) < 0.0121, 0.2, 0).astype(np.float32)
     radiance = uniform(np.ones(3)).astype(np.float32)
     light = AvatarLight(radiance, transfer, occlusion, irradiance, wet, 0.0)
     top = np.flatnonzero(vertices[faces][:, :, 1].min(1) > LID_HEIGHT - 1e-6)
@@ -73,7 +74,7 @@ def test_a_lash_shades_the_eye_as_cast_rays_say():
     with_lid = np.concatenate([vertices, ends])
     faces = np.concatenate([avatar.faces, len(vertices) + np.array([[0, 1, 2], [0, 2, 3]])])
     up = normals[:, 1] > 0.5
-    eye = np.flatnonzero(up & (np.linalg.norm(points, axis=1) < EYE_RADIUS))
+    eye = np.flatnonzero(up & (norm(points, axis=1) < EYE_RADIUS))
     lifted = points[eye] + 0.001 * normals[eye]
     sunward = np.array([0.0, 1, 0])
     dark = blocked(lifted, sunward, with_lid, faces)
@@ -117,7 +118,7 @@ def test_splats_are_at_the_nearest_point_of_the_mesh():
     """Catches splats that stay in a triangle they have left, or walk away or off the border."""
     avatar = lit_avatar()
     rng = np.random.default_rng(0)
-    ball = avatar.faces[np.linalg.norm(avatar.neutral[avatar.faces].mean(1), axis=1) < 0.101]
+    ball = avatar.faces[norm(avatar.neutral[avatar.faces].mean(1), axis=1) < 0.101]
     ball = ball[avatar.neutral[ball].mean(1)[:, 2] > -0.07]  # with a border
     xyz = (rng.normal(0, 1, (len(ball), 3)) * [1.0, 1.0, 0.1]).astype(np.float32)
     splats = replace(middle_splats(np.arange(len(ball)), -6), xyz=xyz)
@@ -129,8 +130,8 @@ def test_splats_are_at_the_nearest_point_of_the_mesh():
     found = np.einsum("nk,nkc->nc", weights, avatar.neutral[corners])
     mesh = trimesh.Trimesh(avatar.neutral, ball, process=False)
     _, least, _ = trimesh.proximity.closest_point_naive(mesh, points)
-    away = np.linalg.norm(found - points, axis=1)
-    own = np.linalg.norm(avatar.neutral[ball].mean(1) - points, axis=1)
+    away = norm(found - points, axis=1)
+    own = norm(avatar.neutral[ball].mean(1) - points, axis=1)
     assert (corners != ball).any(1).mean() > 0.5
     assert (away < 1.2 * least + 1e-4).mean() > 0.95
     assert (away <= own + 1e-9).all()

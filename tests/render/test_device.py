@@ -5,8 +5,8 @@ import sys
 from types import SimpleNamespace
 
 import pytest
+from refusal import refusal
 
-from stga_addon.errors import StgaError
 from stga_addon.render import device as device_module
 from stga_addon.render.device import adapter_names, choose_device, is_device
 
@@ -70,17 +70,17 @@ def test_wrong_gradients_are_refused(trials: dict[str, Trial], error: float) -> 
     """Catches training on a driver that computes something else."""
     for name in trials:
         trials[name] = Trial(error, 0.002, 0.02)
-    with pytest.raises(StgaError, match=r"^--device gpu: Card .* computes gradients that differ"):
+    with refusal(r"^--device gpu: Card .* computes gradients that differ"):
         choose_device("gpu")
     assert choose_device("auto")[0] == "cpu"
 
 
 def test_names_that_fit_none_or_several(trials):
     """Catches an adapter that nobody meant, and a file that names nonsense."""
-    with pytest.raises(StgaError, match=r"^--device gpu:card: several adapters .*llvmpipe"):
+    with refusal(r"^--device gpu:card: several adapters .*llvmpipe"):
         choose_device("gpu:card")
     expected = "^--device gpu:Voodoo: no adapter of that name; there are: Card"
-    with pytest.raises(StgaError, match=expected):
+    with refusal(expected):
         choose_device("gpu:Voodoo")
     assert all(map(is_device, ("auto", "cpu", "gpu", "gpu:any name")))
     wrong = "", "gpu:", "cuda", "gpux", None, 3, ["cpu"], "gpu:" + 999 * "x"
@@ -101,7 +101,7 @@ def raises(name: str) -> None:
 def test_what_is_wrong_is_said(trials, monkeypatch, place, name, stand_in, reason):
     """Catches a traceback, a silent fallback, and training on a GPU that cannot."""
     monkeypatch.setattr(place, name, stand_in)
-    with pytest.raises(StgaError, match=f"^--device gpu: .*{reason}"):
+    with refusal(f"^--device gpu: .*{reason}"):
         choose_device("gpu")
     chosen, why = choose_device("auto")
     assert chosen == "cpu"

@@ -8,11 +8,11 @@ from pathlib import Path
 
 import pytest
 from capture import factory
+from refusal import refusal
 from training.toys import quick_settings
 
 from stga_addon.avatar.file import read_avatar
 from stga_addon.capture.open import open_capture
-from stga_addon.errors import StgaError
 from stga_addon.files import read_json, write_json
 from stga_addon.training.run import session as run_module
 from stga_addon.training.run.checkpoint import read_checkpoint
@@ -45,9 +45,7 @@ def test_no_room_for_a_checkpoint(root, tmp_path, monkeypatch):
         return False
 
     try:
-        with pytest.raises(
-            StgaError, match=r"checkpoint\.npz: cannot be written \(File too large\)"
-        ):
+        with refusal(r"checkpoint\.npz: cannot be written \(File too large\)"):
             train_run(capture, tmp_path, run, report=no_more)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
@@ -68,7 +66,7 @@ def test_an_error_when_the_data_reaches_the_disk(tmp_path, monkeypatch):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     monkeypatch.setattr(os, "fsync", full)
-    with pytest.raises(StgaError, match=r"a\.json: cannot be written"):
+    with refusal(r"a\.json: cannot be written"):
         write_json(tmp_path / "a.json", [2])
     assert read_json(tmp_path / "a.json") == [1]
     assert os.listdir(tmp_path) == ["a.json"]
@@ -77,7 +75,7 @@ def test_an_error_when_the_data_reaches_the_disk(tmp_path, monkeypatch):
 def test_metrics_that_cannot_be_written(tmp_path):
     """Catches a traceback from the one file that is not replaced but grows."""
     (tmp_path / "metrics.jsonl").mkdir()
-    with pytest.raises(StgaError, match=r"metrics\.jsonl: cannot be written"):
+    with refusal(r"metrics\.jsonl: cannot be written"):
         append_metrics(tmp_path, {"iteration": 1})
 
 

@@ -7,6 +7,7 @@ from functools import partial
 import numpy as np
 import pytest
 from flame.small_head import EXPRESSIONS, small_head, small_head_colors, subdivided
+from numpy.random import default_rng
 
 from stga_addon.capture.camera import look_at
 from stga_addon.flame.forward import FlameFrame, flame_forward
@@ -67,7 +68,7 @@ def frame_at(opening, timestep):
 def skin_texture(rest):
     """(V, 1) factor of skin's colors: waves of 6 to 30 mm, since the small head's painted chin is
     of one color."""
-    rng = np.random.default_rng(3)
+    rng = default_rng(3)
     factor = 1
     for length, amount in [(0.006, 0.02), (0.010, 0.03), (0.018, 0.03), (0.03, 0.03)] * 4:
         phase = 2 * np.pi * rest @ (rng.normal(size=3) / 1.7) / length
@@ -80,7 +81,7 @@ def scene(eyes, openings=OPENINGS, pull=DETECTOR_PULL, size=(230, 300), brows=0.
     tracked = small_head(0)
     pictured, tint = subdivided(tracked, small_head_colors())
     head = HeadModel(tracked, "flame")
-    rng = np.random.default_rng(4)
+    rng = default_rng(4)
     shape = rng.normal(0, 0.5, tracked.n_identity)
     frames = [frame_at(opening, t) for t, opening in enumerate(openings)]
     for t in (3, 6) if brows else ():
@@ -128,7 +129,7 @@ def errors_of(moved, take, fit):
 def test_texture_is_free_of_lighting_and_distrusts_what_changes():
     """Catches shading baked into the texture, which a jaw that turns would be compared with, and
     hands and hair that count like skin."""
-    rng = np.random.default_rng(0)
+    rng = default_rng(0)
     normals = rng.normal(size=(400, 3)) * [1, 1, 0.5] + [0, 0, 1]
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     skin = np.array([120, 0, 30]) + rng.normal(0, [12, 8, 5], (400, 3))
@@ -151,7 +152,7 @@ def test_texture_is_free_of_lighting_and_distrusts_what_changes():
 def test_projection_derivative_agrees_with_differences():
     """Catches a sign or a focal length that sends Gauss-Newton the wrong way."""
     camera = look_at((0.3, 0.2, 1.1), (0, 0, 0), 200, 150, 500)
-    points = np.random.default_rng(0).normal(0, 0.05, (7, 3))
+    points = default_rng(0).normal(0, 0.05, (7, 3))
     found = projection_derivative(camera, points)
     for axis in range(3):
         step = 1e-6 * np.eye(3)[axis]

@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from flame.small_head import small_head
+from numpy.linalg import norm
 from scipy.spatial.transform import Rotation
 
 from stga_addon.capture.camera import Camera, look_at
@@ -51,7 +52,7 @@ def test_landmarks_and_scores_are_mediapipes(pictures):
         pictures, reference["points"], reference["scores"], strict=True
     ):
         (found,) = FaceNetworks().detect(image)
-        assert np.median(np.linalg.norm(found - points, axis=1)) < 0.1  # of 512 pixels
+        assert np.median(norm(found - points, axis=1)) < 0.1  # of 512 pixels
         weights = FaceNetworks().score(image).weights
         np.testing.assert_allclose([weights[name] for name in SCORE_NAMES], scores, atol=0.02)
     front = pictures[0]
@@ -74,10 +75,10 @@ def test_small_faces_are_found(pictures):
         frame[y : y + 200, x : x + 200] = face
         assert FaceNetworks().detect(frame) == []
         (found,) = FaceNetworks().find(frame)
-        assert np.median(np.linalg.norm(found - [x, y] - whole, axis=1)) < 1.5
+        assert np.median(norm(found - [x, y] - whole, axis=1)) < 1.5
         assert FaceNetworks().score(frame) is not None
         (again,) = FaceNetworks().find(frame, found + 40)
-        assert np.median(np.linalg.norm(again - found, axis=1)) < 1.5
+        assert np.median(norm(again - found, axis=1)) < 1.5
         frame[850:1050, 10:210] = face
         assert len(FaceNetworks().find(frame)) == 2
     side = cv2.resize(pictures[1], (360, 360), interpolation=cv2.INTER_AREA)
@@ -85,7 +86,7 @@ def test_small_faces_are_found(pictures):
     frame[500:860, 200:560] = side
     (whole,) = FaceNetworks().detect(side)
     away = [
-        np.median(np.linalg.norm(found - [200, 500] - whole, axis=1))
+        np.median(norm(found - [200, 500] - whole, axis=1))
         for (found,) in (FaceNetworks().detect(frame), FaceNetworks().find(frame))
     ]
     assert away[1] < 0.6 * away[0]  # from a coarse box
@@ -124,7 +125,7 @@ def test_landmarks_of_lips_and_lids_lie_on_what_moves_them():
 
     def moved(name):
         shape = model.shapedirs[:, :, model.n_identity + model.expression_names.index(name)]
-        return np.linalg.norm(places.on(shape, model.faces), axis=1)
+        return norm(places.on(shape, model.faces), axis=1)
 
     upper = moved("jawOpen")[[80, 82, 13, 312, 310]]
     lower = moved("jawOpen")[[88, 87, 14, 317, 318]]

@@ -5,6 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from flame.conftest import random_arrays, random_frame
+from numpy.linalg import norm
+from numpy.random import default_rng
 from scipy.spatial.transform import Rotation
 
 from stga_addon.capture.camera import look_at
@@ -44,7 +46,7 @@ from stga_addon.tracking.solve import (
 
 def places_on(head, count, seed=0):
     """Places all over the front of the skin."""
-    rng = np.random.default_rng(seed)
+    rng = default_rng(seed)
     centers = head.model.v_template[head.model.faces].mean(1)
     front = np.flatnonzero(centers[:, 2] > 0.04)
     return SurfacePoints(rng.choice(front, count), rng.dirichlet([1, 1, 1], count))
@@ -70,7 +72,7 @@ def cameras(count):
 
 def seen(rig, points, noise=0.0, seed=0):
     """Landmarks of points (N, 3) in every camera."""
-    rng = np.random.default_rng(seed)
+    rng = default_rng(seed)
     pixels = np.stack([camera.project(points)[0] for camera in rig])
     return TimestepLandmarks(
         tuple(rig), pixels + rng.normal(0, noise, pixels.shape), np.ones(pixels.shape[:2])
@@ -96,7 +98,7 @@ def test_points_agree_with_the_forward_pass_and_their_derivatives_with_differenc
     shapes = arrays["v_template"], arrays["shapedirs"], 9, arrays["posedirs"]
     model = FlameModel(*shapes, *skeleton, arrays["f"].astype(np.int32))
     frame = random_frame(3, model.n_expression)
-    rng = np.random.default_rng(1)
+    rng = default_rng(1)
     shape = rng.normal(size=model.n_identity)
     places = SurfacePoints(np.arange(50), rng.dirichlet([1, 1, 1], 50))
     points = PosedPoints(model, places)
@@ -119,14 +121,14 @@ def in_cameras_world(fit, timestep):
 def pixel_errors(head, fit, timestep, camera, pixels):
     """Pixels by which the fitted face misses where another camera shows it."""
     found, _ = fit.to_capture.camera(camera).project(posed_mesh(fit, fit.parameters[timestep]))
-    return np.linalg.norm(found - pixels, axis=1)[head.model.masks["face"]]
+    return norm(found - pixels, axis=1)[head.model.masks["face"]]
 
 
 def test_triangulation_outvotes_a_wrong_camera():
     """Catches a plain mean of rays, which one misdetected face pulls centimeters away, and a
     principal point or an axis with the wrong sign."""
     rig = [replace(camera, cx=300.0, cy=450.0, fl_y=1800.0) for camera in cameras(6)]
-    points = np.random.default_rng(0).normal(0, 0.05, (20, 3))
+    points = default_rng(0).normal(0, 0.05, (20, 3))
     landmarks = seen(rig, points)
     landmarks.points[2] += 60
     found = triangulate(rig, landmarks.points, landmarks.confidence)
@@ -138,7 +140,7 @@ def test_triangulation_outvotes_a_wrong_camera():
 def test_a_take_is_found_in_a_world_of_any_scale_and_orientation(head):
     """Catches an error in scale, orientation, identity or expression: vertices would be millimeters
     off."""
-    shape = np.random.default_rng(5).normal(0, 0.7, head.model.n_identity)
+    shape = default_rng(5).normal(0, 0.7, head.model.n_identity)
     turn = Rotation.from_euler("xz", [90, 63], degrees=True).as_matrix()
     world = Similarity(0.23, turn, np.array([3.0, -1.0, 2.0]))
     places = places_on(head, 100)
@@ -151,7 +153,7 @@ def test_a_take_is_found_in_a_world_of_any_scale_and_orientation(head):
     assert fit.to_capture.scale == pytest.approx(1 / world.scale, rel=0.03)
     for timestep in (0, 7, 11):
         missed = in_cameras_world(fit, timestep) - world.apply(meshes[timestep])
-        error = np.linalg.norm(missed, axis=1)[head.model.masks["face"]] / world.scale
+        error = norm(missed, axis=1)[head.model.masks["face"]] / world.scale
         assert error.mean() < (2e-3 if timestep == 7 else 0.8e-3)
 
 
@@ -166,7 +168,7 @@ def test_jumps_are_not_smoothed(head):
     fit = fit_head(head, recorded(head, cameras(4), meshes, places))
     for timestep, mesh in enumerate(meshes):
         missed = (in_cameras_world(fit, timestep) - mesh)[head.model.masks["face"]]
-        assert np.linalg.norm(missed, axis=1).mean() < 0.8e-3
+        assert norm(missed, axis=1).mean() < 0.8e-3
 
 
 def amounts_and_observations(head, amounts, noise):
@@ -174,7 +176,7 @@ def amounts_and_observations(head, amounts, noise):
     expression."""
     one = person(head, np.zeros(head.model.n_identity))
     places = places_on(head, 100)
-    rng = np.random.default_rng(3)
+    rng = default_rng(3)
     observed = []
     for amount in amounts:
         frame = replace(frame_at(head, 0), expr=amount * np.eye(head.model.n_expression)[0])
@@ -239,7 +241,7 @@ def test_one_camera_keeps_the_size_of_the_head(head):
     for timestep, own in take.items():
         at = places.on(posed_mesh(fit, fit.parameters[timestep]), head.model.faces)
         away = fit.to_capture.camera(rig[0]).project(at)[0] - own.points[0]
-        assert np.median(np.linalg.norm(away, axis=1)) < 12  # of a face of 300 pixels
+        assert np.median(norm(away, axis=1)) < 12  # of a face of 300 pixels
 
 
 @pytest.mark.parametrize("count", [1, 3])
@@ -278,7 +280,7 @@ def test_rays_that_all_miss_give_a_start(head):
     """Catches weights that vanish, and the mean of no points, where no two cameras agree about any
     landmark."""
     rig = cameras(3)
-    rng = np.random.default_rng(0)
+    rng = default_rng(0)
     points = rng.normal(0, 0.05, (30, 3))
     landmarks = seen(rig, points, noise=100.0)
     found = triangulate(rig, landmarks.points, landmarks.confidence)
@@ -288,12 +290,12 @@ def test_rays_that_all_miss_give_a_start(head):
         start = rigid_start(points, observed)
     assert (observed.weight > 0).all()
     np.testing.assert_allclose(start[-3:], (observed.position - points).mean(0), atol=3)
-    assert np.linalg.norm(start[:3]) <= np.pi + 1e-9
+    assert norm(start[:3]) <= np.pi + 1e-9
 
 
 def test_a_linear_model_without_joints_moves_rigidly():
     """Catches rotation about joints that a plain shape-key head does not have."""
-    rng = np.random.default_rng(0)
+    rng = default_rng(0)
     faces = np.array([[0, 1, 2], [2, 3, 4], [5, 6, 7]])
     arrays = {
         "mean": rng.normal(0, 0.1, (8, 3)),
@@ -305,7 +307,7 @@ def test_a_linear_model_without_joints_moves_rigidly():
     fit = np.concatenate([[0.5, -1.0], [0.3, 0.2, 0.1], np.zeros(12), [0.1, 0.2, 0.3]])
     found = flame_forward(head.model, np.zeros(0), frame_of(fit))
     shaped = arrays["mean"] + arrays["expression"] @ [0.5, -1.0]
-    lengths = [np.linalg.norm(mesh[:, None] - mesh[None], axis=2) for mesh in (found, shaped)]
+    lengths = [norm(mesh[:, None] - mesh[None], axis=2) for mesh in (found, shaped)]
     np.testing.assert_allclose(*lengths, atol=1e-12)
 
 
@@ -358,7 +360,7 @@ def test_the_world_says_nothing_of_smoothness(head, world):
     """Catches a head near half a turn that trembles: where its axis-angle changes its sign, it was
     taken for a cut, and not smoothed."""
     rows = np.stack([frame_at(head, 0).parameters] * 40)
-    rng = np.random.default_rng(0)
+    rng = default_rng(0)
     rows[:, -18:-15] = rng.normal(0, 0.02, (40, 3))
     precision = np.full(rows.shape[1], 1e8)
     precision[-18:-15] = 300.0
@@ -368,26 +370,26 @@ def test_the_world_says_nothing_of_smoothness(head, world):
         terms = np.stack([turn.T @ np.diag(precision) @ turn for turn in turns])
         found = smoothed(values, terms, acceleration_precision(person_model(head)))
         meshes = meshes_of(head, found)
-        return np.linalg.norm(meshes - meshes.mean(0), axis=2).mean()
+        return norm(meshes - meshes.mean(0), axis=2).mean()
 
     turned, _ = moved(head, rows, WORLDS[world])
     meshes = meshes_of(head, rows)
-    raw = np.linalg.norm(meshes - meshes.mean(0), axis=2).mean()
+    raw = norm(meshes - meshes.mean(0), axis=2).mean()
     assert smooth(rows) < 0.5 * raw
     assert smooth(turned) < 1.2 * smooth(rows)
 
 
 def test_nearest_points_of_a_mesh(head):
     """Catches a nearest triangle that is only the one with the nearest center."""
-    points = np.random.default_rng(0).normal(0, 0.08, (40, 3))
+    points = default_rng(0).normal(0, 0.08, (40, 3))
     places, distance = nearest_points(head.model.v_template, head.model.faces, points)
     on = places.on(head.model.v_template, head.model.faces)
-    np.testing.assert_allclose(np.linalg.norm(on - points, axis=1), distance, atol=1e-9)
+    np.testing.assert_allclose(norm(on - points, axis=1), distance, atol=1e-9)
     corners = head.model.v_template[head.model.faces]
-    weights = np.random.default_rng(1).dirichlet([1, 1, 1], 60)
+    weights = default_rng(1).dirichlet([1, 1, 1], 60)
     samples = np.einsum("sk,fkc->fsc", weights, corners).reshape(-1, 3)
     for point, found in zip(points, distance, strict=True):
-        assert found <= np.linalg.norm(samples - point, axis=1).min() + 1e-9
+        assert found <= norm(samples - point, axis=1).min() + 1e-9
 
 
 def test_prior_keeps_weights_between_0_and_1():
@@ -401,7 +403,7 @@ def test_prior_keeps_weights_between_0_and_1():
     ]
     shares = np.array(list(LID_SHAPES.values()))
     count = named.model.n_expression
-    rng = np.random.default_rng(0)
+    rng = default_rng(0)
     values = np.concatenate([rng.uniform(-1, 2, count), np.zeros(RIGID_SIZE)])
     values[lids[0]] = 0.9, 0.8  # each in its range
     pulled = (values[:count] < 0) | (values[:count] > 1)

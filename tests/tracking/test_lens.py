@@ -4,9 +4,9 @@ import sys
 
 import numpy as np
 import pytest
+from refusal import refusal
 
 from stga_addon.capture.camera import look_at
-from stga_addon.errors import StgaError
 from stga_addon.tracking.footage.shots import Lens, undistortion
 
 POINTS = np.dstack(np.meshgrid(np.linspace(-0.6, 0.6, 9), np.linspace(-0.5, 0.5, 7))).reshape(-1, 2)
@@ -68,6 +68,6 @@ def test_without_opencv_the_message_names_it(monkeypatch):
     """Catches a traceback where the optional package is missing."""
     monkeypatch.setitem(sys.modules, "cv2", None)
     message = r"^cam 3: its lens is distorted; undistorting needs opencv-python-headless"
-    with pytest.raises(StgaError, match=message):
+    with refusal(message):
         undistortion(CAMERA, BROWN, "cam 3")
     assert undistortion(CAMERA, Lens(), "cam 3") is None

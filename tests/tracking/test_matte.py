@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from numpy.random import default_rng
 from scipy.ndimage import gaussian_filter, shift
 
 from stga_addon.capture.images import read_image, read_mask
@@ -18,7 +19,7 @@ HEIGHT = 260
 
 def room(height=HEIGHT, width=WIDTH, seed=0):
     """A wall in shades with blurred things before it, and noise: levels (height, width, 3)."""
-    rng = np.random.default_rng(seed)
+    rng = default_rng(seed)
     x = np.linspace(-0.5, 0.5, width)[None, :, None]
     things = gaussian_filter(rng.normal(size=(height, width)), width / 12)[..., None]
     shades = rng.uniform(90, 190, 3) + 50 * x + 25 * things / things.std()
@@ -33,7 +34,7 @@ def person(softness=3.0):
     body = 1 - np.hypot((x - 100) / 90, (y - 262) / 120)
     coverage = np.clip(0.5 + 48 * np.maximum(head, 1.9 * body) / softness, 0, 1)
     skin = np.stack([40 + 0.3 * x, 30 + 0.1 * y, 25 + 0 * x], -1)
-    return coverage, head > 0.1, skin + np.random.default_rng(1).normal(0, 4, skin.shape)
+    return coverage, head > 0.1, skin + default_rng(1).normal(0, 4, skin.shape)
 
 
 def filmed(coverage, colors, backdrop):
@@ -52,7 +53,7 @@ def test_an_outline_that_is_off_is_drawn_to_the_person(has_plate):
     clean plate that is not used in place of a network."""
     coverage, head, colors = person()
     wall = room().round().astype(np.uint8)
-    noise = np.random.default_rng(2).normal(0, 2, wall.shape)
+    noise = default_rng(2).normal(0, 2, wall.shape)
     image = np.clip(filmed(coverage, colors, wall) + noise, 0, 255).round().astype(np.uint8)
     coarse = gaussian_filter(shift(coverage, (4, 5), order=1, mode="nearest"), 4).astype(np.float32)
     assert overlap(coarse, coverage) < 0.95

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from command_line import refused
 from PIL import Image
+from refusal import refusal
 
-from stga_addon.errors import StgaError
 from stga_addon.tracking import mattes
 from stga_addon.tracking.footage.open import open_footage
 from stga_addon.tracking.mattes import with_mattes
@@ -109,7 +109,7 @@ def test_clean_plate_of_a_camera(tmp_path, halves):
     assert found.cameras[0].mask(2)[:, : WIDTH // 2 - 2].min() == 255
     assert found.cameras[0].mask(2)[:, WIDTH // 2 + 2 :].max() == 0
     write_image(tmp_path / "footage/plates/left.png", size=(7, 5))
-    with pytest.raises(StgaError, match=r"left\.png: the image has 7 x 5 pixels"):
+    with refusal(r"left\.png: the image has 7 x 5 pixels"):
         made(footage, tmp_path, {"head": "another"})
 
 
@@ -128,7 +128,7 @@ def test_a_folder_of_mattes(tmp_path, suffix):
     assert brightest(footage) == [0, 10, 20]
     (tmp_path / "mattes/left/0001.png").unlink()
     message = rf"has no matte of .*0001\.{suffix}; expected left/0001\.png"
-    with pytest.raises(StgaError, match=message):
+    with refusal(message):
         open_footage(tmp_path / "footage", focal=50.0, mattes=tmp_path / "mattes")
 
 

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from refusal import refusal
 
-from stga_addon.errors import StgaError
 from stga_addon.render.video import video_writer
 from stga_addon.tracking.footage.open import open_footage
 from stga_addon.tracking.footage.sequences import FrameRange
@@ -119,7 +119,7 @@ def test_recordings_out_of_step(tmp_path, damage, frames, message):
     write_folders(tmp_path)
     if damage is not None:
         damage(tmp_path / "images")
-    with pytest.raises(StgaError, match=message):
+    with refusal(message):
         open_footage(tmp_path, frames=frames)
 
 
@@ -178,7 +178,7 @@ def test_videos_that_cannot_be_used(tmp_path, monkeypatch, rate, damage, message
     path.write_bytes(path.read_bytes()[: 200 if damage == "cut" else None])
     if damage == "no av":
         monkeypatch.setitem(sys.modules, "av", None)
-    with pytest.raises(StgaError, match=message):
+    with refusal(message):
         open_footage(tmp_path, tmp_path / "calibration")
 
 
@@ -221,13 +221,13 @@ def test_two_cameras_without_calibration(tmp_path):
     write_image(tmp_path / "a/1.png")
     write_image(tmp_path / "b/1.png")
     message = r"has 2 cameras \(a, b\) and no calibration; expected transforms.json, a COLMAP model"
-    with pytest.raises(StgaError, match=message):
+    with refusal(message):
         open_footage(tmp_path)
     (tmp_path / "empty").mkdir()
-    with pytest.raises(StgaError, match=r"has neither images nor videos and no calibration"):
+    with refusal(r"has neither images nor videos and no calibration"):
         open_footage(tmp_path / "empty")
     (tmp_path / "loop").symlink_to(tmp_path / "loop")
-    with pytest.raises(StgaError, match="loop: does not exist"):
+    with refusal("loop: does not exist"):
         open_footage(tmp_path / "loop")
 
 

@@ -6,6 +6,8 @@ from functools import partial
 import numpy as np
 import pytest
 import trimesh
+from numpy.linalg import norm
+from numpy.random import default_rng
 from scipy.ndimage import binary_dilation
 
 from stga_addon.capture.camera import look_at
@@ -53,7 +55,7 @@ def sphere_image(camera, contrast=1.0):
     middle = -rays @ camera.position
     inside = middle**2 - (camera.position @ camera.position - RADIUS_M**2)
     at = camera.position + (middle - np.sqrt(np.maximum(inside, 0)))[..., None] * rays
-    rng = np.random.default_rng(3)
+    rng = default_rng(3)
     level = sum(
         np.sin(at @ rng.normal(0, 1.5 / length, 3) + rng.uniform(0, 6))
         for length in (0.002, 0.003, 0.004) * 4
@@ -67,13 +69,13 @@ def rays_of(camera, grid=1):
     y, x = (np.indices((grid * camera.height, grid * camera.width)) + 0.5) / grid
     flat = (x - camera.cx) / camera.fl_x, (y - camera.cy) / camera.fl_y
     rays = np.stack([*flat, np.ones(x.shape)], -1) @ camera.world_to_camera[:3, :3]
-    return rays / np.linalg.norm(rays, axis=-1, keepdims=True)
+    return rays / norm(rays, axis=-1, keepdims=True)
 
 
 def ball_points():
     """Unit directions to the front of a ball."""
-    directions = np.random.default_rng(0).normal(size=(60, 3)) * [1, 1, 0.5] + [0, 0, 2]
-    return directions / np.linalg.norm(directions, axis=1, keepdims=True)
+    directions = default_rng(0).normal(size=(60, 3)) * [1, 1, 0.5] + [0, 0, 2]
+    return directions / norm(directions, axis=1, keepdims=True)
 
 
 def views(cameras, contrast=1.0):
@@ -111,7 +113,7 @@ def test_large_images_are_reduced_to_the_size_of_a_sample():
     """Catches a principal point that reduction moves, and samples that skip most pixels of a large
     image."""
     camera = look_at((0.2, 0.1, 1.0), (0, 0, 0), 1210, 900, 12000)
-    rng = np.random.default_rng(0)
+    rng = default_rng(0)
     pixels = rng.integers(0, 255, (900, 1210, 3), np.uint8)
     small, image = gray_view(camera, pixels, np.zeros(3), 0.001)
     factor = camera.fl_x / small.fl_x
@@ -146,7 +148,7 @@ def test_offsets_are_smooth_robust_and_local(head):
     faces = head.model.faces
     points = surface_points(head, 2000)
     at = points.on(vertices, faces)
-    rng = np.random.default_rng(0)
+    rng = default_rng(0)
     true = 0.003 * np.exp(-((at - at[at[:, 2].argmax()]) ** 2).sum(1) / 0.04**2)
     wrong = rng.random(len(at)) < 0.15
     outliers = np.where(wrong, rng.uniform(-0.004, 0.004, len(at)), 0)
@@ -162,7 +164,7 @@ def test_offsets_are_smooth_robust_and_local(head):
 def test_offsets_do_not_depend_on_how_the_surface_is_cut_into_triangles():
     """Catches a Laplacian that counts neighbors and takes a slope for a bend."""
     y, x = (0.004 * values.ravel() for values in np.indices((12, 12)))
-    flat = np.column_stack([x, y]) + np.random.default_rng(0).uniform(-0.0013, 0.0013, (144, 2))
+    flat = np.column_stack([x, y]) + default_rng(0).uniform(-0.0013, 0.0013, (144, 2))
     vertices = np.column_stack([flat, np.zeros(144)])
     cell = np.flatnonzero((np.arange(144) % 12 < 11) & (np.arange(144) < 132))
     faces = np.concatenate([cell[:, None] + [0, 1, 12], cell[:, None] + [1, 13, 12]])
@@ -177,7 +179,7 @@ def pictured(head, cameras, meshes):
     """Images of a take, in colors of the vertices without a pattern."""
     count = len(head.model.v_template)
     faces = head.model.faces
-    colors = np.random.default_rng(2).uniform(0.25, 1, (count, 1)) * np.ones(3)
+    colors = default_rng(2).uniform(0.25, 1, (count, 1)) * np.ones(3)
     pictures = [[(c, shaded_image(mesh, faces, c, colors)) for c in cameras] for mesh in meshes]
     return partial(shown, pictures)
 
@@ -187,7 +189,7 @@ def test_a_head_is_moved_onto_the_skin_that_the_cameras_see(head):
     landmarks alone, wrong by 3 mm each, leave errors of millimeters."""
     model = head.model
     cameras = rig(5)
-    rng = np.random.default_rng(5)
+    rng = default_rng(5)
     shape = rng.normal(0, 0.7, model.n_identity)
     front = model.v_template[:, 2] > 0.04
     bump = 0.002 * np.sin(model.v_template[:, :1] * 60) * front[:, None] * [0, 0, 1]
@@ -213,7 +215,7 @@ def test_one_timestep_does_not_tell_the_errors_of_landmarks(head, monkeypatch):
     one expression."""
     model = head.model
     cameras = rig(5)
-    wrong = np.random.default_rng(5).normal(0, 0.0018, (150, 3))
+    wrong = default_rng(5).normal(0, 0.0018, (150, 3))
     mesh = flame_forward(model, np.zeros(model.n_identity), frame_at(head, 6))
     images = pictured(head, cameras, [mesh])
     take = recorded(head, cameras, [mesh], places_on(head, 150), wrong=wrong, images=images)
@@ -255,7 +257,7 @@ def test_skin_slides_as_dense_tracking_has_it(head, count, share):
         fit = fit_surface(head, first, take, Crew(Helpers(1)), dense=dense)
         assert fit.static_offset is not None
         slips = [in_cameras_world(fit, t) - mesh for t, mesh in enumerate(meshes)]
-        errors.append(np.linalg.norm(slips, axis=2)[:, front].mean())
+        errors.append(norm(slips, axis=2)[:, front].mean())
     assert errors[1] < share * errors[0]
 
 
@@ -272,9 +274,9 @@ CAMERA = look_at((0.3, 0.1, 1.0), (0.01, 0, 0), 120, 160, 500)
 def ball(radius):
     """Vertices and triangles of a ball, and a thousand unit directions to its surface."""
     mesh = trimesh.creation.icosphere(4, radius)
-    directions = np.random.default_rng(0)
+    directions = default_rng(0)
     directions = directions.normal(size=(1000, 3))
-    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    directions /= norm(directions, axis=1, keepdims=True)
     return np.array(mesh.vertices), np.array(mesh.faces), directions
 
 

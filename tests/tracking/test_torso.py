@@ -7,6 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from flame.small_head import small_head, small_head_colors, subdivided, write_flame
+from numpy.linalg import norm
+from numpy.random import default_rng
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
@@ -98,8 +100,8 @@ def ellipsoid():
     corners = grid[:-1, :-1], grid[1:, :-1], grid[1:, 1:], grid[:-1, 1:]
     a, b, c, d = (own.ravel() for own in corners)
     faces = np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)])
-    waves = np.sin(vertices @ np.random.default_rng(1).normal(0, 160, (3, 5)))
-    colors = 0.5 + 0.12 * waves @ np.random.default_rng(2).normal(0, 1, (5, 3))
+    waves = np.sin(vertices @ default_rng(1).normal(0, 160, (3, 5)))
+    colors = 0.5 + 0.12 * waves @ default_rng(2).normal(0, 1, (5, 3))
     return vertices, faces, np.clip(colors, 0.05, 0.95)
 
 
@@ -218,7 +220,7 @@ def test_shoulders_that_are_lifted_are_followed(head, lifted):
     assert np.abs(wrong - wrong.mean(0)).max() < 3e-3
     timestep = followed.points.timestep
     beside = followed.points.at - [0.002 * timestep, 0, 0] - LIFT_M[timestep] - CHEST_CENTER_M
-    assert np.median(np.abs(np.linalg.norm(beside / CHEST_SIZE_M, axis=1) - 1)) < 0.15
+    assert np.median(np.abs(norm(beside / CHEST_SIZE_M, axis=1) - 1)) < 0.15
 
 
 def test_the_necks_end_is_drawn_over_the_chest(fine_head):
@@ -230,8 +232,8 @@ def test_the_necks_end_is_drawn_over_the_chest(fine_head):
     base = np.array([0.0, -0.14, -0.04])
     shown = cloth[(cloth[:, 2] > CHEST_CENTER_M[2] + 0.02) & (cloth[:, 1] < base[1] - 0.01)]
     after = draped(sheet, at - base, shown - base) + base
-    moved = np.linalg.norm(after - at, axis=1) > 0.02
-    beside = np.abs(np.linalg.norm((after - CHEST_CENTER_M) / CHEST_SIZE_M, axis=1) - 1)
+    moved = norm(after - at, axis=1) > 0.02
+    beside = np.abs(norm((after - CHEST_CENTER_M) / CHEST_SIZE_M, axis=1) - 1)
     assert moved.sum() > 20
     assert np.median(beside[moved & (sheet.height < 0.7)]) < 0.1
     assert after[:, 1].min() < shown[:, 1].min() + 0.03
@@ -269,7 +271,7 @@ def test_cloth_that_slides_over_the_shoulders_is_followed(fine_head):
     true = (slides - slides[first])[:, nearest[on_cloth]]
     found = [at[t] - at[first] - moved[t] + moved[first] for t in meshes]
     wrong = np.array(found)[:, on_cloth] - true
-    assert np.linalg.norm(wrong, axis=2).mean() < 0.5 * np.linalg.norm(true, axis=2).mean()
+    assert norm(wrong, axis=2).mean() < 0.5 * norm(true, axis=2).mean()
 
 
 @pytest.mark.slow
@@ -299,7 +301,7 @@ def test_a_take_on_its_torso_has_the_vertices_that_motion_and_cloth_say(fine_hea
     static offset that is lost, cloth that does not bend, a head that offsets move, and figures of
     the report in other units or of another joint."""
     bare = person(fine_head, np.zeros(fine_head.model.n_identity))
-    rng = np.random.default_rng(3)
+    rng = default_rng(3)
     size = bare.model.v_template.shape
     static = rng.normal(0, 1e-3, size) * earlier
     one = with_offset(bare, static)
@@ -335,10 +337,10 @@ def test_a_take_on_its_torso_has_the_vertices_that_motion_and_cloth_say(fine_hea
     motion = followed.motion
     assert motion.misfit == decided.misfit
     necks = [values[expressions + 3 : expressions + 6] for values in tracked.values()]
-    assert motion.turn_deg == pytest.approx(np.degrees(np.linalg.norm(necks, axis=1).max()))
-    shifts = [1000 * np.linalg.norm(torso.shift) for torso in posed.values()]
+    assert motion.turn_deg == pytest.approx(np.degrees(norm(necks, axis=1).max()))
+    shifts = [1000 * norm(torso.shift) for torso in posed.values()]
     assert motion.shift_mm == pytest.approx(max(shifts))
-    by_cloth = [1000 * np.linalg.norm(bend, axis=1).max() for bend in bent.values()]
+    by_cloth = [1000 * norm(bend, axis=1).max() for bend in bent.values()]
     assert motion.bend_mm == (pytest.approx(max(by_cloth)) if bends else 0)
 
 

@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 from command_line import stga
 from flame.small_head import write_flame
+from refusal import refusal
 from scipy.spatial.transform import Rotation
 
 from stga_addon.capture.camera import look_at
 from stga_addon.capture.mesh_geometry import Similarity
 from stga_addon.capture.open import open_capture
 from stga_addon.cli.main import main
-from stga_addon.errors import StgaError
 from stga_addon.export.playback import playback_fps
 from stga_addon.files import read_json, read_npz, write_json, write_npz
 from stga_addon.flame.forward import RIGID_SIZE, flame_forward
@@ -352,7 +352,7 @@ def test_detection_resumes_camera_by_camera(recorded):
     np.testing.assert_array_equal(written.points, 1)
     two = np.array([[0.0, 0.0], [9.0, 9.0]])
     message = r"camera cam0 sees 5 of 5 frames with two faces, the first at timestep 0"
-    with pytest.raises(StgaError, match=message):
+    with refusal(message):
         detect_landmarks(footage, Counting([two, two + 30]), folder, Crew(Helpers(1)))
 
 
@@ -423,7 +423,7 @@ def test_cameras_have_landmark_files_of_their_own(tmp_path):
 def test_the_capture_is_not_written_into_the_footage(tmp_path):
     """Catches images of the footage that those of the capture replace."""
     write_folders(tmp_path)
-    with pytest.raises(StgaError, match="is the folder of the footage; give another --out"):
+    with refusal("is the folder of the footage; give another --out"):
         track(open_footage(tmp_path), tmp_path / "head.npz", tmp_path)
 
 
@@ -438,7 +438,7 @@ def test_landmarks_of_another_recording_are_not_used_again(tmp_path, head, monke
     other = "holds landmarks of other footage"
     for offset, message in ((1, none), (1, none), (2, other)):
         frames = FrameRange(stop=6, offsets={"b": offset})
-        with pytest.raises(StgaError, match=message):
+        with refusal(message):
             track(
                 open_footage(tmp_path / "footage", frames=frames),
                 tmp_path / "head.npz",
@@ -447,10 +447,10 @@ def test_landmarks_of_another_recording_are_not_used_again(tmp_path, head, monke
     image = sorted((tmp_path / "footage").rglob("*.png"))[3]
     for number, changed in enumerate((image, tmp_path / "head.npz")):
         footage = open_footage(tmp_path / "footage", frames=FrameRange(stop=6))
-        with pytest.raises(StgaError, match=none):
+        with refusal(none):
             track(footage, tmp_path / "head.npz", tmp_path / f"out_{number}")
         os.utime(changed, ns=(0, 1))
-        with pytest.raises(StgaError, match=other):
+        with refusal(other):
             track(footage, tmp_path / "head.npz", tmp_path / f"out_{number}")
 
 
@@ -479,7 +479,7 @@ def test_footage_without_a_face_leaves_nothing(tmp_path, monkeypatch):
     bundled = HeadModel(flame_model(None), "flame")
     use_detector(monkeypatch, Counting([]), places_on(bundled, LANDMARKS))
     message = r"landscape.mp4.*: shows no face, nor does any other of 4 frames"
-    with pytest.raises(StgaError, match=message):
+    with refusal(message):
         perform(Track(tmp_path / "landscape.mp4", None, tmp_path / "out"))
     assert not (tmp_path / "out").exists()
 
@@ -502,7 +502,7 @@ def test_a_face_that_is_hardly_ever_found_is_no_capture(tmp_path, head, monkeypa
     model = tmp_path / "head.npz"
     use_detector(monkeypatch, Glimpsing(points, {3}), places)
     message = r"is found at 1 of 5 timesteps, expected 33% .* crop the video to head and shoulders"
-    with pytest.raises(StgaError, match=message):
+    with refusal(message):
         track(footage, model, tmp_path / "out", TrackingOptions(mattes=False))
     assert not (tmp_path / "out").exists()
     use_detector(monkeypatch, Glimpsing(points, {0, 4}), places)

@@ -16,6 +16,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
+from refusal import refusal
 
 from stga_addon.errors import StgaError
 from stga_addon.progress import Progress
@@ -97,9 +98,9 @@ def test_worker_is_cancelled(start):
         nicer = min(os.getpriority(os.PRIO_PROCESS, 0) + 5, 19)
         assert os.getpriority(os.PRIO_PROCESS, process.pid) == nicer
     message = rf"another worker is running here \(process {process.pid}\)"
-    with pytest.raises(StgaError, match=message):
+    with refusal(message):
         prepare_status_folder(folder)
-    with pytest.raises(StgaError, match="another worker"):
+    with refusal("another worker"):
         status.remove_status_folder(folder)
     status.request_cancel(folder)
     status.request_cancel(folder)
@@ -183,15 +184,15 @@ def test_only_own_files_are_removed(tmp_path):
     for folder, left in ((tmp_path / "new", []), (tmp_path / "job", ["notes.txt"])):
         for python in (str(tmp_path / "nowhere/python"), "null\0character"):
             prepare_status_folder(folder)
-            with pytest.raises(StgaError, match=r"cannot be started as a Python interpreter"):
+            with refusal(r"cannot be started as a Python interpreter"):
                 start_worker(folder, python, [])
             assert folder.exists() == bool(left)
             assert [path.name for path in folder.glob("*")] == left
     for use in (prepare_status_folder, status.request_cancel):
-        with pytest.raises(StgaError, match=r"file.*cannot be written"):
+        with refusal(r"file.*cannot be written"):
             use(tmp_path / "file" / "status")
     writing = status.status_writer(tmp_path / "file" / "status")
-    with pytest.raises(StgaError, match="cannot be written"), writing:
+    with refusal("cannot be written"), writing:
         pass
 
 
@@ -211,7 +212,7 @@ def test_symbolic_links_are_not_followed(tmp_path):
     (folder / status.CANCEL_FILE).unlink()
     (folder / status.LOG_FILE).unlink()
     (folder / status.LOG_FILE).symlink_to(target)
-    with pytest.raises(StgaError, match=rf"{status.LOG_FILE}: cannot be written"):
+    with refusal(rf"{status.LOG_FILE}: cannot be written"):
         start_worker(folder, sys.executable, ["this"])
     with status.status_writer(folder) as writer:
         writer.report(Progress(0.5, "working"))
@@ -253,7 +254,7 @@ def test_status_round_trip(tmp_path, monkeypatch):
     with status.status_writer(tmp_path) as writer:
         now += 0.25
         writer.report(Progress(0.25, "training", "enough", lambda: figures))
-        with pytest.raises(StgaError, match="another worker"), status.status_writer(tmp_path):
+        with refusal("another worker"), status.status_writer(tmp_path):
             pass
         assert status.read_status(tmp_path) == expected
         now += 1

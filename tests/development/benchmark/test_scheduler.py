@@ -13,6 +13,7 @@ import pytest
 from batch.simulated import InProcessEngine
 from capture import factory
 from command_line import refused, stga
+from refusal import refusal
 
 import stga_addon.development.commands  # noqa: F401 (adds its requests)
 from stga_addon.capture.model import Capture
@@ -27,8 +28,7 @@ from stga_addon.development.benchmark.variants import (
     Benchmark,
     select_variants,
 )
-from stga_addon.development.benchmark.worker import QUALITY, Turns, work
-from stga_addon.errors import StgaError
+from stga_addon.development.benchmark.worker import QUALITY, work
 from stga_addon.jobs.perform import perform, request_folder, write_request
 from stga_addon.jobs.train import Train
 from stga_addon.progress import Cancelled, Progress
@@ -50,20 +50,6 @@ def run_in(capture: Capture, out: Path, **changes: Any) -> BenchmarkRun:
 
 def progress(share: float, iteration: int = 1) -> Progress:
     return Progress(share, figures=lambda: {"iteration": iteration})
-
-
-def test_turns() -> None:
-    """Catches a run that trains out of its turn, waits after its end, or outlives its parent."""
-    replies = io.StringIO()
-    turns = Turns(io.StringIO("0.5\n0.7\n"), replies)
-    assert not turns.report(progress(0.0, iteration=0))  # still compiling
-    assert replies.getvalue() == ""
-    for share in (0.1, 0.3, 0.49, 0.52):
-        assert not turns.report(progress(share, 3))
-    assert [json.loads(line)["share"] for line in replies.getvalue().splitlines()] == [0.1, 0.52]
-    assert turns.report(progress(0.7))  # end of the requests: stop
-    ended = Turns(io.StringIO(""), replies)
-    assert not ended.report(progress(1.0))
 
 
 def test_one_run(toy: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -127,7 +113,7 @@ def test_a_slice_is_stopped_and_goes_on(toy, tmp_path, monkeypatch):
     said.clear()
     perform(request, say=said.append)
     assert [text for text in said if "Starting" in text] == []
-    with pytest.raises(StgaError, match="holds a run with other settings"):
+    with refusal("holds a run with other settings"):
         perform(replace(request, seconds=3.0))
 
 
