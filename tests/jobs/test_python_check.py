@@ -40,8 +40,7 @@ def test_check_is_described():
         describe_check("p", old)
     failures = {"torch": "ModuleNotFoundError: No module", "PIL": "OSError: libjpeg.so"}
     bare = {**FOUND, "failures": failures}
-    sentence = r"p: Python 3\.11\.7 lacks torch, pillow \(OSError: libjpeg\.so\); install"
-    with refusal(sentence):
+    with refusal(r"p: Python 3\.11\.7 lacks torch, pillow \(OSError: libjpeg\.so\); install"):
         describe_check("p", bare)
 
 
@@ -50,8 +49,7 @@ def test_what_cannot_train_is_refused(tmp_path):
     make = [sys.executable, "-m", "venv", "--without-pip", str(tmp_path / "venv")]
     subprocess.run(make, check=True)
     python = next(path for path in (tmp_path / "venv").glob("*/python*") if path.stem == "python")
-    sentence = r"lacks numpy, torch, numba, scipy, .*av, opencv-python-headless; install"
-    with refusal(sentence):
+    with refusal(r"lacks numpy, torch, numba, scipy, .*av, opencv-python-headless; install"):
         check(python)
     with refusal("cannot be started as a Python interpreter"):
         check(tmp_path / "python")
@@ -79,8 +77,7 @@ def test_order_of_choices(monkeypatch):
     """Catches a farm's variable or the preferences overruled, and no word of what to do."""
     monkeypatch.delenv(PYTHON_VARIABLE, raising=False)
     monkeypatch.setattr(training_python, "missing_packages", lambda: ["torch"])
-    sentence = rf"lacks torch\. Install the complete edition .* or by {PYTHON_VARIABLE}"
-    with refusal(sentence):
+    with refusal(rf"lacks torch\. Install the complete edition .* or by {PYTHON_VARIABLE}"):
         find_training_python()
     assert find_training_python("/preferred/python") == "/preferred/python"
     monkeypatch.setattr(training_python, "missing_packages", list)

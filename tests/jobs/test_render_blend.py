@@ -89,13 +89,11 @@ def test_a_program_with_spaces_in_its_path(monkeypatch: pytest.MonkeyPatch, tmp_
 def test_what_went_wrong_is_a_sentence(shot, tmp_path, monkeypatch):
     """Catches a film that counts as finished without all frames, and a missing Blender."""
     monkeypatch.setenv("FAILS", "10")
-    sentence = r"shot\.blend: frame 10 was not rendered: .*exit status 1: Error: Out of memory"
-    with refusal(sentence):
+    with refusal(r"shot\.blend: frame 10 was not rendered: .*exit status 1: Error: Out of memory"):
         perform(shot, ignore, lambda line: None)
     assert sorted(pictures(shot.output)) == ["000008.png", "000009.png"]
     monkeypatch.setenv("STGA_BLENDER", str(tmp_path / "nowhere"))
-    sentence = r"nowhere: Blender cannot be started .*; expected it on PATH"
-    with refusal(sentence):
+    with refusal(r"nowhere: Blender cannot be started .*; expected it on PATH"):
         perform(shot, ignore, lambda line: None)
 
 

@@ -126,8 +126,7 @@ def test_what_cannot_render_is_one_sentence(monkeypatch):
         raise StgaError("no training Python")
 
     monkeypatch.setattr(render_client, "missing_packages", lambda: ["numba", "platformdirs"])
-    expected = "Rendering splats needs numba and platformdirs .*or another Python"
-    with refusal(expected):
+    with refusal("Rendering splats needs numba and platformdirs .*or another Python"):
         RenderClient(nobody).compose([], CAMERA)
     with refusal("/no/such/python: cannot be started"):
         RenderClient(lambda: "/no/such/python").compose([], CAMERA)

@@ -130,7 +130,6 @@ def test_the_server_renders_on_the_wanted_device(adapter, monkeypatch):
     np.testing.assert_array_equal(remote.compose(layers, CAMERA, True).rgb, want.rgb)
     assert subprocess.Popen.poll(first) is not None
     device[0] = "gpu:Voodoo 2"
-    sentence = r"could not render the image \(--device gpu:Voodoo 2: no adapter"
-    with refusal(sentence):
+    with refusal(r"could not render the image \(--device gpu:Voodoo 2: no adapter"):
         remote.compose(layers, CAMERA)
     remote.close()

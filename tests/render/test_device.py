@@ -79,8 +79,7 @@ def test_names_that_fit_none_or_several(trials):
     """Catches an adapter that nobody meant, and a file that names nonsense."""
     with refusal(r"^--device gpu:card: several adapters .*llvmpipe"):
         choose_device("gpu:card")
-    expected = "^--device gpu:Voodoo: no adapter of that name; there are: Card"
-    with refusal(expected):
+    with refusal("^--device gpu:Voodoo: no adapter of that name; there are: Card"):
         choose_device("gpu:Voodoo")
     assert all(map(is_device, ("auto", "cpu", "gpu", "gpu:any name")))
     wrong = "", "gpu:", "cuda", "gpux", None, 3, ["cpu"], "gpu:" + 999 * "x"

@@ -90,8 +90,7 @@ def test_recordings_that_share_nothing(tmp_path):
     """Catches an offset that is made up."""
     footage(tmp_path, (20, 20), seeds=(5, 6))
     for sync in ("sound", "motion"):
-        message = rf"b.mkv: its {sync} does not say when camera a recorded the same"
-        with refusal(message):
+        with refusal(rf"b.mkv: its {sync} does not say when camera a recorded the same"):
             open_footage(tmp_path, frames=FrameRange(sync=sync))
 
 

@@ -350,8 +350,7 @@ def test_sensor_without_calibration(tmp_path, changes):
     if len(changes) == 1:
         changes = [*changes, ("<f>7</f>", "")]
     changed_export(tmp_path, changes)
-    message = "sensor '0': has no calibration with f; align the cameras and export them again"
-    with refusal(message):
+    with refusal("sensor '0': has no calibration with f; align the cameras and export them again"):
         open_footage(tmp_path)
 
 

@@ -67,7 +67,6 @@ def test_undistorted_pixels_are_where_the_pinhole_sees_them(lens):
 def test_without_opencv_the_message_names_it(monkeypatch):
     """Catches a traceback where the optional package is missing."""
     monkeypatch.setitem(sys.modules, "cv2", None)
-    message = r"^cam 3: its lens is distorted; undistorting needs opencv-python-headless"
-    with refusal(message):
+    with refusal(r"^cam 3: its lens is distorted; undistorting needs opencv-python-headless"):
         undistortion(CAMERA, BROWN, "cam 3")
     assert undistortion(CAMERA, Lens(), "cam 3") is None

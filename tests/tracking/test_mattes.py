@@ -127,8 +127,7 @@ def test_a_folder_of_mattes(tmp_path, suffix):
     footage = open_footage(tmp_path / "footage", focal=50.0, mattes=tmp_path / "mattes")
     assert brightest(footage) == [0, 10, 20]
     (tmp_path / "mattes/left/0001.png").unlink()
-    message = rf"has no matte of .*0001\.{suffix}; expected left/0001\.png"
-    with refusal(message):
+    with refusal(rf"has no matte of .*0001\.{suffix}; expected left/0001\.png"):
         open_footage(tmp_path / "footage", focal=50.0, mattes=tmp_path / "mattes")
 
 

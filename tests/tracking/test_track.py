@@ -351,8 +351,7 @@ def test_detection_resumes_camera_by_camera(recorded):
     written = read_camera(landmark_file(folder / "found", camera.name), camera)
     np.testing.assert_array_equal(written.points, 1)
     two = np.array([[0.0, 0.0], [9.0, 9.0]])
-    message = r"camera cam0 sees 5 of 5 frames with two faces, the first at timestep 0"
-    with refusal(message):
+    with refusal(r"camera cam0 sees 5 of 5 frames with two faces, the first at timestep 0"):
         detect_landmarks(footage, Counting([two, two + 30]), folder, Crew(Helpers(1)))
 
 
@@ -478,8 +477,7 @@ def test_footage_without_a_face_leaves_nothing(tmp_path, monkeypatch):
     write_video(tmp_path / "landscape.mp4", range(0, 200, 50))
     bundled = HeadModel(flame_model(None), "flame")
     use_detector(monkeypatch, Counting([]), places_on(bundled, LANDMARKS))
-    message = r"landscape.mp4.*: shows no face, nor does any other of 4 frames"
-    with refusal(message):
+    with refusal(r"landscape.mp4.*: shows no face, nor does any other of 4 frames"):
         perform(Track(tmp_path / "landscape.mp4", None, tmp_path / "out"))
     assert not (tmp_path / "out").exists()
 

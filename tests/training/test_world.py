@@ -7,8 +7,7 @@ from unittest.mock import patch
 import numpy as np
 import pytest
 from capture import factory
-from cli.conftest import refused
-from command_line import stga
+from command_line import refused, stga
 from PIL import Image
 from scipy.ndimage import gaussian_filter, map_coordinates
 

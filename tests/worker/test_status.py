@@ -97,8 +97,7 @@ def test_worker_is_cancelled(start):
     if os.name != "nt":
         nicer = min(os.getpriority(os.PRIO_PROCESS, 0) + 5, 19)
         assert os.getpriority(os.PRIO_PROCESS, process.pid) == nicer
-    message = rf"another worker is running here \(process {process.pid}\)"
-    with refusal(message):
+    with refusal(rf"another worker is running here \(process {process.pid}\)"):
         prepare_status_folder(folder)
     with refusal("another worker"):
         status.remove_status_folder(folder)
