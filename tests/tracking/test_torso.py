@@ -27,6 +27,7 @@ from stga_addon.tracking.correspondence import shaded_image
 from stga_addon.tracking.dense_head import REGIONS
 from stga_addon.tracking.fit import HeadFit, posed_mesh
 from stga_addon.tracking.folder import (
+    KEPT_FOLDER,
     PLACES_FILE,
     REPORT_FILE,
     TorsoMotion,
@@ -372,6 +373,7 @@ def test_track_writes_the_torso_as_flames_neck(tmp_path, head, lifted, monkeypat
     result = track(
         footage, tmp_path / "head.npz", out, TrackingOptions(tmp_path / "points", mattes=False)
     )
+    assert not (out / KEPT_FOLDER).exists()
     found = read_torso_motion(out)
     assert found == result.torso
     assert found.shift_mm > 5

@@ -278,7 +278,7 @@ def test_timesteps_that_determine_no_pose_are_interpolated(tmp_path, head, capsy
         path = tmp_path / f"points/cam{camera}.npz"
         points, confidence = (np.load(path)[name] for name in ("points", "confidence"))
         confidence[3, 7:] = 0  # unreliable ones alone
-        points[4] = 5.0  # all in one point
+        points[4, 7:] = 5.0  # reliable ones in one point
         confidence[5] = np.arange(LANDMARKS) % 5 == camera  # each in one camera
         confidence[6] = np.isin(np.arange(LANDMARKS), (20, 21))  # only two
         change(path, points=points, confidence=confidence)
