@@ -46,10 +46,11 @@ def sheet(seed: int = 0) -> np.ndarray:
     return 0.01 * bumpy
 
 
-def colored(neutral: np.ndarray, seed: int = 0) -> Avatar:
+def colored(neutral, size=0.2, names=("strain_color", "normal_color")):
+    """An avatar whose triangles' splats follow signals, by random offsets."""
     splats = lattice_splats(neutral, FACES, 1, 0, opacity_logit=2.0)
-    colors = default_rng(seed).normal(0, 0.2, (2, len(FACES), 3, 3)).astype(np.float32)
-    offsets = dict(zip(("strain_color", "normal_color"), colors, strict=True))
+    values = default_rng(0).normal(0, size, (len(names), len(FACES), 3, 3)).astype(np.float32)
+    offsets = dict(zip(names, values, strict=True))
     return Avatar(splats, "stga", neutral.astype(np.float32), FACES, driven_offsets=offsets)
 
 
@@ -148,12 +149,9 @@ def test_baking_keeps_the_picture():
     np.testing.assert_array_equal(to_world(avatar.splats, undeformed).sh, avatar.splats.sh)
 
 
-def following(neutral: np.ndarray, seed: int = 0) -> Avatar:
+def following(neutral):
     """An avatar without driven colors whose triangles' splats move by millimeters with strain."""
-    splats = lattice_splats(neutral, FACES, 1, 0, opacity_logit=2.0)
-    position = default_rng(seed).normal(0, 3e-3, (len(FACES), 3, 3)).astype(np.float32)
-    offsets = {"strain_position": position}
-    return Avatar(splats, "stga", neutral.astype(np.float32), FACES, driven_offsets=offsets)
+    return colored(neutral, 3e-3, ["strain_position"])
 
 
 def test_neighbors_share_an_edge():

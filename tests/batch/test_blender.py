@@ -61,34 +61,20 @@ def shot(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
         patch.setenv("BLENDER_USER_RESOURCES", str(folder / "profile"))
         patch.setenv("STGA_PYTHON", sys.executable)
         archive = build_zip(folder)
-        blender(
-            "--command", "extension", "install-file", "--repo", "user_default", "--enable", archive
-        )
+        blender(f"--command extension install-file --repo user_default --enable {archive}")
         capture = open_capture(write_mesh_capture(folder / "capture", (0, 1, 3, 4), range(4)))
         write_avatar_of(capture, folder / "avatar.npz")
         (folder / "make.py").write_text(MAKE.format(folder=str(folder)))
-        blender("--background", "--python-exit-code", "1", "--python", folder / "make.py")
-        names = folder / "whole/######"
+        blender(f"--background --python-exit-code 1 --python {folder}/make.py")
         blender(
-            "--background",
-            folder / "head.blend",
-            "--engine",
-            "STGA_SPLATS",
-            "--render-output",
-            names,
-            "--render-format",
-            "PNG",
-            "--frame-start",
-            0,
-            "--frame-end",
-            4,
-            "--render-anim",
+            f"--background {folder}/head.blend --engine STGA_SPLATS --render-output "
+            f"{folder}/whole/###### --render-format PNG --frame-start 0 --frame-end 4 --render-anim"
         )
         yield folder
 
 
-def blender(*arguments: object) -> None:
-    output_of([*BLENDER, *arguments], timeout=600, cwd=ROOT)
+def blender(words: str) -> None:
+    output_of([*BLENDER, *words.split()], timeout=600, cwd=ROOT)
 
 
 def pictures(folder: Path) -> dict[str, np.ndarray]:

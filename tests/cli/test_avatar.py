@@ -15,8 +15,8 @@ from stga_addon.tracking.torso import FollowedTorso
 
 
 def make(take, out, *more):
-    files = "--model", take / "head.npz", "--out", out, "--landmarks", take / "points"
-    return stga("avatar", take / "footage", *files, "--iterations 6", *more)
+    files = f"{take}/footage --model {take}/head.npz --landmarks {take}/points --out {out}"
+    return stga("avatar", files, "--iterations 6", *more)
 
 
 @pytest.fixture(scope="module")
@@ -93,11 +93,11 @@ def test_other_inputs_are_refused(made, take, capsys, more, expected):
 
 def test_a_wrong_folder_is_left_as_it_is(take, tmp_path, capsys):
     """Catches a folder that remembers a mistake, and somebody's run taken for a part of it."""
-    files = "--model", take / "head.npz", "--out", tmp_path / "out"
-    assert "nowhere: does not exist" in refused(capsys, "avatar", tmp_path / "nowhere", *files)
+    words = f"avatar {tmp_path}/nowhere --model {take}/head.npz --out {tmp_path}/out"
+    assert "nowhere: does not exist" in refused(capsys, words)
     assert not (tmp_path / "out").exists()
     (tmp_path / "out").mkdir()
-    assert stga("avatar", tmp_path / "nowhere", *files) == 2
+    assert stga(words) == 2
     assert list((tmp_path / "out").iterdir()) == []
     (tmp_path / "out/run").mkdir()
     assert make(take, tmp_path / "out") == 2

@@ -9,7 +9,7 @@ from numpy.linalg import norm
 from scipy.spatial.transform import Rotation
 
 from stga_addon.capture.camera import Camera, look_at
-from stga_addon.capture.mesh_geometry import Similarity, similarity
+from stga_addon.capture.mesh_geometry import similarity
 from stga_addon.capture.open import open_capture
 from stga_addon.flame.model import EYEBALL_WEIGHT
 from stga_addon.flame.parts import flame_model
@@ -23,6 +23,8 @@ from stga_addon.tracking.known_person import KnownPerson
 from stga_addon.tracking.opened import TrackingOptions
 from stga_addon.tracking.solve import person
 from stga_addon.tracking.track import track
+
+from .test_fit import HERE
 
 cv2 = pytest.importorskip("cv2")
 
@@ -162,7 +164,7 @@ def test_a_known_head_seen_from_above_is_not_tilted(tmp_path, monkeypatch):
 
     places = calibrate(head.model, FaceNetworks(), "head")
     monkeypatch.setattr(recorded, "calibrate", lambda *_: places)  # as both would find them
-    fit = HeadFit(head, np.zeros(0), {}, Similarity(1.0, np.eye(3), np.zeros(3)))
+    fit = HeadFit(head, np.zeros(0), {}, HERE)
     tilts_deg = []
     for name, drawn in (("biased", draw_nothing), ("corrected", draw)):
         known = KnownPerson(fit, drawn, None)

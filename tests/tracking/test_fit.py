@@ -43,6 +43,8 @@ from stga_addon.tracking.solve import (
     solve_take,
 )
 
+HERE = Similarity(1.0, np.eye(3), np.zeros(3))
+
 
 def places_on(head, count, seed=0):
     """Places all over the front of the skin."""

@@ -9,7 +9,6 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from stga_addon.capture.camera import camera_from_gl
-from stga_addon.capture.mesh_geometry import Similarity
 from stga_addon.files import read_json, write_npz
 from stga_addon.flame.forward import FlameFrame, flame_forward
 from stga_addon.tracking.fit import HeadFit, RecordedTake, TimestepLandmarks
@@ -22,7 +21,7 @@ from stga_addon.tracking.opened import TrackingOptions
 from stga_addon.tracking.track import track
 
 from .scenes import write_image, write_video
-from .test_fit import places_on
+from .test_fit import HERE, places_on
 
 EQUIVALENT_MM = 28.0
 WIDTH = 64
@@ -213,7 +212,7 @@ def test_a_lens_that_nothing_tells_is_that_of_the_avatars_camera(tmp_path, head)
     (width, height) = SIZE
     likely = camera_from_gl(np.eye(4), (2 * width, 2 * height), (500, 500), (width, height))
     inputs = footage, tmp_path / "head.npz", tmp_path / "out"
-    fit = HeadFit(head, np.zeros(0), {}, Similarity(1.0, np.eye(3), np.zeros(3)))
+    fit = HeadFit(head, np.zeros(0), {}, HERE)
     known = KnownPerson(fit, lambda mesh, camera: np.zeros((1, 1, 3), np.uint8), likely)
     found = track(*inputs, TrackingOptions(tmp_path / "points", mattes=False, person=known))
     assert (found.focal, found.focal_px) == ("avatar", 250)

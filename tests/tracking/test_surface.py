@@ -11,7 +11,7 @@ from numpy.random import default_rng
 from scipy.ndimage import binary_dilation
 
 from stga_addon.capture.camera import look_at
-from stga_addon.capture.mesh_geometry import Similarity, rasterize
+from stga_addon.capture.mesh_geometry import rasterize
 from stga_addon.flame.forward import flame_forward
 from stga_addon.tracking.correspondence import nearest_points, shaded_image
 from stga_addon.tracking.fit import HeadFit, RecordedTake, fit_head
@@ -34,7 +34,7 @@ from stga_addon.tracking.stages import Crew
 from stga_addon.tracking.surface import fit_surface, smooth_offsets
 from stga_addon.worker.helpers import Helpers
 
-from .test_fit import frame_at, in_cameras_world, places_on, recorded, seen, shown
+from .test_fit import HERE, frame_at, in_cameras_world, places_on, recorded, seen, shown
 
 RADIUS_M = 0.09
 SWEEP = Sweep(0.004, 0.0005, 0.001)
@@ -325,10 +325,9 @@ def test_mattes_that_are_too_wide_are_not_followed(head):
     used = np.ones(150, bool)
     frame = frame_at(head, 0)
     shape = np.zeros(head.model.n_identity)
-    world = Similarity(1.0, np.eye(3), np.zeros(3))
     mesh = flame_forward(head.model, shape, frame)
     faces = head.model.faces
-    fit = HeadFit(person(head, shape), shape, {0: frame.parameters}, world)
+    fit = HeadFit(person(head, shape), shape, {0: frame.parameters}, HERE)
     points = surface_points(head, 2000)
     take = RecordedTake(places, used, {}, no_image)
     near = near_landmarks(head, points, take)

@@ -1,7 +1,7 @@
 """The torso's motion against generated takes in which shoulders are a body of their own, that moves
 as told."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -13,13 +13,14 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from stga_addon.capture.camera import look_at
-from stga_addon.capture.mesh_geometry import Similarity, rasterize, weighted_procrustes
+from stga_addon.capture.mesh_geometry import rasterize, weighted_procrustes
 from stga_addon.capture.open import open_capture
 from stga_addon.files import read_json, write_npz
 from stga_addon.flame.forward import (
     FlameFrame,
     axis_angle_matrices,
     flame_forward,
+    frame_of,
     joint_positions,
 )
 from stga_addon.flame.model import MIN_TORSO_WEIGHT, torso_faces
@@ -49,6 +50,7 @@ from stga_addon.tracking.torso_take import (
     NECK,
     ROOT,
     BothWays,
+    Carrier,
     PosedTorso,
     TorsoPose,
     TorsoTake,
@@ -58,7 +60,7 @@ from stga_addon.tracking.track import track
 from stga_addon.worker.helpers import Helpers
 
 from .recording import seen_landmarks, write_footage
-from .test_fit import places_on
+from .test_fit import HERE, places_on
 
 SIZE = 105, 142
 TIMESTEPS = 6
@@ -71,7 +73,6 @@ CLOTH_SIGMA_M = 0.05
 """By which cloth slides over the shoulders at each timestep; where, and how far around."""
 CHEST_SIZE_M = np.array([0.17, 0.08, 0.085])
 CHEST_CENTER_M = np.array([0.0, -0.215, -0.04])
-HERE = Similarity(1.0, np.eye(3), np.zeros(3))
 
 
 def follow(fit, parameters, footage):
@@ -294,6 +295,43 @@ def test_without_masks_the_torso_is_not_told_from_the_wall(head):
     followed = follow(fit, parameters, footage)
     assert followed.motion is None
     assert_unchanged(followed, parameters)
+
+
+def test_turning_the_root_leaves_the_head_in_its_place(head):
+    """Catches a neck that turns about another point than the model's."""
+    one = person(head, np.zeros(head.model.n_identity))
+    rng = default_rng(0)
+    expr = rng.normal(0, 0.3, one.model.n_expression)
+    root = rng.normal(0, 0.4, 3)
+    neck = rng.normal(0, 0.2, 3)
+    frame = FlameFrame(expr, root, neck, np.zeros(3), rng.normal(0, 1, 3), np.zeros(6))
+    # the throat's correctives are another thing
+    model = replace(one.model, posedirs=np.zeros_like(one.model.posedirs))
+    joints = joint_positions(model, model.v_template + model.shapedirs @ frame.expr)
+    rotation = axis_angle_matrices(rng.normal(0, 0.5, (1, 3)))[0]
+    changed = with_root(frame.parameters, rotation, joints[NECK] - joints[ROOT])
+    before, after = (flame_forward(model, np.zeros(0), own) for own in (frame, frame_of(changed)))
+    apart = model.weights[:, ROOT] == 0
+    np.testing.assert_allclose(after[apart], before[apart], atol=1e-12)
+    turned = axis_angle_matrices(frame_of(changed).rotation[None])[0]
+    np.testing.assert_allclose(turned, rotation, atol=1e-12)
+
+
+def test_points_are_carried_by_the_triangles_that_they_lie_on(fine_head):
+    """Catches points that the wrong triangle carries: near the neck, each moves otherwise."""
+    one = person(fine_head, np.zeros(fine_head.model.n_identity))
+    first, last = np.zeros((2, one.model.n_expression + 18))
+    last[-18:-15] = [0.1, 0.5, 0.0]
+    last[-15:-12] = [0.0, -0.5, 0.1]
+    fit = HeadFit(one, np.zeros(0), {0: first, 1: last}, HERE)
+    torso = TorsoTake(fit, fit.parameters, [])
+    meshes = [posed_mesh(fit, own)[one.model.faces[torso.torso]] for own in (first, last)]
+    at, expected = (corners.mean(axis=1) for corners in meshes)
+    found = Carrier(torso, PosedTorso(first), at).carried(PosedTorso(last))(at)
+    away = norm(found - expected, axis=1)
+    assert norm(expected - at, axis=1).max() > 0.02
+    assert np.median(away) < 1e-4
+    assert away.max() < 2e-3
 
 
 @pytest.mark.parametrize(("earlier", "bends"), [(True, True), (False, True), (True, False)])

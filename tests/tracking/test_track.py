@@ -38,7 +38,7 @@ from stga_addon.worker.helpers import Helpers
 
 from .recording import LANDMARKS, SIZE, record, rig, seen_landmarks, write_footage
 from .scenes import write_video
-from .test_fit import frame_at, places_on
+from .test_fit import HERE, frame_at, places_on
 from .test_sequences import write_folders
 
 
@@ -302,8 +302,7 @@ def test_a_camera_at_the_side_is_not_blamed_for_what_landmarks_get_wrong_there(
     used = np.ones(LANDMARKS, bool)
     parameters = {t: np.zeros(head.model.n_expression + RIGID_SIZE) for t in range(3)}
     shape = np.zeros(head.model.n_identity)
-    world = Similarity(1.0, np.eye(3), np.zeros(3))
-    fit = HeadFit(person(head, shape), shape, parameters, world)
+    fit = HeadFit(person(head, shape), shape, parameters, HERE)
     at = places.on(head.model.v_template, head.model.faces)
     cameras = []
     points = []
