@@ -16,6 +16,7 @@ from stga_addon.flame.forward import (
     parameters_gradient,
 )
 from stga_addon.flame.model import read_flame
+from stga_addon.flame.quaternions import to_matrices
 
 from .conftest import random_arrays, random_frame
 
@@ -83,3 +84,12 @@ def test_the_gradient_is_that_of_differences(tiny_flame, frame):
     ]
     found = parameters_gradient(person, replace(frame, dynamic_offset=offset), outer)
     np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-12)
+
+
+def test_matrices_are_those_of_scipy():
+    """Catches a transposed matrix, another order of components, and lengths that scale what is
+    rotated."""
+    quaternions = default_rng(0).normal(size=(4, 5, 4))
+    expected = Rotation.from_quat(np.roll(quaternions, -1, axis=-1).reshape(-1, 4)).as_matrix()
+    np.testing.assert_allclose(to_matrices(quaternions).reshape(-1, 3, 3), expected, atol=1e-12)
+    np.testing.assert_array_equal(to_matrices(np.zeros(4)), np.eye(3))
