@@ -19,6 +19,7 @@ from .gltf import write_gltf
 from .playback import Playback, check_rate
 from .ply import ply_bytes, write_gaussian_avatars, write_ply, write_ply_sequence
 from .rig import RiggedAvatar, rigged_avatar
+from .skinned_gltf import write_skinned_gltf
 from .spz import write_spz
 from .usd import usd_bytes, write_usd
 from .web.page import web_bytes, write_web
@@ -165,10 +166,20 @@ FORMATS: dict[str, Format] = {
     ),
     "web": Format(
         "Web Page",
-        "The frames of the scene as a page that plays them, or as data for a server",
-        (".html", ".stga"),
+        "The frames of the scene as a page that plays them, or as glTF and the player for a server",
+        (".html", ".glb"),
         "range",
         lambda path, item: write_web(path, item.rigged(path), item.playback),
+        lambda item, frames: web_bytes(item.avatar),
+        has_rate=True,
+        has_rig=True,
+    ),
+    "skinned-gltf": Format(
+        "Skinned glTF",
+        "The head with bones, sliders, splats and the frames of the scene; elsewhere a plain mesh",
+        (".glb",),
+        "range",
+        lambda path, item: write_skinned_gltf(path, item.rigged(path), item.playback),
         lambda item, frames: web_bytes(item.avatar),
         has_rate=True,
         has_rig=True,

@@ -11,9 +11,10 @@ import numpy as np
 
 from ..avatar.splats import SH_C0, Splats
 from ..capture.color import srgb_to_linear
-from ..files import replacing
+from ..files import parse_json, replacing
 
 EXTENSION = "KHR_gaussian_splatting"
+GENERATOR = "STGA for Blender"
 _MAGIC = b"glTF"
 _VERSION = 2
 _JSON_CHUNK = b"JSON"
@@ -26,6 +27,9 @@ _COMPONENTS = {
     "uint8": {"componentType": 5121, "normalized": True},
 }
 _TYPES = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
+DTYPES = {5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
+WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4, "MAT4": 16}
+"""Component and element types of accessors."""
 
 
 def write_gltf(path: Path, world: Splats) -> None:
@@ -53,7 +57,7 @@ def write_gltf(path: Path, world: Splats) -> None:
         "extensions": {EXTENSION: splatting},
     }
     document = {
-        "asset": {"version": "2.0", "generator": "STGA for Blender"},
+        "asset": {"version": "2.0", "generator": GENERATOR},
         "extensionsUsed": [EXTENSION],
         "scene": 0,
         "scenes": [{"nodes": [0]}],
@@ -63,7 +67,9 @@ def write_gltf(path: Path, world: Splats) -> None:
         "bufferViews": views,
         "buffers": [{"byteLength": sum(array.nbytes for array in arrays)}],
     }
-    _write_glb(path, document, arrays)
+    binary = b"".join(little_endian(array) for array in arrays)
+    with replacing(path) as partial:
+        partial.write_bytes(glb_bytes(document, binary))
 
 
 def _attributes(world: Splats) -> dict[str, np.ndarray]:
@@ -100,13 +106,33 @@ def _accessors(arrays: Sequence[np.ndarray]) -> tuple[list[dict[str, Any]], list
     return accessors, views
 
 
-def _write_glb(path: Path, document: dict[str, Any], arrays: Sequence[np.ndarray]) -> None:
-    text = json.dumps(document, separators=(",", ":")).encode()
+def glb_bytes(document: dict[str, Any], binary: bytes) -> bytes:
+    """A .glb file of a document and its binary chunk."""
+    text = json.dumps(document, ensure_ascii=False, allow_nan=False, separators=(",", ":")).encode()
     text += b" " * (-len(text) % 4)
-    size = sum(array.nbytes for array in arrays)
-    with replacing(path) as partial, partial.open("wb") as out:
-        out.write(_MAGIC + struct.pack("<II", _VERSION, 12 + 8 + len(text) + 8 + size))
-        out.write(struct.pack("<I", len(text)) + _JSON_CHUNK + text)
-        out.write(struct.pack("<I", size) + _BINARY_CHUNK)
-        for array in arrays:
-            out.write(array.astype(array.dtype.newbyteorder("<"), copy=False).tobytes())
+    binary += bytes(-len(binary) % 4)
+    size = 12 + 8 + len(text) + 8 + len(binary)
+    return b"".join(
+        (
+            _MAGIC + struct.pack("<II", _VERSION, size),
+            struct.pack("<I", len(text)) + _JSON_CHUNK + text,
+            struct.pack("<I", len(binary)) + _BINARY_CHUNK + binary,
+        )
+    )
+
+
+def parse_glb(data: bytes) -> tuple[dict[str, Any], bytes]:
+    """The document and the binary chunk of a .glb file. Raises ValueError where it is none."""
+    magic, version, size, length, kind = struct.unpack_from("<4sIII4s", data)
+    begin = 20 + length
+    if (magic, version, kind) != (_MAGIC, _VERSION, _JSON_CHUNK) or size > len(data):
+        raise ValueError("it is not a whole .glb file")
+    binary_size, kind = struct.unpack_from("<I4s", data, begin)
+    if kind != _BINARY_CHUNK:
+        raise ValueError("it has no binary chunk")
+    return parse_json(data[20:begin]), data[begin + 8 : begin + 8 + binary_size]
+
+
+def little_endian(array: np.ndarray) -> bytes:
+    """The values of an array as glTF stores them."""
+    return array.astype(array.dtype.newbyteorder("<"), copy=False).tobytes()

@@ -39,7 +39,7 @@ def demo_head(tmp_path: Path):
 
 
 def exported(folder: Path, **options) -> tuple[dict, dict[str, np.ndarray]]:
-    path = folder / "anna.stga"
+    path = folder / "anna.glb"
     bpy.ops.stga.export_avatar(filepath=str(path), format="web", **options)
     return read_web_data(path.read_bytes())
 

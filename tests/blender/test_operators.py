@@ -205,8 +205,8 @@ def test_exports(shown, tmp_path):
     with pytest.raises(RuntimeError, match="not tracked with FLAME"):
         bpy.ops.stga.export_avatar(filepath=str(tmp_path / "pair"), format="gaussian-avatars")
     bpy.context.scene.frame_start = 1
-    bpy.ops.stga.export_avatar(filepath=str(tmp_path / "a.stga"), format="web")
-    header, arrays = read_web_data((tmp_path / "a.stga").read_bytes())
+    bpy.ops.stga.export_avatar(filepath=str(tmp_path / "a.glb"), format="web")
+    header, arrays = read_web_data((tmp_path / "a.glb").read_bytes())
     assert len(arrays["translation"]) == 3
     centers = [capture.mesh(timestep).mean(0) for timestep in (1, 3)]
     np.testing.assert_allclose(arrays["translation"][[0, 2]], centers, atol=1e-5)

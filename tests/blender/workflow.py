@@ -16,7 +16,7 @@ from pathlib import Path
 
 import bpy
 
-MODULE = "bl_ext.user_default.stga"
+MODULE = "bl_ext.user_default.glb"
 
 
 def main(archive: str, folder: Path, python: str) -> dict[str, object]:

@@ -167,7 +167,7 @@ def test_export_of_frames(trained, root, tmp_path, capsys):
 def test_a_page_is_called_like_its_run(trained, tmp_path):
     """Catches a folder's name that is cut at a dot, as if it were a file's."""
     run = shutil.copytree(trained, tmp_path / "anna.v2")
-    out = tmp_path / "page.stga"
+    out = tmp_path / "page.glb"
     assert stga("export", run, "--format web --frames 0:0 --out", out) == 0
     assert read_web_data(out.read_bytes())[0]["title"] == "anna.v2"
 
@@ -385,8 +385,8 @@ def test_frames_cameras_and_selection_of_a_capture(tmp_path):
     first = capture.timesteps[1]
     last = capture.timesteps[-1]
     words = f"--format web --capture {capture.root} --frames {first}:{last} --fps 30 --out"
-    assert stga("export", avatar_file, words, tmp_path / "a.stga") == 0
-    header, arrays = read_web_data((tmp_path / "a.stga").read_bytes())
+    assert stga("export", avatar_file, words, tmp_path / "a.glb") == 0
+    header, arrays = read_web_data((tmp_path / "a.glb").read_bytes())
     frames = len(capture.timesteps) - 1
     assert (header["title"], header["fps"]) == ("anna", 30)
     assert len(arrays["pose"]) == len(arrays["selection"]) == frames
@@ -394,8 +394,8 @@ def test_frames_cameras_and_selection_of_a_capture(tmp_path):
     assert {view["name"] for view in header["views"]} == {f"Camera {index}" for index in cameras}
     edit(tmp_path / "capture/transforms_train.json", lambda document: document.update(fps=60))
     words = f"--capture {capture.root} --out"
-    assert stga("export", avatar_file, "--format web", words, tmp_path / "a.stga") == 0
-    assert read_web_data((tmp_path / "a.stga").read_bytes())[0]["fps"] == 60
+    assert stga("export", avatar_file, "--format web", words, tmp_path / "a.glb") == 0
+    assert read_web_data((tmp_path / "a.glb").read_bytes())[0]["fps"] == 60
     assert stga("export", avatar_file, "--format web --out", tmp_path / "a.html") == 0
     text = (tmp_path / "a.html").read_text(encoding="utf-8")
     assert "<title>anna</title>" in text
@@ -410,9 +410,9 @@ def test_what_is_left_of_flame_is_said(tmp_path, capsys):
     root, model = write_flame_capture(tmp_path / "flame")
     avatar = write_avatar_of(open_capture(root, model), tmp_path / "anna.npz", sh_degree=1)
     words = "export", avatar, "--format web --capture", root, "--flame", model
-    assert stga(*words, "--motion-only --out", tmp_path / "a.stga") == 0
+    assert stga(*words, "--motion-only --out", tmp_path / "a.glb") == 0
     said = "Contains the triangles and the posed meshes of a FLAME head: FLAME's licence"
     assert said in capsys.readouterr().out
-    assert stga(*words, "--out", tmp_path / "a.stga") == 0
+    assert stga(*words, "--out", tmp_path / "a.glb") == 0
     said = "--motion-only leaves them out, but not the meshes of the take."
     assert said in capsys.readouterr().out

@@ -122,7 +122,7 @@ def requests_about(case: Path) -> dict[str, ask.Request]:
         ask.Render(
             avatar, case / "asked", cameras=capture / "transforms_val.json", capture=capture
         ),
-        ask.Export(avatar, case / "asked.stga", "web", capture, played=played),
+        ask.Export(avatar, case / "asked.glb", "web", capture, played=played),
         ask.ConvertMotion(case / "take.csv", case / "asked.npz", footage / "head.npz"),
         ask.Select(capture),
         ask.TimePresets(capture),

@@ -86,5 +86,5 @@ def test_what_a_head_cannot_have_played(folder, changes, expected):
     avatar = write_avatar_of(capture, folder / "a.npz")
     played = Played(**{"meshes": {4: capture.neutral}, **changes})
     with refusal(expected):
-        perform(Export(avatar, folder / "page.stga", "web", root, model, played))
-    assert not (folder / "page.stga").exists()
+        perform(Export(avatar, folder / "page.glb", "web", root, model, played))
+    assert not (folder / "page.glb").exists()

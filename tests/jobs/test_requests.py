@@ -260,9 +260,9 @@ def test_a_worker_renders_and_exports_what_the_command_line_would(tmp_path, capt
             f"export {given} --format ply-sequence --frames 1:3 --out",
             Export(avatar, tmp_path / "plys", "ply-sequence", capture, frames=(1, 3)),
         ),
-        "page.stga": (
+        "page.glb": (
             f"export {given} --format web --fps 30 --out",
-            Export(avatar, tmp_path / "page.stga", "web", capture, fps=30.0),
+            Export(avatar, tmp_path / "page.glb", "web", capture, fps=30.0),
         ),
     }
     for name, (words, request) in asked_for.items():

@@ -21,7 +21,7 @@ from stga_addon.avatar.offsets import OFFSETS
 from stga_addon.avatar.splats import Splats
 from stga_addon.export.playback import Playback
 from stga_addon.export.rig import Rig, RiggedAvatar, ShapeControls
-from stga_addon.export.web.data_file import data_file
+from stga_addon.export.skinned_gltf import skinned_glb
 from stga_addon.flame.forward import FlameFrame, frame_of
 from stga_addon.flame.model import read_flame
 from stga_addon.flame.sequence import FlameSequence
@@ -49,7 +49,8 @@ from stga_addon.training.run.metrics_log import append_metrics
 from stga_addon.training.settings import make_settings
 
 DATA = Path(__file__).with_name("data")
-WEB_DATA = "avatar.stga"
+SKINNED = "avatar.glb"
+OLDER_SKINNED = "avatar.stga"
 COUNT = 5
 FACES = np.array([[0, 1, 2], [0, 3, 1], [1, 3, 2], [0, 2, 3]], np.int32)
 NEUTRAL = np.array([[0, 0, 0], [0.25, 0, 0], [0, 0.25, 0], [0, 0, 0.25]], np.float32)
@@ -216,7 +217,7 @@ def make(folder: Path) -> None:
     write_result(request_folder(folder), Written(Path("/runs/anna/avatar.npz"), ("PSNR 30 dB",)))
     (request_folder(folder) / "worker.log").unlink()
     playback = Playback("Anna", 30.0, selection=[np.arange(4) != k for k in range(3)])
-    (folder / WEB_DATA).write_bytes(data_file(rigged(), playback))
+    (folder / SKINNED).write_bytes(skinned_glb(rigged(), playback))
     with tempfile.TemporaryDirectory() as other:
         found = sequence(Path(other) / "model.npz")
         before = np.stack([found.frame(timestep).parameters for timestep in TIMESTEPS])

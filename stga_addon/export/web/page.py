@@ -1,6 +1,7 @@
 """The web page of an avatar as one HTML file, or its data and the player for a server."""
 
 import base64
+import gzip
 import html
 import re
 from functools import cache
@@ -8,13 +9,12 @@ from pathlib import Path
 
 from ...avatar.file import Avatar
 from ...avatar.splats import harmonics_text
-from ...errors import StgaError
 from ...files import replacing_together
 from ...light.shading import SHADING_DEFINES, SHADING_FUNCTIONS
 from ...raster.splat_shader import SPLAT_DEFINES, SPLAT_FUNCTIONS
 from ..playback import Playback
 from ..rig import RiggedAvatar
-from .data_file import data_file
+from ..skinned_gltf import glb_of, in_planes
 
 PLAYER = Path(__file__).parent / "player"
 ELEMENT = "stga-avatar.js"
@@ -28,6 +28,10 @@ TYPES = re.compile(
     re.MULTILINE,
 )
 """Comments that only `make lint-web` reads."""
+NOTES = re.compile(r"^ *//.*\n|^ +", re.MULTILINE)
+"""Comments and indents, which a page is smaller without."""
+HTML_SAFE = str.maketrans("&<>", ",.:")
+"""Of base 85's digits."""
 
 
 @cache
@@ -55,34 +59,33 @@ def _source(name: str) -> str:
 
 
 def page(title: str, notice: str, data: bytes) -> str:
-    """The HTML of a page that plays `data` (`data_file`); `notice`: on its licence, or ""."""
+    """The HTML of a page that plays `data` (`skinned_glb`); `notice`: on its licence, or ""."""
     template = (PLAYER / "page.html").read_text(encoding="utf-8")
+    packed = gzip.compress(in_planes(data), 9, mtime=0)
     parts = {
         "title": html.escape(title),
         "notice": html.escape(notice),
-        "script": f"{element_script()}\n{_source(PAGE)}",
-        "data": base64.b64encode(data).decode("ascii"),
+        "script": NOTES.sub("", f"{element_script()}\n{_source(PAGE)}"),
+        "data": base64.b85encode(packed).decode("ascii").translate(HTML_SAFE),
     }
     return re.sub(r"\{\{(\w+)\}\}", lambda match: parts[match[1]], template)
 
 
+PAGE_BYTES = 700_000
 BYTES_PER_SPLAT = 20
-BYTES_PER_COEFFICIENT = 0.75
-"""About what a splat, and a coefficient of its color, takes in a page."""
+BYTES_PER_COEFFICIENT = 0.45
+"""About what a page takes without splats; a splat; a coefficient of a driven offset."""
 
 
 def write_web(path: Path, rigged: RiggedAvatar, playback: Playback) -> list[Path]:
-    """Write a page that plays the avatar, or an .stga data file with the player beside it; returns
+    """Write a page that plays the avatar, or an .glb file with the player beside it; returns
     the files.
 
     Raises StgaError where a value cannot be stored, or a file not be written.
     """
-    try:
-        data = data_file(rigged, playback)
-    except ValueError as error:
-        raise StgaError(f"{path}: the avatar cannot be exported ({error})") from error
+    data = glb_of(path, rigged, playback)
     contents = {path: page(playback.title, rigged.notice, data).encode("utf-8")}
-    if path.suffix.lower() == ".stga":
+    if path.suffix.lower() == ".glb":
         contents = {path: data, path.with_name(ELEMENT): element_script().encode("utf-8")}
     with replacing_together() as new_file:
         for file, content in contents.items():
@@ -93,6 +96,6 @@ def write_web(path: Path, rigged: RiggedAvatar, playback: Playback) -> list[Path
 
 def web_bytes(avatar: Avatar) -> int:
     """About the size of a page of the avatar."""
-    splats = avatar.splats
-    coefficients = splats.sh.size + sum(each.size for each in avatar.driven_offsets.values())
-    return round(BYTES_PER_SPLAT * len(splats) + BYTES_PER_COEFFICIENT * coefficients)
+    coefficients = sum(each.size for each in avatar.driven_offsets.values())
+    size = PAGE_BYTES + BYTES_PER_SPLAT * len(avatar.splats)
+    return round(size + BYTES_PER_COEFFICIENT * coefficients)

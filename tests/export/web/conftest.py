@@ -16,7 +16,7 @@ from stga_addon.avatar.strain import seen_range, strain_basis
 from stga_addon.capture.camera import Camera, look_at
 from stga_addon.export.playback import Playback
 from stga_addon.export.rig import Rig, RiggedAvatar, flame_rig
-from stga_addon.export.web.data_file import data_file
+from stga_addon.export.skinned_gltf import skinned_glb
 from stga_addon.export.web.page import page
 from stga_addon.flame.forward import FlameFrame
 from stga_addon.flame.sequence import FlameSequence, neutral_mesh, sequence_mesh
@@ -62,7 +62,7 @@ class Head:
     def data(self, rig=None, exact=False, controls=None):
         playback = Playback("Zoë", 2.0, {"front": self.camera}, selection=self.selection)
         rigged = RiggedAvatar(self.avatar, rig or self.rig, controls)
-        return data_file(rigged, playback, exact)
+        return skinned_glb(rigged, playback, exact)
 
     @property
     def selection(self) -> list[np.ndarray]:

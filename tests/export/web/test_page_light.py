@@ -12,7 +12,7 @@ from stga_addon.avatar.file import Avatar, AvatarLight
 from stga_addon.avatar.splats import Splats
 from stga_addon.export.playback import Playback
 from stga_addon.export.rig import RiggedAvatar
-from stga_addon.export.web.data_file import data_file
+from stga_addon.export.skinned_gltf import skinned_glb
 from stga_addon.light.harmonics import rotated, uniform
 from stga_addon.light.relight import Relighter
 from stga_addon.light.surface import Bounce, transfer_of
@@ -161,7 +161,7 @@ def test_environments_stand_upright_and_turn(up, browser, tmp_path):
     """Catches an environment that lies on its side, or whose light and sun turn apart."""
     head = lit_head()
     playback = Playback(title="Zoë", fps=2.0, views={"front": head.camera}, up=up)
-    show(browser, tmp_path, data_file(RiggedAvatar(head.avatar, head.rig), playback))
+    show(browser, tmp_path, skinned_glb(RiggedAvatar(head.avatar, head.rig), playback))
     found = []
     for turn in (0.0, np.pi / 2):
         set_lighting(browser, f"{{ environment: 'sunset', turn: {turn} }}")

@@ -354,7 +354,7 @@ def test_the_documented_embedding_works(browser, head, tmp_path, server):
     something else."""
     site = tmp_path / "site"
     playback = Playback(title="Anna")
-    export_avatar(site / "anna.stga", head.avatar, "web", (), head.sequence, playback)
+    export_avatar(site / "anna.glb", head.avatar, "web", (), head.sequence, playback)
     text = (ROOT / "docs/web.md").read_text(encoding="utf-8")
     markup, script = (re.search(rf"```{k}\n(.*?)```", text, re.DOTALL)[1] for k in ("html", "js"))
     own = '<!doctype html><meta charset="utf-8"><link rel="icon" href="data:,"><h1>Our team</h1>'
@@ -375,7 +375,7 @@ def test_the_documented_embedding_works(browser, head, tmp_path, server):
     assert (found["height"], found["loop"], found["background"]) == (480, True, "#202020")
     assert found["expression"] == pytest.approx(0.8)
     assert found["jaw"] == pytest.approx(0.2)
-    assert browser.requests == [f"{server}/{name}" for name in ("index.html", ELEMENT, "anna.stga")]
+    assert browser.requests == [f"{server}/{name}" for name in ("index.html", ELEMENT, "anna.glb")]
     assert browser.errors == []
 
 

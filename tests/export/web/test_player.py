@@ -5,6 +5,7 @@ import gzip
 import itertools
 import json
 import operator
+import struct
 import subprocess
 from collections import Counter
 from dataclasses import replace
@@ -21,10 +22,11 @@ from stga_addon.avatar.offsets import COLOR, OFFSETS
 from stga_addon.avatar.strain import at_rest, trained_range
 from stga_addon.export.playback import Playback
 from stga_addon.export.rig import RiggedAvatar, baked_rig
-from stga_addon.export.web.data_file import data_file
+from stga_addon.export.skinned_gltf import skinned_glb
 from stga_addon.export.web.page import PLAYER
 
 from .conftest import make_head
+from .web_data import document_of
 
 pytestmark = pytest.mark.needs("node")
 
@@ -33,9 +35,9 @@ COLORS = {name for name, offset in OFFSETS.items() if offset.target == COLOR}
 
 def evaluated(data: bytes, folder: Path) -> dict[str, Any]:
     """What evaluate.mjs makes of a data file."""
-    (folder / "a.stga").write_bytes(data)
+    (folder / "a.glb").write_bytes(data)
     script = Path(__file__).with_name("evaluate.mjs")
-    command = ["node", script, PLAYER, folder / "a.stga"]
+    command = ["node", script, PLAYER, folder / "a.glb"]
     done = subprocess.run(command, capture_output=True, timeout=120)
     assert not done.stderr, done.stderr.decode()
     return dict(json.loads(done.stdout))
@@ -69,7 +71,7 @@ def test_a_head_at_rest_stays_where_it_is(tmp_path):
         neutral = head.avatar.neutral
         faces = head.avatar.faces
         avatar = replace(head.avatar, strain_range=trained_range(len(faces)))
-        data = data_file(RiggedAvatar(avatar, baked_rig([neutral])), Playback(), exact=True)
+        data = skinned_glb(RiggedAvatar(avatar, baked_rig([neutral])), Playback(), exact=True)
         [result] = evaluated(data, tmp_path)["results"]
         assert np.abs(colors(result)).max() < 1e-5
         assert np.abs(np.reshape(result["vertices"], (-1, 3)) - neutral).max() < 1e-6
@@ -122,7 +124,7 @@ def test_smoothed_strain_where_edges_have_any_number_of_triangles(tmp_path):
     avatar = replace(avatar, driven_offsets=driven)
     meshes = [neutral, neutral * [0.9, 1.0, 1.1], neutral + rng.normal(0, 0.01, neutral.shape)]
     meshes.append(0 * neutral)
-    data = data_file(RiggedAvatar(avatar, baked_rig(meshes)), Playback(), exact=True)
+    data = skinned_glb(RiggedAvatar(avatar, baked_rig(meshes)), Playback(), exact=True)
     edges = [Counter(frozenset((face[k - 1], face[k])) for k in range(3)) for face in faces]
     pairs = itertools.product(edges, repeat=2)
     weight = [sum(n * other[edge] for edge, n in own.items()) for own, other in pairs]
@@ -140,14 +142,17 @@ def test_smoothed_strain_where_edges_have_any_number_of_triangles(tmp_path):
         assert np.abs(colors(result)[0] - frames.color).max() < 1e-5
 
 
-def with_header(raw: bytes, *keys: str | int, value: Any) -> bytes:
-    """An inflated data file with one value of its header replaced."""
-    length = int.from_bytes(raw[8:12], "little")
-    header = json.loads(raw[12 : 12 + length])
+def with_header(whole: bytes, *keys: str | int, value: Any) -> bytes:
+    """A .glb file with one value of its document, or of the header of the splats, replaced."""
+    document, binary = document_of(whole)
+    root = document if keys[0] in document else document["extras"]["stga_splats"]
     *outer, last = keys
-    functools.reduce(operator.getitem, outer, header)[last] = value
-    text = json.dumps(header).replace("Infinity", "1e999").encode()
-    return raw[:8] + len(text).to_bytes(4, "little") + text + raw[12 + length :]
+    functools.reduce(operator.getitem, outer, root)[last] = value
+    text = json.dumps(document).replace("Infinity", "1e999").encode()
+    text += b" " * (-len(text) % 4)
+    sizes = 28 + len(text) + len(binary), len(text), len(binary)
+    begin = struct.pack("<4sIII4s", b"glTF", 2, *sizes[:2], b"JSON")
+    return begin + text + struct.pack("<I4s", sizes[2], b"BIN\0") + binary
 
 
 LIGHT = {"damping": 0.5, "recorded": [1] * 27, "typical": [1] * 3}
@@ -158,25 +163,27 @@ def test_damaged_files_are_refused_in_one_sentence(head, tmp_path):
     a later version."""
     whole = head.data()
     packed = functools.partial(gzip.compress, compresslevel=1)
-    raw = gzip.decompress(whole)
     altered = [
-        (whole[: len(whole) // 2], "is damaged."),
+        (whole[: len(whole) // 2], "is cut off."),
         (b"PK" + whole, "not an avatar data file."),
-        (packed(raw[:-5]), "is cut off."),
-        (packed(raw[:4] + b"\x09" + raw[5:]), "format version 9"),
-        (packed(raw[:8] + b"\xff\xff\xff\x7f" + raw[12:]), "is cut off."),
+        (packed(whole)[:-999], "is damaged."),
+        (with_header(whole, "version", value=9), "format version 9"),
+        (with_header(whole, "byteLength", value=99), "is damaged."),
+        (whole[:12] + b"\xff\xff\xff\x7f" + whole[16:], "document is missing or malformed."),
     ]
     for field, *keys, value in [
         ("sliders", "sliders", 0, "component", 0.5),
         ("sliders", "sliders", 0, "component", 10**6),
         ("sliders", "sliders", 0, "reach", float("inf")),
         ("sliders", "sliders", 0, None),
-        ("joints", "joints", 0, None),
+        ("joints", "nodes", 0, "name", None),
+        ("mesh", "meshes", []),
+        ("mesh", "accessors", 0, "count", 10**9),
+        ("document", "buffers", 0, "byteLength", 10**9),
         ("views", "views", 0, "size", [0.5, 120]),
         ("views", "views", 0, "size", [1e300, 120]),
         ("views", "views", 0, "focal", "12"),
-        ("parents", "parents", 1, 0.5),
-        ("parents", "parents", 0, 77),
+        ("parents", "nodes", 4, "children", [0]),
         ("fps", "fps", 1e300),
         ("fps", "fps", -20),
         ("fps", "fps", True),
@@ -190,7 +197,7 @@ def test_damaged_files_are_refused_in_one_sentence(head, tmp_path):
         ("xyz.planes", "arrays", "xyz", "planes", 9),
     ]:
         sentence = f"damaged: {field} is missing or malformed."
-        altered.append((packed(with_header(raw, *keys, value=value)), sentence))
+        altered.append((with_header(whole, *keys, value=value), sentence))
     for data, sentence in altered:
         error = evaluated(data, tmp_path).get("error", "")
         assert error.startswith("DataError: ")

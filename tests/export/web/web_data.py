@@ -1,4 +1,5 @@
-"""An independent reader of web data files, written from docs/formats.md."""
+"""An independent reader of skinned splats, written from docs/skinned-splats.md, and of the data
+files of version 0.2.0."""
 
 import gzip
 import json
@@ -11,33 +12,131 @@ from scipy.spatial.transform import Rotation
 
 from stga_addon.avatar.splats import Splats
 
+COMPONENTS = {5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
+WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4, "MAT4": 16}
+
 
 def read_web_data(data: bytes) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """Header and arrays (float32 or int64) of a data file."""
-    raw = gzip.decompress(data)
-    magic, version, length = struct.unpack_from("<4sII", raw)
-    assert magic == b"STGA"
-    assert version == 4
-    header = json.loads(raw[12 : 12 + length])
-    at = 12 + length
+    """Header and arrays (floats or int64) of a .glb or an older data file."""
+    if data[:4] != b"glTF":
+        raw = gzip.decompress(data)
+        magic, version, length = struct.unpack_from("<4sII", raw)
+        assert (magic, version) == (b"STGA", 4)
+        header = json.loads(raw[12 : 12 + length])
+        return header, planes(header["arrays"], raw[12 + length :])
+    document, binary = document_of(data)
+    splats = document["extras"]["stga_splats"]
+    assert splats["version"] == 1
+    packed = binary[splats["byteOffset"] :][: splats["byteLength"]]
+    nodes = [document["nodes"][joint] for joint in document["skins"][0]["joints"]]
+    children = [node.get("children", []) for node in nodes]
+    parents = [
+        next((n for n, own in enumerate(children) if joint in own), -1)
+        for joint in document["skins"][0]["joints"]
+    ]
+    header = {**splats, "joints": [node["name"] for node in nodes], "parents": parents}
+    arrays = skin(document, binary) | planes(splats["arrays"], gzip.decompress(packed))
+    arrays.setdefault("neutral", arrays["base"])
+    features = 9 * (len(nodes) - 1)
+    arrays.setdefault("correctives", np.zeros((features, *arrays["base"].shape)))
+    return header, arrays
+
+
+def document_of(data: bytes) -> tuple[dict[str, Any], bytes]:
+    """Document and binary chunk of a .glb."""
+    magic, version, length, size, kind = struct.unpack_from("<4sIII4s", data)
+    assert (magic, version, length, kind) == (b"glTF", 2, len(data), b"JSON")
+    return json.loads(data[20 : 20 + size]), data[28 + size :]
+
+
+def accessor(document: dict[str, Any], binary: bytes, index: int) -> np.ndarray:
+    """Values of an accessor (count, width)."""
+
+    def block(kind: int, count: int, width: int, view: int, offset: int = 0) -> np.ndarray:
+        at = document["bufferViews"][view]["byteOffset"] + offset
+        flat = np.frombuffer(binary, COMPONENTS[kind], count * width, at)
+        return flat.reshape(count, width)
+
+    entry = document["accessors"][index]
+    kind = entry["componentType"]
+    width = WIDTHS[entry["type"]]
+    values = np.zeros((entry["count"], width), COMPONENTS[kind])
+    if "bufferView" in entry:
+        values = block(kind, entry["count"], width, entry["bufferView"])
+    if sparse := entry.get("sparse"):
+        places = sparse["indices"]
+        count = sparse["count"]
+        moved = block(places["componentType"], count, 1, places["bufferView"], places["byteOffset"])
+        place = sparse["values"]
+        values[moved[:, 0]] = block(kind, count, width, place["bufferView"], place["byteOffset"])
+    if entry.get("normalized"):
+        return values / float(np.iinfo(values.dtype).max)
+    return values
+
+
+def skin(document: dict[str, Any], binary: bytes) -> dict[str, np.ndarray]:
+    """Mesh, rig and motion of the standard part, in meters and radians."""
+    [owner] = document["skins"]
+    primitive = document["meshes"][0]["primitives"][0]
+    attributes = primitive["attributes"]
+    bind = accessor(document, binary, owner["inverseBindMatrices"]).reshape(-1, 4, 4)
+    unit = float(bind[0, 0, 0])
+    base = unit * accessor(document, binary, attributes["POSITION"])
+    targets = [target["POSITION"] for target in primitive.get("targets", [])]
+    basis = [unit * accessor(document, binary, target) for target in targets]
+    weights = np.zeros((len(base), len(bind)))
+    for number in range(len([name for name in attributes if name.startswith("JOINTS")])):
+        joints = accessor(document, binary, attributes[f"JOINTS_{number}"])
+        shares = accessor(document, binary, attributes[f"WEIGHTS_{number}"])
+        for column in range(4):
+            np.add.at(weights, (np.arange(len(base)), joints[:, column]), shares[:, column])
+    rest = -bind[:, 3, :3]
+    [motion] = document["animations"]
+    found: dict[Any, np.ndarray] = {}
+    for channel in motion["channels"]:
+        target = channel["target"]
+        output = motion["samplers"][channel["sampler"]]["output"]
+        found[target["path"], target["node"]] = accessor(document, binary, output)
+    turns = [found["rotation", joint] for joint in owner["joints"]]
+    weighted = [values for (path, _), values in found.items() if path == "weights"]
+    frames = len(turns[0])
+    return {
+        "base": base,
+        "basis": np.reshape(basis, (-1, *base.shape)),
+        "faces": accessor(document, binary, primitive["indices"]).reshape(-1, 3).astype(int),
+        "weights": weights,
+        "joint_rest": rest,
+        "pose": np.stack([Rotation.from_quat(turn).as_rotvec() for turn in turns], axis=1),
+        "translation": found["translation", owner["joints"][0]] - rest[0],
+        "coefficients": weighted[0].reshape(frames, -1) if weighted else np.zeros((frames, 0)),
+    }
+
+
+def planes(entries: dict[str, Any], raw: bytes) -> dict[str, np.ndarray]:
+    """Arrays of a header's entries, which lie one after the other."""
+    at = 0
     arrays = {}
-    for name, entry in header["arrays"].items():
+    for name, entry in entries.items():
         shape = entry["shape"]
         count = int(np.prod(entry["shape"]))
         if entry["type"] == "float32":
             arrays[name] = np.frombuffer(raw, "<f4", count, at).reshape(shape)
             at += 4 * count
             continue
-        planes = np.frombuffer(raw, np.uint8, entry["planes"] * count, at).astype(np.int64)
-        at += planes.size
+        bytes_of = np.frombuffer(raw, np.uint8, entry["planes"] * count, at).astype(np.int64)
+        at += bytes_of.size
         factors = 256 ** np.arange(entry["planes"])
-        integers = factors @ planes.reshape(entry["planes"], count) + entry["low"]
+        integers = factors @ bytes_of.reshape(entry["planes"], count) + entry["low"]
         integers = np.moveaxis(np.reshape(integers, [*shape[-1:], *shape[:-1]]), 0, -1)
         arrays[name] = integers
         if entry["type"] == "fixed":
             arrays[name] = (integers * entry["step"]).astype(np.float32)
     assert at == len(raw)
-    return header, arrays
+    for name in [name for name in arrays if name.endswith("_axes")]:
+        axes = arrays.pop(name)
+        own = name.removesuffix("_axes")
+        arrays[own] = arrays[own] @ axes.T
+    return arrays
 
 
 def splats_of(arrays: dict[str, np.ndarray]) -> Splats:

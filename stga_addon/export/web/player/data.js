@@ -1,40 +1,85 @@
 // @ts-check
-// Reading of web data files: container, arrays, and checks of everything that the player relies on.
+// Reading of skinned splats, and checks of everything that the player relies on.
 
 /** @import { Data, DataArray, Values } from './types.js' */
 
 import { SIGNALS, TARGETS } from './face_frames.js';
+import { bytesOf, parseGlb, readSkin } from './glb.js';
 
 export class DataError extends Error {}
 
-const VERSION = 4;
+const VERSION = 4; // of data files of STGA for Blender 0.2
+const SPLATS_VERSION = 1; // of skinned splats in glTF
 const MAX_VIEW_SIZE = 1 << 16; // pixels
 
-// Parse a data file (Uint8Array, gzipped): { header, arrays }. Throws DataError in one sentence.
+// Parse skinned splats (Uint8Array): a .glb file, or one of those or an older data file gzipped:
+// { header, arrays }. Throws DataError in one sentence.
 /** @type {(bytes: Uint8Array<ArrayBuffer>) => Promise<Data>} */
 export async function readData(bytes) {
-  if (bytes[0] !== 0x1f || bytes[1] !== 0x8b)
-    throw new DataError('This is not an avatar data file.');
-  const inflated = new Blob([bytes]).stream().pipeThrough(new DecompressionStream('gzip'));
-  const buffer = await new Response(inflated).arrayBuffer().catch(() => {
+  const raw = bytes[0] === 0x1f && bytes[1] === 0x8b ? await inflated(bytes) : bytes;
+  const view = new DataView(raw.buffer, raw.byteOffset, raw.byteLength);
+  const magic = raw.length < 20 ? 0 : view.getUint32(0, false);
+  if (magic === 0x53544741 && raw !== bytes) return readOlder(raw, view);
+  if (magic !== 0x676c5446) throw new DataError('This is not an avatar data file.');
+  if (view.getUint32(8, true) > raw.length) throw new DataError('The avatar data is cut off.');
+  const { document, binary } = understood('document', () => parseGlb(raw));
+  const splats = document.extras.stga_splats;
+  checkVersion(splats.version, SPLATS_VERSION);
+  const packed = understood('byteLength', () => bytesOf(binary, splats));
+  const skin = understood('mesh', () => readSkin(document, binary));
+  const header = { ...splats, joints: skin.joints, parents: skin.parents };
+  const stored = readArrays(header, await inflated(packed));
+  const arrays = { ...skin.arrays, ...stored };
+  const joints = header.parents.length;
+  const [vertices] = arrays.base.shape;
+  arrays.neutral ??= arrays.base;
+  const features = 9 * (joints - 1);
+  arrays.correctives ??= {
+    shape: [features, vertices, 3],
+    values: new Float32Array(3 * features * vertices),
+  };
+  checkData(header, arrays);
+  return { header, arrays };
+}
+
+/** @type {(bytes: Uint8Array<ArrayBuffer>) => Promise<Uint8Array<ArrayBuffer>>} */
+async function inflated(bytes) {
+  const stream = new Blob([bytes]).stream().pipeThrough(new DecompressionStream('gzip'));
+  const buffer = await new Response(stream).arrayBuffer().catch(() => {
     throw new DataError('The avatar data is damaged.');
   });
-  const [raw, view] = [new Uint8Array(buffer), new DataView(buffer)];
-  if (raw.length < 12 || view.getUint32(0, false) !== 0x53544741)
-    throw new DataError('This is not an avatar data file.');
-  const version = view.getUint32(4, true);
-  if (version !== VERSION)
-    throw new DataError(`The avatar has format version ${version}; this player reads ${VERSION}.`);
+  return new Uint8Array(buffer);
+}
+
+// A data file of STGA for Blender 0.2.
+/** @type {(raw: Uint8Array<ArrayBuffer>, view: DataView) => Data} */
+function readOlder(raw, view) {
+  checkVersion(view.getUint32(4, true), VERSION);
   const end = 12 + view.getUint32(8, true);
   if (end > raw.length) throw new DataError('The avatar data is cut off.');
-  let header;
-  try {
-    header = JSON.parse(new TextDecoder('utf-8', { fatal: true }).decode(raw.subarray(12, end)));
-  } catch {} // reported below
+  const header = understood('header', () =>
+    JSON.parse(new TextDecoder('utf-8', { fatal: true }).decode(raw.subarray(12, end))),
+  );
   require(header instanceof Object, 'header');
   const arrays = readArrays(header, raw.subarray(end));
   checkData(header, arrays);
   return { header, arrays };
+}
+
+/** @type {(found: unknown, known: number) => void} */
+function checkVersion(found, known) {
+  if (found !== known)
+    throw new DataError(`The avatar has format version ${found}; this player reads ${known}.`);
+}
+
+// What `read` returns; throws DataError where it throws.
+/** @type {<T>(field: string, read: () => T) => T} */
+function understood(field, read) {
+  try {
+    return read();
+  } catch {
+    throw new DataError(`The avatar data is damaged: ${field} is missing or malformed.`);
+  }
 }
 
 /** @type {(header: any, payload: Uint8Array) => Record<string, DataArray>} */
@@ -54,7 +99,27 @@ function readArrays(header, payload) {
     arrays[name] = { shape, values: decoded(name, entry, block, count) };
     at += planes * count;
   }
+  for (const [name, axes] of Object.entries(arrays)) {
+    const along = arrays[name.replace(/_axes$/, '')];
+    if (along !== axes) turn(along, axes);
+  }
   return arrays;
+}
+
+// Rows of an array from what they are along axes (n, n), columns, in place.
+/** @type {(array: DataArray, axes: DataArray) => void} */
+function turn(array, axes) {
+  const width = array?.shape[1];
+  require(width && axes.shape.join() === [width, width].join(), 'axes');
+  const row = new Float32Array(width);
+  for (let at = 0; at < array.values.length; at += width) {
+    row.set(array.values.subarray(at, at + width));
+    for (let k = 0; k < width; k++) {
+      let sum = 0;
+      for (let n = 0; n < width; n++) sum += axes.values[width * k + n] * row[n];
+      array.values[at + k] = sum;
+    }
+  }
 }
 
 /** @type {(name: string, entry: any, block: Uint8Array, count: number) => Values} */

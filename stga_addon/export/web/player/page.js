@@ -508,15 +508,23 @@ avatar.addEventListener('error', () => {
   for (const id of ['heading', 'transport', 'panel', 'open']) byId(id).hidden = true;
 });
 
-// The data file that the page holds as base64. Throws DataError where it was cut off or altered.
+const BASE_85 =
+  '0123456789ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz!#$%,()*+-;.=:?@^_`{|}~';
+
+// The data that the page holds in base 85. Throws DataError where it was cut off or altered.
 async function embeddedData() {
   const text = document.querySelector('#data')?.textContent?.trim();
   if (!text) throw new DataError('This page holds no avatar data.');
-  try {
-    return Uint8Array.from(atob(text), character => character.charCodeAt(0));
-  } catch {
-    throw new DataError('The avatar data is damaged.');
+  const values = new Map(Array.from(BASE_85, (digit, value) => [digit.charCodeAt(0), value]));
+  const words = new DataView(new ArrayBuffer(4 * Math.ceil(text.length / 5)));
+  for (let at = 0; at < text.length; at += 5) {
+    let word = 0;
+    for (let k = at; k < at + 5; k++)
+      word = 85 * word + (k < text.length ? (values.get(text.charCodeAt(k)) ?? NaN) : 84);
+    if (!(word < 2 ** 32)) throw new DataError('The avatar data is damaged.');
+    words.setUint32((at / 5) * 4, word);
   }
+  return words.buffer.slice(0, Math.floor((text.length * 4) / 5));
 }
 
 avatar.load(embeddedData()).catch(console.error);

@@ -1,5 +1,5 @@
 // @ts-check
-// <stga-avatar src="anna.stga" autoplay loop>: an animated head avatar as an HTML element
+// <stga-avatar src="anna.glb" autoplay loop>: an animated head avatar as an HTML element
 // (docs/web.md).
 
 /** @import { Camera, Color, Data, Lighting } from './types.js' */

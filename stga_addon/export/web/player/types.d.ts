@@ -7,6 +7,7 @@ export type Vector = [number, number, number];
 export interface Values extends ArrayLike<number>, Iterable<number> {
   subarray(begin?: number, end?: number): Values;
   every(test: (value: number) => boolean): boolean;
+  [index: number]: number;
   reduce(add: (sum: number, value: number) => number, start: number): number;
 }
 

@@ -1,48 +1,69 @@
-"""Web data files: a rigged avatar, how it plays, and cameras (docs/formats.md)."""
+"""Skinned splats: a rigged avatar as glTF, a skinned and morphing mesh with the splats that are
+bound to its triangles (docs/skinned-splats.md)."""
 
 import gzip
-import json
-import struct
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from ...avatar.embedding import face_frames
-from ...avatar.file import Avatar
-from ...avatar.offsets import OFFSETS, POSITION
-from ...avatar.splats import Splats
-from ...light.relight import Relighter
-from ..playback import Playback
-from ..rig import Rig, RiggedAvatar, ShapeControls
-from ..spz import smallest_three
+from ..avatar.embedding import face_frames
+from ..avatar.file import Avatar
+from ..avatar.offsets import OFFSETS, POSITION
+from ..avatar.splats import Splats
+from ..errors import StgaError
+from ..files import replacing
+from ..light.relight import Relighter
+from .gltf import DTYPES, GENERATOR, WIDTHS, glb_bytes, parse_glb
+from .playback import Playback
+from .rig import Rig, RiggedAvatar, ShapeControls
+from .skinned_mesh import BASE_STEP_M, SHAPE_STEP_M, skinned_mesh
+from .spz import smallest_three
 
-MAGIC = b"STGA"
-FORMAT = "stga-web"
-VERSION = 4
+EXTRA = "stga_splats"
+"""Key of the splats in the document's `extras`."""
+VERSION = 1
 MAX_PLANES = 4
 MAX_STEPS = 1 << 31
 """Largest number of steps from zero: what four planes hold."""
-GZIP_LEVEL = 7
-"""Level 9 takes six times as long and makes the demo's page half a percent smaller."""
+GZIP_LEVEL = 9
+AXES = "_axes"
+"""Suffix of the axes (n, n), columns, along which rows of an array of n numbers are stored."""
+TURNED = ("color", "sh", "strain_color", "normal_color")
+"""Arrays that are stored along their principal axes: red, green and blue go together, and what the
+eye does not see becomes zeros."""
+MIN_OPACITY = 1 / 255
+"""Of splats that any renderer draws."""
 
 
 def pack(
-    header: Mapping[str, Any], arrays: Mapping[str, np.ndarray], steps: Mapping[str, float]
-) -> bytes:
-    """A data file: `header` and `arrays`, by their names in fixed point as multiples of a step,
-    with an error of at most half of it.
+    arrays: Mapping[str, np.ndarray], steps: Mapping[str, float]
+) -> tuple[dict[str, Any], bytes]:
+    """Entries of arrays in the header, and their values compressed: by their names in fixed point
+    as multiples of a step, with an error of at most half of it (along the axes of TURNED).
 
     Other integers are stored exactly, others in float32. Equal contents give equal bytes. Raises
     ValueError where a value is not finite, or too many steps from zero.
     """
-    packed = {name: _entry(name, array, steps.get(name)) for name, array in arrays.items()}
-    entries = {name: entry for name, (entry, _) in packed.items()}
-    complete = {"format": FORMAT, "version": VERSION, **header, "arrays": entries}
-    text = json.dumps(complete, ensure_ascii=False, allow_nan=False).encode("utf-8")
-    begin = MAGIC + struct.pack("<II", VERSION, len(text))
-    raw = b"".join((begin, text, *(block for _, block in packed.values())))
-    return gzip.compress(raw, GZIP_LEVEL, mtime=0)
+    entries = dict[str, Any]()
+    blocks = list[bytes]()
+    for name, array in _turned(arrays, steps).items():
+        entries[name], block = _entry(name, array, steps.get(name))
+        blocks.append(block)
+    return entries, gzip.compress(b"".join(blocks), GZIP_LEVEL, mtime=0)
+
+
+def _turned(arrays: Mapping[str, np.ndarray], steps: Mapping[str, float]) -> dict[str, np.ndarray]:
+    """The arrays, those of TURNED along axes that follow them."""
+    turned = dict(arrays)
+    for name in TURNED:
+        if name in arrays and name in steps and np.isfinite(arrays[name]).all():
+            rows = np.asarray(arrays[name], np.float64)
+            axes = np.linalg.eigh(rows.T @ rows)[1][:, ::-1].astype(np.float32)
+            turned[name] = rows @ axes
+            turned[name + AXES] = axes
+    return turned
 
 
 def _entry(name: str, array: np.ndarray, step: float | None) -> tuple[dict[str, Any], bytes]:
@@ -75,38 +96,33 @@ def _entry(name: str, array: np.ndarray, step: float | None) -> tuple[dict[str, 
     return entry, b"".join(np.moveaxis(plane, -1, 0).tobytes() for plane in planes)
 
 
-POSITION_STEP_M = 4e-6
-MOVED_STEP_M = 0.25e-6
+POSITION_STEP_M = 2.5e-5
+MOVED_STEP_M = 4e-5
 """Of splats, and of how far a driven offset moves them with a unit of its signal."""
-OFFSET_STEP = 2.0**-12
-"""Of other driven offsets. Signals are at most 2 in each of three components: half a step of each
-changes a color by 0.19 / 255, a size by 0.07 %, and moves a splat by 0.75 µm along an axis."""
+OFFSET_STEP = 2.0**-7
+"""Of other driven offsets."""
 PLAYER_SIGNALS = ("smoothed_strain", "normal")
 """Those of `face_frames.js`."""
 STEPS = {
-    # The three smaller parts of a unit quaternion lie within ±0.7071: ten bits each.
-    "rotation": 1 / 724,
-    "log_scale": 0.015,
+    # The three smaller parts of a unit quaternion lie within ±0.7071.
+    "rotation": 1 / 128,
+    "log_scale": 0.06,
     "opacity": 1 / 255,
     # Of the constant SH coefficient, which a color has 0.28 times.
-    "color": 0.004,
-    "sh": 0.005,
-    # Of the ends of a triangle's range: positions that follow strain by 2 mm err by 2 µm.
-    "strain_range": 0.002,
-    # Meters, so fine that no thin triangle becomes a line, or the reverse.
-    "base": 2.0**-24,
-    "neutral": 2.0**-24,
-    "basis": 2e-6,
-    "correctives": 2e-6,
-    "weights": 1 / 65535,
+    "color": 0.02,
+    "sh": 0.03,
+    # Of the ends of a triangle's range.
+    "strain_range": 0.03,
+    "neutral": BASE_STEP_M,
+    "correctives": SHAPE_STEP_M,
     # Of irradiance over radiance, which is at most π.
-    "light_transfer": 2.0**-12,
+    "light_transfer": 2.0**-8,
     "light_occlusion": 1 / 255,
     "light_roughness": 1 / 255,
 }
-"""Array -> step of its fixed-point values: half of one is the largest error. With POSITION_STEP_M
-they leave a picture of large random splats 55 dB PSNR at least (tests/export/web/test_page.py)."""
-IRRADIANCE_STEPS = 65535
+"""Array -> step of its fixed-point values: half of one is the largest error. Of the demo's head,
+each by itself leaves a picture 52 dB PSNR or more."""
+IRRADIANCE_STEPS = 1023
 """Steps to the largest irradiance of the capture, whose level is any."""
 
 MIN_SLIDER_RANGE = 1.0
@@ -114,39 +130,50 @@ SLIDER_HEADROOM = 1.5
 """Sliders reach beyond the motion by this factor, and to ±1 at least."""
 
 
-MOVING = (
-    "base",
-    "basis",
-    "correctives",
-    "weights",
-    "joint_rest",
-    "joint_basis",
-    "coefficients",
-    "pose",
-    "translation",
-)
-"""Arrays of the rig."""
-
-
-def data_file(rigged: RiggedAvatar, playback: Playback, exact: bool = False) -> bytes:
-    """The data file of an avatar; `exact`: float32 instead of fixed point.
+def skinned_glb(rigged: RiggedAvatar, playback: Playback, exact: bool = False) -> bytes:
+    """The .glb file of an avatar; `exact`: float32 instead of fixed point.
 
     Raises ValueError where a value is not finite, or the player lacks a driven offset.
     """
+    header, arrays, steps = _splat_data(rigged, playback)
+    entries, packed = pack(arrays, {} if exact else steps)
+    document, accessors = skinned_mesh(rigged.rig, rigged.avatar.faces, playback.fps, exact)
+    copyright = {"copyright": rigged.notice} if rigged.notice else {}
+    mesh_bytes = accessors.binary
+    place = {"byteOffset": len(mesh_bytes), "byteLength": len(packed)}
+    binary = mesh_bytes + packed
+    document |= {
+        "asset": {"version": "2.0", "generator": GENERATOR} | copyright,
+        "accessors": accessors.accessors,
+        "bufferViews": accessors.views,
+        "buffers": [{"byteLength": len(binary)}],
+        "extras": {EXTRA: {"version": VERSION, **header, **place, "arrays": entries}},
+    }
+    return glb_bytes(document, binary)
+
+
+def _splat_data(
+    rigged: RiggedAvatar, playback: Playback
+) -> tuple[dict[str, Any], dict[str, np.ndarray], dict[str, float]]:
+    """Header, arrays and the steps of these."""
     avatar = rigged.avatar
     rig = rigged.rig
     relighter = None if avatar.light is None else Relighter(avatar)
     surface = avatar.splats.face if relighter is None else relighter.face
     # equal triangles side by side, which gzip likes
     order = np.lexsort((surface, avatar.splats.face))
+    order = order[avatar.splats.opacities()[order] >= MIN_OPACITY]
     splats = avatar.splats.rows(order)
     faces = len(avatar.faces)
     arrays = _splat_arrays(splats) | {
-        "faces": avatar.faces,
-        "neutral": avatar.neutral,
         "splats_per_face": np.bincount(splats.face, minlength=faces),
+        "joint_basis": rig.joint_basis,
     }
-    arrays |= {name: getattr(rig, name) for name in MOVING}
+    if len(rig.correctives) and np.abs(rig.correctives).max() > 0:
+        arrays["correctives"] = rig.correctives
+    at_rest = np.resize(rig.base, avatar.neutral.shape)
+    if np.abs(avatar.neutral - at_rest).max() > BASE_STEP_M:
+        arrays["neutral"] = avatar.neutral
     # meters of a unit of the splats' local frames, where it is largest
     frames = face_frames(avatar.neutral, avatar.faces, avatar.neutral, avatar.convention)
     unit = float(frames.scale.max(initial=1e-6))
@@ -173,7 +200,22 @@ def data_file(rigged: RiggedAvatar, playback: Playback, exact: bool = False) -> 
         steps["light_irradiance"] = brightest / IRRADIANCE_STEPS
     if playback.selection is not None:
         arrays["selection"] = np.packbits(np.stack(playback.selection), axis=1)
-    return pack(header, arrays, {} if exact else steps)
+    return header, arrays, steps
+
+
+def write_skinned_gltf(path: Path, rigged: RiggedAvatar, playback: Playback) -> None:
+    """Write an avatar as .glb, atomically. Raises StgaError where a value cannot be stored, or the
+    file not be written."""
+    with replacing(path) as partial:
+        partial.write_bytes(glb_of(path, rigged, playback))
+
+
+def glb_of(path: Path, rigged: RiggedAvatar, playback: Playback) -> bytes:
+    """As `skinned_glb`; raises StgaError naming `path`."""
+    try:
+        return skinned_glb(rigged, playback)
+    except ValueError as error:
+        raise StgaError(f"{path}: the avatar cannot be exported ({error})") from error
 
 
 def _splat_arrays(splats: Splats) -> dict[str, np.ndarray]:
@@ -237,8 +279,6 @@ def _header(avatar: Avatar, rig: Rig, playback: Playback) -> dict[str, Any]:
         "background": [float(value) for value in avatar.background],
         "fps": playback.fps,
         "up": [float(value) for value in playback.up],
-        "joints": list(rig.joint_names),
-        "parents": list(rig.parents),
         "sliders": [
             {"name": names[k], "component": k, "reach": round(float(reach[k]), 2)} for k in order
         ],
@@ -253,3 +293,32 @@ def _header(avatar: Avatar, rig: Rig, playback: Playback) -> dict[str, Any]:
             for name, camera in playback.views.items()
         ],
     }
+
+
+def in_planes(glb: bytes) -> bytes:
+    """A .glb of this module as pages hold it, which compresses by a fifth more: of each accessor's
+    buffer view one byte of all components after the other, and of integers without sign and floats
+    the difference from the row before. Only the player reads it."""
+    document, binary = parse_glb(glb)
+    document["extras"][EXTRA]["planes"] = True
+    layouts = dict[int, tuple[int, str]]()
+    for accessor in document["accessors"]:
+        kind = accessor["componentType"]
+        layouts[accessor.get("bufferView", -1)] = kind, accessor["type"]
+        if "sparse" in accessor:
+            sparse = accessor["sparse"]
+            indices = sparse["indices"]
+            layouts[indices["bufferView"]] = indices["componentType"], "SCALAR"
+            layouts[sparse["values"]["bufferView"]] = kind, accessor["type"]
+    layouts.pop(-1, None)
+    stored = bytearray(binary)
+    for index, (kind, shape) in layouts.items():
+        view = document["bufferViews"][index]
+        place = slice(view["byteOffset"], view["byteOffset"] + view["byteLength"])
+        dtype = np.dtype(DTYPES[kind])
+        rows = np.frombuffer(binary[place], f"<u{dtype.itemsize}").reshape(-1, WIDTHS[shape])
+        if dtype.kind != "i":
+            rows = np.diff(rows, axis=0, prepend=rows[:1] * 0)
+            rows[0] = np.frombuffer(binary[place], rows.dtype, WIDTHS[shape])
+        stored[place] = rows.view(np.uint8).reshape(len(rows), -1).T.tobytes()
+    return glb_bytes(document, bytes(stored))
