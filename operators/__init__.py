@@ -58,6 +58,7 @@ CLASSES = tuple(
 IMPORTS = (
     ("stga.avatar_from_video", "Avatar from Video (STGA)…"),
     ("stga.import_capture", "Head Capture (STGA)"),
+    ("stga.import_avatar", "Gaussian Head Avatar (.glb)"),
     ("stga.import_motion", "FLAME Motion (.npz)"),
     ("stga.import_meshes", "Mesh Sequence (STGA)"),
     ("stga.import_ply", "Gaussian Splats (.ply, .spz, .splat)"),

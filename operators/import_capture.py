@@ -14,6 +14,12 @@ from ..stga_addon.capture.open import OWN_MODELS, open_capture
 from ..stga_addon.capture.transforms import DEFAULT_PRINCIPAL_POINT, transforms_files
 from ..stga_addon.driving.performers import READ_SUFFIXES
 from ..stga_addon.errors import StgaError
+from ..stga_addon.export.skinned_reader import (
+    AVATAR_FILE,
+    MODEL_FILE,
+    MOTION_FILE,
+    unpack_skinned_splats,
+)
 from ..stga_addon.export.splat_files import READERS
 from ..stga_addon.flame.sequence import FIELD_ALIASES, FRAME_FIELDS
 from ..stga_addon.scene import tags
@@ -25,6 +31,7 @@ from ..stga_addon.scene.objects import (
     leave_edit_mode,
     mover_of,
     remove,
+    set_frames_per_second,
     show_kind,
     show_progress,
 )
@@ -192,6 +199,25 @@ class ImportMeshes(HeadImport, bpy.types.Operator, FileImport):
     def run(self, context: Any) -> None:
         path = file_path(self.filepath, "mesh sequence")
         self.bring_in(context, path if path.is_dir() else path.parent)
+
+
+class ImportAvatar(HeadImport, bpy.types.Operator, FileImport):
+    """Import a head with bones, sliders, motion and splats from a file of the export format Skinned
+    glTF; a folder beside it gets its parts"""
+
+    bl_label = "Import Avatar"
+
+    filter_glob: options.file_filter(".glb")
+
+    def run(self, context: Any) -> set[str]:
+        path = file_path(self.filepath, "avatar")
+        folder = path.with_name(f"{path.stem}_avatar")
+        is_first = not any(is_head(thing) for thing in context.scene.objects)
+        found = unpack_skinned_splats(path, folder)
+        self.bring_in(context, folder / MOTION_FILE, str(folder / MODEL_FILE))
+        if is_first:
+            set_frames_per_second(context.scene, found.fps)
+        return call(bpy.ops.stga.show_avatar, filepath=str(folder / AVATAR_FILE))
 
 
 class OpenDemo(HeadImport, bpy.types.Operator):

@@ -24,6 +24,7 @@ class CapturePanel(SidebarPanel, bpy.types.Panel):
         head = context.scene.stga.head
         layout.operator("stga.import_capture", icon="IMPORT")
         row = layout.row(align=True)
+        row.operator("stga.import_avatar", text="Avatar", icon="USER")
         row.operator("stga.import_motion", text="FLAME Motion", icon="ARMATURE_DATA")
         row.operator("stga.import_meshes", text="Meshes", icon="MESH_DATA")
         layout.prop(context.scene.stga, "head")

@@ -116,7 +116,7 @@ STEPS = {
     "neutral": BASE_STEP_M,
     "correctives": SHAPE_STEP_M,
     # Of irradiance over radiance, which is at most π.
-    "light_transfer": 2.0**-8,
+    "light_transfer": 2.0**-7,
     "light_occlusion": 1 / 255,
     "light_roughness": 1 / 255,
 }
@@ -227,6 +227,7 @@ def _splat_arrays(splats: Splats) -> dict[str, np.ndarray]:
         "rotation_largest": largest,
         "log_scale": splats.log_scale,
         "opacity": splats.opacities(),
+        "unbound": splats.unbound,
         "color": splats.sh[:, 0],
         **({"sh": view} if view.shape[1] else {}),
     }
@@ -261,6 +262,9 @@ def _add_light(
         "damping": light.damping,
         "typical": relighter.typical_albedo.tolist(),
         "recorded": relighter.recorded_light.ravel().tolist(),
+        "radiance": light.radiance.ravel().tolist(),
+        "residual": light.residual,
+        "source": light.source,
     }
 
 
@@ -273,6 +277,8 @@ def _header(avatar: Avatar, rig: Rig, playback: Playback) -> dict[str, Any]:
     order = np.argsort(-used.std(0), kind="stable").tolist()
     return {
         "title": playback.title,
+        "expressions": rig.expressions,
+        "named": bool(rig.expression_names),
         "convention": avatar.convention,
         "antialiased": avatar.antialiased,
         "offsets": {},
