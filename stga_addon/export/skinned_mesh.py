@@ -12,7 +12,7 @@ from .rig import Rig
 QUANTIZATION = "KHR_mesh_quantization"
 SHAPE_STEP_M = 4e-5
 """Of what a shape moves a vertex by; larger where one moves farther than a short integer holds."""
-MIN_SHAPE_M = 6e-5
+MIN_SHAPE_M = 8e-5
 """What a shape moves by less is left where it is."""
 BASE_STEP_M = 2.0**-20
 """Of vertices at rest: so fine that no thin triangle becomes a line."""

@@ -17,7 +17,7 @@ from stga_addon.flame.model import JOINTS
 from stga_addon.scene.arrays import evaluated_vertices
 from stga_addon.scene.rig.head import rig_of
 
-BLENDER_TOLERANCE_M = 1.5e-4
+BLENDER_TOLERANCE_M = 2e-4
 """What the file's blend shapes leave out, times their weights."""
 
 

@@ -152,7 +152,7 @@ TRACK: list[Any] = [
     ]
 ]
 FORMATS = ("ply", "ply-sequence", "gaussian-avatars", "usd", "web", "gltf", "spz", "obj")
-SUFFIXES = {"usd": ".usdc", "web": ".html", "gltf": ".glb", "spz": ".spz"}
+SUFFIXES = {"usd": ".usdc", "web": ".html", "gltf": ".glb", "skinned-gltf": ".glb", "spz": ".spz"}
 COMMANDS: dict[str, tuple[float, list[Any]]] = {
     "info": (3, [*CAPTURE, EFFECT, DEVICE]),
     "select": (3, [

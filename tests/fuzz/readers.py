@@ -15,6 +15,7 @@ from avatar.conftest import random_mesh, random_splats
 from capture import factory
 from driving.live.wire import facial_mocap
 from driving.test_performance_files import codes_of, write_csv
+from export.ten_splats import ten_splats
 from flame.conftest import model_of, random_arrays
 from numpy.random import default_rng
 from PIL import Image
@@ -32,6 +33,7 @@ from stga_addon.capture.transforms import read_transforms
 from stga_addon.driving.performance import ARKIT_SHAPES
 from stga_addon.driving.performers import read_performance
 from stga_addon.export.ply import PROPERTIES, splat_columns, write_ply
+from stga_addon.export.skinned_reader import read_skinned_splats
 from stga_addon.export.splat_files import read_splats
 from stga_addon.export.spz import write_spz
 from stga_addon.flame.model import read_flame
@@ -232,6 +234,11 @@ TARGETS = {
             performance,
         ),
         "avatar": ("a.npz", avatar, read_avatar),
+        "skinned splats": (
+            "a.glb",
+            lambda p: p.write_bytes(ten_splats()),
+            read_skinned_splats,
+        ),
         "splats": ("a.ply", lambda p: write_ply(p, random_splats(1, 4, 1)), read_splats),
         "splats as text": ("a.ply", ascii_splats, read_splats),
         "splats as spz": ("a.spz", lambda p: write_spz(p, random_splats(1, 4, 1)), read_splats),

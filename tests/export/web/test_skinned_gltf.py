@@ -1,25 +1,33 @@
 """Skinned splats against an independent reader: what quantization may cost, and what is refused."""
 
 import gzip
+import os
 import re
+import subprocess
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from export import ten_splats
+from stga_addon.avatar.embedding import to_world
 from stga_addon.avatar.offsets import OFFSETS
+from stga_addon.avatar.splats import sh_color
 from stga_addon.errors import StgaError
 from stga_addon.export import skinned_gltf
 from stga_addon.export.formats import export_avatar
+from stga_addon.export.gltf import glb_bytes
 from stga_addon.export.playback import Playback
 from stga_addon.export.rig import BAKE_TOLERANCE_M, baked_rig
 from stga_addon.export.skinned_gltf import pack
+from stga_addon.export.skinned_reader import read_skinned_splats
 from stga_addon.export.web import shared_constants
 from stga_addon.export.web.page import ELEMENT, PAGE, PLAYER, element_script, modules
 
 from .conftest import make_head
-from .web_data import planes, read_web_data, splats_of
+from .web_data import document_of, planes, posed_mesh, read_web_data, splats_of
 
 
 def test_fixed_point_errs_by_half_a_step():
@@ -146,3 +154,68 @@ def test_every_module_is_in_the_page():
     assert {path.name for path in PLAYER.glob("*.js")} == {*modules(), PAGE}
     assert "\nimport " not in element_script()
     assert "MIT" in element_script()[:100]
+
+
+def test_ten_splats_are_where_the_page_says():
+    """Catches a page whose rules, file or table do not agree with each other or with what the
+    add-on reads and renders."""
+    text = (ten_splats.FILE.parent / "skinned-splats.md").read_text(encoding="utf-8")
+    rows = [line for line in text.splitlines() if re.match(r"\| -?\d\.\d{4} ", line)]
+    told = np.array([[float(value) for value in re.findall(r"-?\d+\.\d+", row)] for row in rows])
+    data = ten_splats.FILE.read_bytes()
+    assert np.abs(ten_splats.placed(data) - told).max() < 6e-5
+    header, arrays = read_web_data(data)
+    frame = ten_splats.FRAME
+    mesh = posed_mesh(header, arrays, arrays["coefficients"][frame], arrays["pose"][frame], frame)
+    avatar = read_skinned_splats(ten_splats.FILE).avatar
+    world = to_world(avatar.splats, avatar.frames(mesh))
+    direction = world.xyz - ten_splats.CAMERA
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    turns = world.unit_rotations() * np.where(world.rotation[:, :1] < 0, -1, 1)
+    color = np.maximum(sh_color(world.sh, direction), 0)
+    found = np.column_stack([world.xyz, turns, world.scales(), color])
+    assert np.abs(found - told).max() < 1e-4
+
+
+@pytest.mark.parametrize(
+    ("changes", "problem"),
+    [
+        ({"version": 9}, "version 9; known is 1"),
+        ({"byteLength": 50}, "not whole"),
+        ({"arrays": {}}, "not whole"),
+        ({"arrays": {"xyz": {"type": "float32", "shape": [1 << 40, 3]}}}, "larger than any"),
+    ],
+)
+def test_damaged_splats_are_refused(changes, problem, tmp_path):
+    """Catches an exception of numpy or zlib, or memory taken, where a file is none of ours."""
+    document, binary = document_of(ten_splats.FILE.read_bytes())
+    document["extras"]["stga_splats"] |= changes
+    (tmp_path / "a.glb").write_bytes(glb_bytes(document, binary))
+    with pytest.raises(StgaError, match=problem):
+        read_skinned_splats(tmp_path / "a.glb")
+
+
+VALIDATE = """
+import validator from 'gltf-validator';
+import { readFileSync } from 'node:fs';
+for (const file of process.argv.slice(2)) {
+  const { issues } = await validator.validateBytes(new Uint8Array(readFileSync(file)));
+  console.log(JSON.stringify(issues.messages));
+}
+"""
+
+
+@pytest.mark.needs("node")
+def test_khronos_validator_has_nothing_to_say(head, tmp_path):
+    """Catches what other programs may refuse in files of both kinds of rig."""
+    modules_folder = Path(os.environ.get("STGA_NODE_MODULES", "node_modules"))
+    if not (modules_folder / "gltf-validator").is_dir():
+        pytest.skip("npm install gltf-validator, and STGA_NODE_MODULES=…/node_modules")
+    (tmp_path / "node_modules").symlink_to(modules_folder.absolute())
+    (tmp_path / "a.mjs").write_text(VALIDATE)
+    files = [tmp_path / "a.glb", tmp_path / "b.glb", tmp_path / "c.glb"]
+    files[0].write_bytes(head.data())
+    files[1].write_bytes(head.data(baked_rig(list(head.meshes))))
+    files[2].write_bytes(head.data(exact=True))
+    done = subprocess.run(["node", tmp_path / "a.mjs", *files], capture_output=True, timeout=120)
+    assert done.stdout.decode().split() == ["[]"] * len(files), done.stderr
