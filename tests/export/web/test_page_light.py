@@ -27,6 +27,7 @@ pytestmark = pytest.mark.needs("chromium")
 
 LASHES = 40
 MIN_PSNR = 55.0
+MIN_QUANTIZED_PSNR = 50.0
 """Of relit pictures against the renderer's, which also lets the sun's shadow dim the light between
 skin and skin."""
 SUN = {"toward": [0.5, 0.6, 0.62], "color": [2.4, 2.1, 1.6]}
@@ -131,7 +132,7 @@ def test_colors_are_the_relighters(options, exact, browser, tmp_path):
         assert np.quantile(error, 0.95) < (0.02 if exact else 0.03)
         layers = [posed_avatar(head.avatar, head.meshes[frame], colors)]
         expected = to_uint8(render_layers(layers, head.camera))
-        assert difference(shown, expected) >= MIN_PSNR
+        assert difference(shown, expected) >= (MIN_PSNR if exact else MIN_QUANTIZED_PSNR)
     assert browser.errors == []
     assert browser.requests == [(tmp_path / "a.html").as_uri()]
 
