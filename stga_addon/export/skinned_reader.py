@@ -284,9 +284,14 @@ def _avatar(
 def _light(header: dict[str, Any], arrays: dict[str, np.ndarray]) -> AvatarLight | None:
     if "light" not in header:
         return None
-    names = "transfer", "occlusion", "irradiance", "roughness"
-    by_vertex = {name: arrays[f"light_{name}"].astype(np.float32) for name in names}
     own = header["light"]
-    radiance = np.reshape(own["radiance"], (9, 3)).astype(np.float32)
-    known = {"residual": float(own["residual"]), "damping": float(own["damping"])}
-    return AvatarLight(radiance=radiance, source=str(own["source"]), **known, **by_vertex)
+    return AvatarLight(
+        radiance=np.reshape(own["radiance"], (9, 3)).astype(np.float32),
+        transfer=arrays["light_transfer"].astype(np.float32),
+        occlusion=arrays["light_occlusion"].astype(np.float32),
+        irradiance=arrays["light_irradiance"].astype(np.float32),
+        roughness=arrays["light_roughness"].astype(np.float32),
+        residual=float(own["residual"]),
+        damping=float(own["damping"]),
+        source=str(own["source"]),
+    )
