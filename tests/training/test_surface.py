@@ -172,5 +172,7 @@ def test_what_views_tell_is_kept(filmed):
     np.testing.assert_allclose(color, prior.sides.color[state.face[rows]], atol=1e-3)
     height = state.parameters.xyz[rows, 2]
     hair = surface.hair_height[state.face[rows]]
-    outer = np.maximum(0.8 * hair - voxel_size(filmed.neutral) / 2, 0)
-    np.testing.assert_allclose(height, outer, atol=1e-5)
+    outer = 0.8 * hair - voxel_size(filmed.neutral) / 2
+    edges = np.diff(filmed.neutral[filmed.faces[state.face[rows]]], axis=1).swapaxes(0, 1)
+    skin = -0.1 * np.sqrt(np.linalg.norm(np.cross(*edges), axis=1))
+    np.testing.assert_allclose(height, np.where(outer > 0, outer, skin), atol=1e-5)

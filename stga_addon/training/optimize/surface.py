@@ -8,8 +8,9 @@ from scipy.ndimage import binary_dilation
 from scipy.spatial import cKDTree
 
 from ...capture.images import read_view
-from ...capture.mesh_geometry import connected_parts, silhouette
+from ...capture.mesh_geometry import connected_parts, silhouette, triangle_normals
 from ...capture.model import Capture, View, evenly_spread, views_by_timestep
+from ...flame.quaternions import unit
 from .initial_splats import FEW_CAMERAS, SAMPLED_HEIGHT_PIXELS, voxel_size
 from .likeness import BROWS_LEVEL, head_coordinates, kinds_of, outside
 
@@ -187,13 +188,9 @@ class Surface:
 
 
 def _centers_and_normals(capture: Capture, timestep: int) -> tuple[np.ndarray, np.ndarray]:
-    a, b, c = np.asarray(capture.mesh(timestep), np.float64)[capture.faces].swapaxes(0, 1)
-    normal = np.cross(b - a, c - a)
-    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-20)
-    return (a + b + c) / 3, normal
+    corners = np.asarray(capture.mesh(timestep), np.float64)[capture.faces]
+    return corners.mean(1), unit(triangle_normals(corners), 1e-20)
 
 
 def _cosine(center: np.ndarray, normal: np.ndarray, view: View) -> np.ndarray:
-    towards = view.camera.position - center
-    length = np.maximum(np.linalg.norm(towards, axis=1), 1e-20)
-    return np.asarray((normal * towards).sum(1) / length)
+    return np.asarray((normal * unit(view.camera.position - center, 1e-20)).sum(1))
