@@ -42,7 +42,7 @@ result = {"before": [name for name in ("torch", "numba", "scipy") if find_spec(n
 install = bpy.ops.extensions.package_install_files
 install(filepath=archive, repo="user_default", enable_on_install=False)
 bpy.ops.wm.read_factory_settings(use_empty=True)
-module = "bl_ext.user_default.glb"
+module = "bl_ext.user_default.stga"
 bpy.ops.preferences.addon_enable(module=module)
 result["heavy"] = sorted({"torch", "numba"} & set(sys.modules))
 bpy.ops.stga.open_demo()

@@ -158,7 +158,7 @@ def test_uninstall(home: Path) -> None:
     for command in BLENDERS:
         version = output_of([*command, "--version"], cwd=ROOT).split()[1]
         others = other_profiles(home, version)
-        blender(command, home, "--command", "extension", "remove", "user_default.glb")
+        blender(command, home, "--command", "extension", "remove", "user_default.stga")
         assert other_profiles(home, version) == others
     assert {name for name in files_of(home) if not name.startswith("STGA Demo/run")} == set()
 

@@ -16,7 +16,7 @@ from pathlib import Path
 
 import bpy
 
-MODULE = "bl_ext.user_default.glb"
+MODULE = "bl_ext.user_default.stga"
 
 
 def main(archive: str, folder: Path, python: str) -> dict[str, object]:
