@@ -82,9 +82,9 @@ def unseen_sides(surface: Surface) -> UnseenSides:
             found[rows] = color[sources_around_head(at, own, rows)]
     hidden, partner = mirror_images(capture, unseen, is_source)
     found[hidden] = color[partner]
-    within = ~is_outside & ~shown
-    found[within] = inside_colors(capture, color, shown, within)
     inside = _unseen_inside(capture, pixels > 0, is_outside)
+    within = inside | (~is_outside & ~shown)
+    found[within] = inside_colors(capture, color, shown, within)
     return UnseenSides((is_outside & (cosine < UNSEEN_COSINE)) | inside, shown, found)
 
 

@@ -110,11 +110,11 @@ DAMAGED_PAGES: dict[str, tuple[Callable[[str], str], str]] = {
     "a name altered": (lambda page: page.replace("function addViews(", "function a("), INCOMPLETE),
     "no data": (lambda page: re.sub(rf"<script [^>]*{DATA}</script>", "", page), NO_DATA),
     "empty data": (lambda page: re.sub(DATA, 'id="data">', page), NO_DATA),
-    "no base64": (lambda page: re.sub(DATA, 'id="data">H4sI%%', page), DAMAGED),
+    "no base 85": (lambda page: re.sub(DATA, "id=\"data\">H4sI''", page), DAMAGED),
     "other data": (lambda page: re.sub(DATA, 'id="data">AAAA', page), "not an avatar data file."),
     "cut at the data": (lambda page: cut(page, 'id="data">'), NO_DATA),
     "cut in the data": (lambda page: cut(page, 'id="data">', 40_000), DAMAGED),
-    "cut to odd base64": (lambda page: cut(page, 'id="data">', 40_001), DAMAGED),
+    "cut within five digits": (lambda page: cut(page, 'id="data">', 40_001), DAMAGED),
 }
 SHOWN = """(() => {
   const message = document.querySelector('stga-avatar')?.shadowRoot?.querySelector('p');
