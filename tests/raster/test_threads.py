@@ -2,6 +2,7 @@
 let go."""
 
 import os
+import signal
 import threading
 import time
 from collections.abc import Iterator
@@ -13,7 +14,15 @@ pytest.importorskip("numba")
 
 from stga_addon.raster.cpu import jit
 from stga_addon.raster.cpu.elementary import fetch_add
-from stga_addon.raster.cpu.threads import parallel, pieces, set_threads, threads
+from stga_addon.raster.cpu.threads import (
+    call_helpers,
+    end_stages,
+    parallel,
+    pieces,
+    set_threads,
+    stage,
+    threads,
+)
 
 from .test_kernels import SCENES, kernel_gradients, random_cotangents
 
@@ -26,6 +35,7 @@ def as_many_as_before() -> Iterator[None]:
 
 
 def count_up(work, done):
+    call_helpers(work)
     for begin, end in pieces(work):
         for n in range(begin, end):
             done[n] += 1
@@ -47,13 +57,51 @@ def test_every_unit_is_done_once(count, piece):
 
 @parallel(lambda numbers, *_: len(numbers))
 def fail(work, numbers, at):
+    call_helpers(work)
     for begin, end in pieces(work):
         if begin <= at < end:
             raise ValueError("this piece")
 
 
+@parallel(lambda numbers, *_: len(numbers))
+def fail_in_a_stage(work, numbers, at):
+    call_helpers(work)
+    for n in stage(work, 0, len(numbers)):
+        if n == at:
+            raise ValueError("this piece")
+    for n in stage(work, 1, len(numbers)):
+        numbers[n] += 1
+    end_stages(work)
+
+
+@parallel(lambda sums, *_: sums.shape[1], piece=2)
+def add_neighbors(work, sums):
+    call_helpers(work)
+    for s in range(1, sums.shape[0]):
+        for n in stage(work, s - 1, sums.shape[1]):
+            sums[s, n] = sums[s - 1, n - 1] + sums[s - 1, (n + 1) % sums.shape[1]]
+    end_stages(work)
+
+
+@pytest.mark.parametrize("count", [1, 2, 7])
+def test_a_stage_begins_when_the_one_before_is_done(count):
+    """Catches a thread that goes on while another one is still in the stage before."""
+    set_threads(count)
+    for length in (2, 5, 1000):
+        sums = np.zeros((13, length), np.int64)
+        sums[0] = np.arange(length)
+        expected = sums[0]
+        for _ in range(12):
+            expected = np.roll(expected, 1) + np.roll(expected, -1)
+        for _ in range(20):
+            sums[1:] = 0
+            add_neighbors(sums)
+            np.testing.assert_array_equal(sums[-1], expected)
+
+
+@pytest.mark.parametrize("fail", [fail, fail_in_a_stage])
 @pytest.mark.parametrize("at", [0, 9])
-def test_an_error_reaches_the_caller(at):
+def test_an_error_reaches_the_caller(fail, at):
     """Catches an error that dies with its thread, a caller that then waits for ever, and threads
     lost to it."""
     set_threads(3)
@@ -61,10 +109,14 @@ def test_an_error_reaches_the_caller(at):
         with pytest.raises(ValueError, match="this piece"):
             fail(np.zeros(10), at)
     fail(np.zeros(10), 10)
+    met = np.zeros(4, np.int64)
+    meet(met, 100_000_000)
+    assert (met == 3).all()
 
 
 @parallel(lambda met, *_: len(met) - 1)
 def meet(work, met, patience):
+    call_helpers(work)
     for begin, _ in pieces(work):
         fetch_add(met, 0, 1)
         for _ in range(patience):
@@ -117,6 +169,61 @@ def test_several_callers_at_a_time():
     assert len(found) == 15
     for gradients in found:
         np.testing.assert_equal(expected, gradients)
+
+
+def test_the_thread_count_changes_meanwhile():
+    """Catches helpers that end in the middle of a kernel, and a caller that waits for them."""
+    ended = threading.Event()
+
+    def change():
+        while not ended.is_set():
+            for count in (3, 1, 7):
+                set_threads(count)
+
+    other = threading.Thread(target=change)
+    other.start()
+    call = parallel(len, piece=64)(count_up)
+    try:
+        for _ in range(100):
+            done = np.zeros(10_000, np.int64)
+            call(done)
+            assert (done == 1).all()
+    finally:
+        ended.set()
+        other.join()
+
+
+def test_helpers_sleep_between_kernels():
+    """Catches helpers that look for the next kernel for ever: a core each, also in Blender while
+    nothing is rendered."""
+    set_threads(7)
+    meet(np.zeros(8, np.int64), 100_000_000)
+    time.sleep(0.1)
+    before = time.process_time()
+    time.sleep(0.5)
+    assert time.process_time() - before < 0.1
+
+
+def until_interrupted(call):
+    while True:
+        call(np.zeros(10_000, np.int64))
+
+
+@pytest.mark.skipif(os.name != "posix", reason="no signals")
+def test_an_interrupt_leaves_the_threads_usable():
+    """Catches Ctrl-C that is not noticed while kernels run, or leaves helpers in one for ever."""
+    set_threads(3)
+    meet(np.zeros(4, np.int64), 100_000_000)
+    call = parallel(len, piece=64)(count_up)
+    for _ in range(10):
+        timer = threading.Timer(0.02, os.kill, (os.getpid(), signal.SIGINT))
+        timer.start()
+        with pytest.raises(KeyboardInterrupt):
+            until_interrupted(call)
+        timer.join()
+    met = np.zeros(4, np.int64)
+    meet(met, 100_000_000)
+    assert (met == 3).all()
 
 
 @jit

@@ -1,5 +1,4 @@
-"""Order of the splats by depth against numpy's stable sort, and the order in which tiles are
-rendered."""
+"""The tiles' lists against numpy's stable sort, and the order in which tiles are rendered."""
 
 import numpy as np
 import pytest
@@ -7,16 +6,11 @@ import pytest
 pytest.importorskip("numba")
 
 from stga_addon.raster.cpu.blend import RUN_TILES
-from stga_addon.raster.cpu.rasterize import BufferPool, new_projection, sort_by_depth
-from stga_addon.raster.cpu.tiles import RUN_BUCKETS, SPLATS_PER_SORT, heaviest_first
+from stga_addon.raster.cpu.rasterize import BufferPool, new_projection, sort_into_tiles
+from stga_addon.raster.cpu.tiles import RUN_BUCKETS, SPLATS_PER_SORT, heaviest_first, whole_tiles
 
-
-def by_depth(depth: np.ndarray, rect: np.ndarray) -> tuple[np.ndarray, ...]:
-    """`sort_by_depth` of splats with depths (N,) and bounds (N, 4)."""
-    projection = new_projection(len(depth), BufferPool())
-    projection.depth[:] = depth
-    projection.rect[:] = rect
-    return sort_by_depth(projection, BufferPool())
+TILES = 4
+"""Along each side of the image."""
 
 
 @pytest.mark.parametrize("most", [1.0, 1.0 + 1e-6, 1.1, 3.0, 1e9, 3e38])
@@ -27,16 +21,31 @@ def test_depths_are_sorted_whatever_their_range(least, most):
     rng = np.random.default_rng(0)
     depth = np.geomspace(least, most, 3000).astype(np.float32)[rng.integers(0, 3000, 60_000)]
     rect = np.zeros((60_000, 4), np.int32)
-    rect[:, 2:] = rng.integers(1, 5, (60_000, 2)) * (rng.random((60_000, 1)) < 0.7)
-    visible, order, first_pair, pairs, total = by_depth(depth, rect)
+    rect[:, :2] = rng.integers(0, TILES, (60_000, 2))
+    rect[:, 2:] = np.minimum(rect[:, :2] + rng.integers(1, 4, (60_000, 2)), TILES)
+    rect[rng.random(60_000) < 0.3] = 0
     seen = np.flatnonzero(rect[:, 2])
     assert len(seen) > 2 * SPLATS_PER_SORT
-    np.testing.assert_array_equal(visible, seen)
-    np.testing.assert_array_equal(order, seen[np.argsort(depth[seen], kind="stable")])
-    expected = rect[seen, 2] * rect[seen, 3]
-    np.testing.assert_array_equal(pairs[seen], expected)
-    np.testing.assert_array_equal(first_pair[seen], np.cumsum(expected) - expected)
-    assert total == expected.sum()
+    buffers = BufferPool()
+    projection = new_projection(len(depth), buffers)
+    projection.depth[:] = depth
+    projection.rect[:] = rect
+    for _ in range(2):  # with too little room for the pairs, and with enough
+        lists, tiles = sort_into_tiles(projection, TILES, whole_tiles(TILES * TILES), buffers)
+        np.testing.assert_array_equal(np.sort(tiles), np.arange(TILES * TILES))
+        np.testing.assert_array_equal(lists.visible, seen)
+        count = ((rect[:, 2] - rect[:, 0]) * (rect[:, 3] - rect[:, 1]))[seen]
+        np.testing.assert_array_equal(lists.pairs[seen], count)
+        np.testing.assert_array_equal(lists.first_pair[seen], np.cumsum(count) - count)
+        order = seen[np.argsort(depth[seen], kind="stable")]
+        x0, y0, x1, y1 = rect[order].T
+        expected = [
+            order[(x0 <= n % TILES) & (n % TILES < x1) & (y0 <= n // TILES) & (n // TILES < y1)]
+            for n in range(TILES * TILES)
+        ]
+        np.testing.assert_array_equal(lists.pair_splat, np.concatenate(expected))
+        np.testing.assert_array_equal(np.diff(lists.start), [len(found) for found in expected])
+        np.testing.assert_array_equal(lists.pair_splat[lists.splat_pairs], np.repeat(seen, count))
 
 
 @pytest.mark.parametrize("count", [1, 7, 8, 1785])

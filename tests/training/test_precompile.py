@@ -84,7 +84,7 @@ from stga_addon.raster.cpu import tiles
 from stga_addon.training.optimize import precompile
 precompile._step = lambda: None  # which the first process compiles meanwhile
 precompile.precompile_kernels()
-kernel = getattr(tiles.fill_pairs, "__wrapped__", tiles.fill_pairs)
+kernel = getattr(tiles.list_pairs, "__wrapped__", tiles.list_pairs)
 print(json.dumps([sum(kernel.stats.cache_hits.values()), len(kernel.signatures)]))
 """
 
@@ -102,7 +102,7 @@ def test_a_second_process_compiles_what_is_missing(tmp_path):
     shutil.copytree(
         KERNEL_CACHE_FOLDER, tmp_path / "kernels", ignore=shutil.ignore_patterns("*.tmp.*")
     )
-    for name in ("tiles.fill_pairs", "image_loss.image_loss"):
+    for name in ("tiles.list_pairs", "image_loss.image_loss"):
         removed = list((tmp_path / "kernels").glob(f"*/{name}-*"))
         assert removed
         for path in removed:

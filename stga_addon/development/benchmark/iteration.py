@@ -42,17 +42,11 @@ from ...raster.cpu.rasterize import (
     frames_in_camera,
     render_backward,
     render_forward,
-    sort_by_depth,
+    sort_into_tiles,
     tile_grid,
 )
-from ...raster.cpu.threads import parallel, pieces, threads
-from ...raster.cpu.tiles import (
-    SORT_PARTS,
-    arrange_tiles,
-    count_pairs,
-    fill_pairs,
-    sum_tiles,
-)
+from ...raster.cpu.threads import call_helpers, parallel, pieces, threads
+from ...raster.cpu.tiles import sum_tiles
 from ...render.device import choose_device
 from ...training.optimize import adam
 from ...training.optimize.backend import Batch, RenderOptions
@@ -154,6 +148,7 @@ MULTIPLY_ADDS = 16
 @parallel(lambda rows: len(rows), piece=16)
 def multiply_add_rows(work, rows):
     """Sixteen multiply-adds of each value of rows (R, 256) float32, 100 times over."""
+    call_helpers(work)
     for first, past in pieces(work):
         for n in range(first, past):
             row = rows[n]
@@ -209,17 +204,10 @@ def listing_stages(image: Rendered) -> dict[str, Stage]:
     state = image.state
     frames = image.frames
     output = image.output
-    lists = output.lists
     n = len(state.face)
-    rect = output.projection.rect
     tiles_x, tiles_y = tile_grid(*frames.size.tolist())
     everything = np.arange(n)
     everywhere = sum_tiles(np.ones((tiles_y, tiles_x), bool))
-    _, order, first_pair, *_ = sort_by_depth(output.projection, BufferPool())
-    counts = np.empty((SORT_PARTS, tiles_x * tiles_y), np.int32)
-    count_pairs(rect, order, tiles_x, counts)
-    places = counts.copy()
-    arrange_tiles(places, output.tile_blocks)
 
     def project() -> object:
         return project_forward(
@@ -234,23 +222,13 @@ def listing_stages(image: Rendered) -> dict[str, Stage]:
             output.projection,
         )
 
-    def fill() -> object:
-        return fill_pairs(
-            rect, order, tiles_x, places.copy(), first_pair, lists.splat_pairs, lists.pair_splat
-        )
+    def sort() -> object:
+        return sort_into_tiles(output.projection, tiles_x, output.tile_blocks, image.buffers)
 
+    sorted_bytes = n * 80 + len(output.lists.visible) * 44 + image.pairs * 8
     return {
         "project": (project, n * (59 + 16) * 4),
-        "sort by depth": (
-            lambda: sort_by_depth(output.projection, image.buffers),
-            n * 36 + len(lists.visible) * 44,
-        ),
-        "count pairs": (lambda: count_pairs(rect, order, tiles_x, counts), n * 20),
-        "arrange tiles": (
-            lambda: arrange_tiles(counts.copy(), output.tile_blocks),
-            2 * counts.nbytes,
-        ),
-        "fill pairs": (fill, image.pairs * 8 + n * 24),
+        "sort into tiles": (sort, sorted_bytes),
     }
 
 
@@ -361,7 +339,7 @@ def global_step(
     """The backend of whole iterations, from the posed mesh's frames on, and their global batch;
     device: one of `choose_device`."""
     poses = lambda timestep: mesh, lambda timestep, zero_pose: mesh
-    capture = Capture(Path(), "", faces, mesh, {}, (0,), {}, *poses)
+    capture = Capture(Path(), "", faces, mesh, {"train": ()}, (0,), {}, *poses)
     given = make_settings(iterations=1), FrameStore(capture, "stga"), new_state(splats)
     view = View(0, 0, camera, "benchmark", Path())
     batch = Batch(view, target, None, RenderOptions(np.ones(3, np.float32), 3), None, RATES)

@@ -21,7 +21,7 @@ import numpy as np
 from . import inline_jit, layout, part_jit
 from .elementary import prefetch
 from .layout import PIXELS, PROJECTED, TILE
-from .threads import parallel, pieces
+from .threads import call_helpers, parallel, pieces
 
 ZERO = np.float32(0.0)
 HALF = np.float32(0.5)
@@ -347,6 +347,7 @@ def blend_forward(work, tiles, tiles_x, tile_blocks, lists, projection, backgrou
     that are needed, see `find_needed_blocks`; pixels of the others are undefined. background (3,):
     composited behind the splats.
     """
+    call_helpers(work)
     start = lists.start
     pair_splat = lists.pair_splat
     projected = projection.columns
@@ -570,11 +571,11 @@ def blend_backward(
     """Write the gradient of every wanted (tile, splat) pair of the listed tiles to pair_gradients
     (P, PROJECTED).
 
-    wanted (N,) bool: splats whose gradient is needed. projected (N, PROJECTED): the columns of the
-    projection. v_image (3, H, W), v_transmittance (H, W): gradients of the image over the
-    background and of the transmittance. Each pair has a row of its own, so that the sum over a
-    splat's pairs has one order whatever the threads do.
+    wanted (N,) bool: splats whose gradient is needed. projected (N, PROJECTED): the projection's
+    columns. v_image (3, H, W), v_transmittance (H, W): gradients of image and transmittance. Each
+    pair has a row, so that a sum over a splat's pairs has one order whatever the threads do.
     """
+    call_helpers(work)
     pair_splat = lists.pair_splat
     v_pixels = (v_image, v_transmittance)
     s = np.empty(BACKWARD_SIZE, np.float32)

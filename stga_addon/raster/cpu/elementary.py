@@ -1,11 +1,15 @@
 """Exponential and logarithm for loops that LLVM vectorizes: the C library's are calls, one value at
-a time. And instructions that Python has no name for: prefetching, and atomic addition."""
+a time. And what Python has no name for: prefetching, operations that threads cannot divide, and
+Python's own locks, which work without the GIL."""
 
+import platform
+import sys
 from typing import Any
 
 import numpy as np
 from llvmlite import ir
 from numba import types
+from numba.core import cgutils
 from numba.extending import intrinsic
 
 from . import inline_jit
@@ -83,3 +87,83 @@ def fetch_add(typing: Any, array: Any, index: Any, step: Any) -> Any:
         return builder.atomic_rmw("add", address, arguments[2], "seq_cst")
 
     return types.int64(array, types.int64, types.int64), generate
+
+
+@intrinsic
+def exchange(typing: Any, array: Any, index: Any, value: Any) -> Any:
+    """Replace an element of an int64 array, undivided by other threads; returns what it was."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        data = context.make_array(signature.args[0])(context, builder, arguments[0]).data
+        address = builder.gep(data, [arguments[1]])
+        return builder.atomic_rmw("xchg", address, arguments[2], "seq_cst")
+
+    return types.int64(array, types.int64, types.int64), generate
+
+
+@intrinsic
+def latest(typing: Any, array: Any, index: Any) -> Any:
+    """An element of an int64 array as other threads have left it."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        data = context.make_array(signature.args[0])(context, builder, arguments[0]).data
+        return builder.load_atomic(builder.gep(data, [arguments[1]]), "seq_cst", 8)
+
+    return types.int64(array, types.int64), generate
+
+
+@intrinsic
+def pause(typing: Any) -> Any:
+    """Let the other thread of the processor's core go ahead for some ten to a hundred cycles."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        machine = platform.machine()
+        if machine in ("x86_64", "AMD64"):
+            kind = ir.FunctionType(ir.VoidType(), [])
+            name = "llvm.x86.sse2.pause"
+            builder.call(cgutils.get_or_insert_function(builder.module, kind, name), [])
+        elif machine in ("arm64", "aarch64"):
+            kind = ir.FunctionType(ir.VoidType(), [ir.IntType(32)])
+            hint = cgutils.get_or_insert_function(builder.module, kind, "llvm.aarch64.isb")
+            builder.call(hint, [ir.IntType(32)(15)])
+        return context.get_dummy_value()
+
+    return types.void(), generate
+
+
+@intrinsic
+def yield_processor(typing: Any) -> Any:
+    """Let other threads go ahead."""
+    name = "SwitchToThread" if sys.platform == "win32" else "sched_yield"
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        kind = ir.FunctionType(ir.IntType(32), [])
+        builder.call(cgutils.get_or_insert_function(builder.module, kind, name), [])
+        return context.get_dummy_value()
+
+    return types.void(), generate
+
+
+@intrinsic
+def acquire(typing: Any, lock: Any) -> Any:
+    """Wait for a lock of Python's C interface, an address."""
+    return types.void(types.int64), _lock_call("PyThread_acquire_lock", 1)
+
+
+@intrinsic
+def release(typing: Any, lock: Any) -> Any:
+    """Let go a lock of Python's C interface, an address; any thread may."""
+    return types.void(types.int64), _lock_call("PyThread_release_lock")
+
+
+def _lock_call(name: str, *options: int) -> Any:
+    integer = ir.IntType(32)
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        lock = builder.inttoptr(arguments[0], ir.PointerType(ir.IntType(8)))
+        values = [lock, *map(integer, options)]
+        kind = ir.FunctionType(integer, [value.type for value in values])
+        builder.call(cgutils.get_or_insert_function(builder.module, kind, name), values)
+        return context.get_dummy_value()
+
+    return generate

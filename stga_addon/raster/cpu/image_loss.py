@@ -10,8 +10,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from . import inline_jit, jit, part_jit
-from .threads import parallel, pieces
+from . import inline_jit, part_jit
+from .threads import call_helpers, end_stages, parallel, pieces, stage
 
 WINDOW_RADIUS_PX = 5
 LOSS_REACH_PX = 2 * WINDOW_RADIUS_PX
@@ -267,66 +267,65 @@ def _new_rows(columns):
 
 
 @parallel(lambda image, target, rectangles, *_: 3 * len(rectangles))
-def image_loss(work, image, target, rectangles, ssim_weight, scale, gradient, sums):
+def image_loss(work, image, target, rectangles, ssim_weight, scale, gradient, sums, totals):
     """Gradient of the loss with respect to the image, within each rectangle (x0, y0, x1, y1) of
     pixels.
 
     image (3, H, W) float32; target (H, W, 3) uint8; the loss is the mean over all 3·H·W values, so
     `scale` is 1 / (3·H·W). Reads the image up to LOSS_REACH_PX pixels around a rectangle. Writes
-    gradient (3, H, W) and, for the rows of all rectangles one after the other, sums (2, 3, rows): Σ
-    |difference| and Σ SSIM over a row's pixels, by channel. By row, the sums do not depend on how
-    an image is cut into bands.
+    gradient (3, H, W); for the rows of all rectangles one after the other, sums (2, 3, rows): Σ
+    |difference| and Σ SSIM over a row's pixels, by channel; and totals (2,), the sums over all
+    rows and channels. By row, the sums do not depend on how an image is cut into bands.
     """
+    call_helpers(work)
+    weights = (ssim_weight, scale)
+    for job in stage(work, 0, 3 * len(rectangles)):
+        _channel_loss(job // 3, job % 3, image, target, rectangles, weights, gradient, sums)
+    for k in stage(work, 1, 2):
+        totals[k] = _total(sums[k])
+    end_stages(work)
+
+
+@part_jit
+def _channel_loss(r, c, image, target, rectangles, weights, gradient, sums):
+    """`image_loss` of one channel of one rectangle: row by row, the gradient ten rows behind."""
     height = image.shape[1]
-    for first_job, past_job in pieces(work):
-        # one channel of one rectangle: row by row, the gradient ten rows behind
-        for job in range(first_job, past_job):
-            r = job // 3
-            c = job % 3
-            y0 = rectangles[r, 1]
-            y1 = rectangles[r, 3]
-            first_sum = -y0  # where the sums of the rectangle's rows begin, less its first row
-            for before in range(r):
-                first_sum += rectangles[before, 3] - rectangles[before, 1]
-            columns = _columns_of(rectangles[r], image.shape[2])
-            rows = _new_rows(columns)
-            for row in range(y0 - LOSS_REACH_PX, y1 + LOSS_REACH_PX):
-                # 1. horizontal blur of this row's four values
-                inside = 0 <= row < height
-                if inside:
-                    _load_source(image, target, row, c, rows, columns)
-                _blur_into_ring(rows.source, 4, rows.first, row, inside, columns)
-                # 2. SSIM of the row five above, and its slopes blurred horizontally
-                middle = row - WINDOW_RADIUS_PX
-                if middle < y0 - WINDOW_RADIUS_PX:
-                    continue
-                inside = 0 <= middle < height
-                if inside:
-                    for plane in range(4):
-                        _blur_column(rows.first, plane, middle, rows.moments, columns)
-                    _similarity_row(rows, columns)
-                    if y0 <= middle < y1:
-                        similarity = _sum_row(rows.similarities, columns.first, columns.past)
-                        sums[1, c, first_sum + middle] = similarity
-                _blur_into_ring(rows.slopes, 3, rows.second, middle, inside, columns)
-                # 3. gradient of the row five above that
-                out = middle - WINDOW_RADIUS_PX
-                if out < y0 or out >= y1 or out < 0 or out >= height:
-                    continue
-                for plane in range(3):
-                    _blur_column(rows.second, plane, out, rows.blurred, columns)
-                keep = (out % RING_ROWS) * columns.stride
-                weights = (ssim_weight, scale)
-                _gradient_row(image[c, out], gradient[c, out], keep, rows, columns, weights)
-                difference = _sum_row(rows.differences, columns.first, columns.past)
-                sums[0, c, first_sum + out] = difference
-
-
-@jit
-def add_up(sums):
-    """Of sums (2, 3, rows) float64 the two over all rows and channels. Not by numpy, whose code
-    memory has to bring anew after each kernel: six times as long."""
-    return _total(sums[0]), _total(sums[1])
+    y0 = rectangles[r, 1]
+    y1 = rectangles[r, 3]
+    first_sum = -y0  # where the sums of the rectangle's rows begin, less its first row
+    for before in range(r):
+        first_sum += rectangles[before, 3] - rectangles[before, 1]
+    columns = _columns_of(rectangles[r], image.shape[2])
+    rows = _new_rows(columns)
+    for row in range(y0 - LOSS_REACH_PX, y1 + LOSS_REACH_PX):
+        # 1. horizontal blur of this row's four values
+        inside = 0 <= row < height
+        if inside:
+            _load_source(image, target, row, c, rows, columns)
+        _blur_into_ring(rows.source, 4, rows.first, row, inside, columns)
+        # 2. SSIM of the row five above, and its slopes blurred horizontally
+        middle = row - WINDOW_RADIUS_PX
+        if middle < y0 - WINDOW_RADIUS_PX:
+            continue
+        inside = 0 <= middle < height
+        if inside:
+            for plane in range(4):
+                _blur_column(rows.first, plane, middle, rows.moments, columns)
+            _similarity_row(rows, columns)
+            if y0 <= middle < y1:
+                similarity = _sum_row(rows.similarities, columns.first, columns.past)
+                sums[1, c, first_sum + middle] = similarity
+        _blur_into_ring(rows.slopes, 3, rows.second, middle, inside, columns)
+        # 3. gradient of the row five above that
+        out = middle - WINDOW_RADIUS_PX
+        if out < y0 or out >= y1 or out < 0 or out >= height:
+            continue
+        for plane in range(3):
+            _blur_column(rows.second, plane, out, rows.blurred, columns)
+        keep = (out % RING_ROWS) * columns.stride
+        _gradient_row(image[c, out], gradient[c, out], keep, rows, columns, weights)
+        difference = _sum_row(rows.differences, columns.first, columns.past)
+        sums[0, c, first_sum + out] = difference
 
 
 @part_jit
@@ -346,6 +345,7 @@ def change_background(work, image, mask, before, after, out):
     image = coverage · foreground + (1 − coverage) · before, so only the second term has to be
     exchanged.
     """
+    call_helpers(work)
     for first_row, past_row in pieces(work):
         for y in range(first_row, past_row):
             for x in range(image.shape[1]):

@@ -7,7 +7,7 @@ import numpy as np
 
 from . import jit, part_jit
 from .elementary import exponential
-from .threads import parallel, pieces
+from .threads import call_helpers, end_stages, parallel, pieces, stage
 
 ZERO = np.float32(0.0)
 ONE = np.float32(1.0)
@@ -65,6 +65,7 @@ def adam_rows(work, rows, steps, parameters, options):
     row whose gradient is not finite, or beyond MAX_GRADIENT, keeps that parameter, its moments and
     its average. All parameters at once: every further parallel loop waits for its slowest thread.
     """
+    call_helpers(work)
     log1 = math.log(options.beta1)
     log2 = math.log(options.beta2)
     correct1 = np.empty(ROWS_PER_BLOCK, np.float32)
@@ -122,6 +123,7 @@ def _adam_block(rows, parameter, correct1, correct2, ema_shares, options):
 @parallel(lambda rows, *_: len(rows), piece=16_384)
 def add_screen_gradients(work, rows, screen_gradient, total, count):
     """Add screen_gradient (N,) of the listed rows (M,) to total (N,), and 1 to their count (N,)."""
+    call_helpers(work)
     for first_row, past_row in pieces(work):
         for n in range(first_row, past_row):
             i = np.uint64(rows[n])
@@ -209,50 +211,54 @@ def scale_limit(
     limits (2, F) per triangle, of bound and of unbound splats, in the unit of the splats' local
     scale. Returns the norm.
     """
-    sums = np.empty(-(-len(rows) // ROWS_PER_SUM))
-    sum_excess_scale(sums, rows, log_scale, face, unbound, limits)
-    norm = math.sqrt(math.fsum(sums.tolist()))
-    if norm > 0.0:
-        factor = np.float32(weight / norm)
-        add_excess_scale(rows, log_scale, face, unbound, limits, factor, gradient)
-    return norm
+    sums = np.zeros(-(-len(rows) // ROWS_PER_SUM) + 1)
+    limit_scale(rows, log_scale, face, unbound, limits, weight, gradient, sums)
+    return float(sums[-1])
 
 
-@parallel(lambda sums, *_: len(sums), piece=4)
-def sum_excess_scale(work, sums, rows, log_scale, face, unbound, limits):
-    """Write to each of the sums Σ ReLU(scale − limit)² over its ROWS_PER_SUM rows; see
-    `scale_limit`."""
+@parallel(lambda rows, *_: len(rows), piece=4 * ROWS_PER_SUM)
+def limit_scale(work, rows, log_scale, face, unbound, limits, weight, gradient, sums):
+    """`scale_limit`; writes to sums Σ ReLU(scale − limit)² over ROWS_PER_SUM rows each, and as the
+    last one the norm."""
+    call_helpers(work)
     scales = np.empty(3 * ROWS_PER_SUM, np.float32)
-    for first_sum, past_sum in pieces(work):
-        for k in range(first_sum, past_sum):
-            begin = k * ROWS_PER_SUM
-            count = min(len(rows) - k * ROWS_PER_SUM, ROWS_PER_SUM)
-            for n in range(np.uint64(count)):
-                i = np.uint64(rows[np.uint64(begin) + n])
-                for c in range(np.uint64(3)):
-                    scales[np.uint64(3) * n + c] = log_scale[i, c]
-            for n in range(np.uint64(3 * count)):
-                scales[n] = exponential(scales[n])
-            total = 0.0
-            for n in range(np.uint64(count)):
-                i = np.uint64(rows[np.uint64(begin) + n])
+    parts = len(sums) - 1
+    for k in stage(work, 0, parts):
+        some = rows[k * ROWS_PER_SUM : (k + 1) * ROWS_PER_SUM]
+        sums[k] = _excess_scale(some, log_scale, face, unbound, limits, scales)
+    for _ in stage(work, 1, 1):
+        total = 0.0
+        for k in range(parts):
+            total += sums[k]
+        sums[parts] = math.sqrt(total)
+    if sums[parts] > 0.0:
+        factor = np.float32(weight / sums[parts])
+        for k in stage(work, 2, parts):
+            for i in rows[k * ROWS_PER_SUM : (k + 1) * ROWS_PER_SUM]:
                 limit = limits[1 if unbound[i] else 0, face[i]]
-                for c in range(np.uint64(3)):
-                    excess = max(ZERO, scales[np.uint64(3) * n + c] - limit)
-                    total += excess * excess
-            sums[k] = total
+                for c in range(3):
+                    scale = math.exp(log_scale[i, c])
+                    gradient[i, c] += factor * max(ZERO, scale - limit) * scale
+    end_stages(work)
 
 
-@parallel(lambda rows, *_: len(rows), piece=1024)
-def add_excess_scale(work, rows, log_scale, face, unbound, limits, factor, gradient):
-    """Add factor · ReLU(scale − limit) · scale to gradient (N, 3); see `scale_limit`."""
-    for first_row, past_row in pieces(work):
-        for n in range(first_row, past_row):
-            i = rows[n]
-            limit = limits[1 if unbound[i] else 0, face[i]]
-            for c in range(3):
-                scale = math.exp(log_scale[i, c])
-                gradient[i, c] += factor * max(ZERO, scale - limit) * scale
+@part_jit
+def _excess_scale(rows, log_scale, face, unbound, limits, scales):
+    """Σ ReLU(scale − limit)² over a few rows; scales: room for theirs."""
+    for n in range(np.uint64(len(rows))):
+        i = np.uint64(rows[n])
+        for c in range(np.uint64(3)):
+            scales[np.uint64(3) * n + c] = log_scale[i, c]
+    for n in range(np.uint64(3 * len(rows))):
+        scales[n] = exponential(scales[n])
+    total = 0.0
+    for n in range(np.uint64(len(rows))):
+        i = np.uint64(rows[n])
+        limit = limits[1 if unbound[i] else 0, face[i]]
+        for c in range(np.uint64(3)):
+            excess = max(ZERO, scales[np.uint64(3) * n + c] - limit)
+            total += excess * excess
+    return total
 
 
 @parallel(lambda rows, *_: len(rows), piece=16_384)
@@ -262,6 +268,7 @@ def opacity_weight(work, rows, opacity, share, weight, gradient):
 
     share (N,) float32.
     """
+    call_helpers(work)
     for first_row, past_row in pieces(work):
         for n in range(first_row, past_row):
             i = rows[n]

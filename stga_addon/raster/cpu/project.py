@@ -12,7 +12,7 @@ from . import inline_jit, part_jit
 from . import splat_block as block
 from .layout import BLUE, GREEN, MEAN_X, MEAN_Y, OPACITY, PRECISION_X, PRECISION_Y, RED, SHEAR, TILE
 from .splat_block import BLOCK_SPLATS, HALF, ONE, ZERO
-from .threads import parallel, pieces
+from .threads import call_helpers, parallel, pieces
 
 COLUMN = np.uint64(BLOCK_SPLATS)
 SPLATS_PER_PIECE = 4 * BLOCK_SPLATS
@@ -28,6 +28,7 @@ def compose_frames(work, origin, rotation, scale, turn, shift, camera_origin, ca
     distance from the origin costs no precision. Writes camera_origin (F, 3) and camera_matrix (F,
     3, 3) float32.
     """
+    call_helpers(work)
     for begin, end in pieces(work):
         for f in range(begin, end):
             for r in range(3):
@@ -218,6 +219,7 @@ def project_forward(
     a splat's area is taken from its opacity (Mip-Splatting's 2D filter, gsplat's "antialiased"
     mode).
     """
+    call_helpers(work)
     tiles_x = (frames.size[0] + TILE - 1) // TILE
     tiles_y = (frames.size[1] + TILE - 1) // TILE
     limits = _tan_limits(frames.intrinsics, frames.size)
@@ -360,6 +362,7 @@ def project_backward(
     pair_gradients (P, PROJECTED). Writes screen_gradient (N,) too: the length of the gradient with
     respect to the projected center in units of half the image, for density control.
     """
+    call_helpers(work)
     sh = splats.sh
     v_sh = gradients.sh
     half_size = HALF * np.float32(frames.size[0]), HALF * np.float32(frames.size[1])

@@ -69,6 +69,10 @@ class BufferPool:
             buffer = self._buffers[name] = np.zeros(size + size // 8, dtype)
         return buffer[:size].reshape(shape)
 
+    def room(self, name: str) -> int:
+        """How many values the name's array has had room for."""
+        return len(self._buffers.get(name, ()))
+
     def kept(self, name: str, key: tuple[int, ...], make: Callable[..., np.ndarray]) -> np.ndarray:
         """make(*key), which nobody writes to; the same array as long as the key is the same."""
         if name not in self._kept or self._kept[name][0] != key:
@@ -275,55 +279,44 @@ def sort_into_tiles(
     tile_blocks (tiles,): see `find_needed_blocks`. Returns the lists, and the tiles (T,) int32 with
     a needed block in the order in which they are rendered.
     """
-    rect = projection.rect
-    visible, order, first_pair, pairs, total = sort_by_depth(projection, buffers)
-    counts = buffers.get("counts", (tiling.SORT_PARTS, len(tile_blocks)), np.int32)
-    splat_pairs, pair_splat = (
-        buffers.get(name, (total,), np.int32) for name in ("splat_pairs", "pair_splat")
-    )
-    tiling.count_pairs(rect, order, tiles_x, counts)
-    start, tiles = tiling.arrange_tiles(counts, tile_blocks)
-    tiling.fill_pairs(rect, order, tiles_x, counts, first_pair, splat_pairs, pair_splat)
-    return TileLists(visible, first_pair, pairs, splat_pairs, start, pair_splat), tiles
-
-
-def sort_by_depth(
-    projection: Projection, buffers: BufferPool
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, int]:
-    """The visible splats (M,) int32, the same near to far, where the pairs of each splat begin and
-    how many they are (N,), and how many there are in all; see `TileLists`. Equal depths keep their
-    order.
-
-    Least-significant-digit radix sort on the bits of the float: positive floats order like their
-    bits. Counted from the least, the depths of a head have 22 bits, and take two of the three
-    passes.
-    """
     (n,) = projection.depth.shape
     found, visible, order, moved, first_pair, pairs = (
         buffers.get(name, (n,), np.int32)
         for name in ("found", "visible", "order", "moved", "first_pair", "pairs")
     )
     keys, moved_keys = (buffers.get(name, (n,), np.uint32) for name in ("keys", "moved_keys"))
-    parts = buffers.get("parts", (tiling.parts_of(n) + 1, 4), np.int64)
-    counts = buffers.get("digits", (tiling.parts_of(n), tiling.DIGITS), np.int32)
-    depth_bits = projection.depth.view(np.uint32)
-    tiling.list_visible(projection.rect, depth_bits, found, keys, pairs, first_pair, parts, counts)
-    least, greatest = tiling.sum_parts(parts, counts)
-    splats = int(parts[-1, tiling.SPLATS])
-    total = int(parts[-1, tiling.PAIRS])
-    visible = visible[:splats]
-    tiling.move_visible(parts, found, keys, counts, first_pair, visible, moved_keys, order)
-    keys, moved_keys = moved_keys[:splats], keys[:splats]
-    order = order[:splats]
-    moved = moved[:splats]
-    counts = counts[: tiling.parts_of(splats)]
-    for shift in range(tiling.RADIX_BITS, greatest.bit_length(), tiling.RADIX_BITS):
-        digit = np.uint32(least), np.uint32(shift)
-        tiling.count_digits(counts, keys, *digit)
-        tiling.sum_counts(counts)
-        tiling.move_by_digit(counts, keys, order, *digit, moved_keys, moved)
-        keys, moved_keys, order, moved = moved_keys, keys, moved, order
-    return visible, order, first_pair, pairs, total
+    parts = tiling.parts_of(n)
+    totals = np.zeros(5, np.int64)
+    sorting = tiling.Sorting(
+        parts=buffers.get("parts", (parts, 4), np.int64),
+        found=found,
+        keys=keys,
+        order=order,
+        moved_keys=moved_keys,
+        moved=moved,
+        digits=buffers.get("digits", (parts, tiling.DIGITS), np.int32),
+        counts=buffers.get("counts", (tiling.SORT_PARTS, len(tile_blocks)), np.int32),
+        totals=totals,
+    )
+    start = np.zeros(len(tile_blocks) + 1, np.int64)
+    tiles = np.empty(len(tile_blocks), np.int32)
+    room = buffers.room("pair_splat")
+    while True:
+        splat_pairs, pair_splat = (
+            buffers.get(name, (room,), np.int32) for name in ("splat_pairs", "pair_splat")
+        )
+        lists = TileLists(visible, first_pair, pairs, splat_pairs, start, pair_splat)
+        tiling.list_pairs(projection, tiles_x, tile_blocks, lists, tiles, sorting)
+        splats, found_pairs = totals[:2].tolist()
+        if found_pairs <= room:
+            break
+        room = found_pairs
+    lists = lists._replace(
+        visible=visible[:splats],
+        splat_pairs=splat_pairs[:found_pairs],
+        pair_splat=pair_splat[:found_pairs],
+    )
+    return lists, tiles[: totals[tiling.RENDERED]]
 
 
 def tile_grid(width: int, height: int) -> tuple[int, int]:

@@ -5,7 +5,7 @@ import math
 import numpy as np
 
 from . import part_jit
-from .threads import parallel, pieces
+from .threads import call_helpers, parallel, pieces
 
 ZERO, EIGHTH, HALF, ONE, TWO, PI = (
     np.float32(value) for value in (0.0, 0.125, 0.5, 1.0, 2.0, np.pi)
@@ -85,6 +85,7 @@ def add_lights(
     eye (3,). roughness, reflectance (N,): of the highlight; a roughness of 0 has none. lit (maps,
     N): see MAP.
     """
+    call_helpers(work)
     for begin, end in pieces(work):
         for n in range(begin, end):
             px = points[n, 0]

@@ -5,7 +5,7 @@ import math
 import numpy as np
 
 from . import jit
-from .threads import parallel, pieces
+from .threads import call_helpers, parallel, pieces
 
 ZERO = np.float32(0.0)
 ONE = np.float32(1.0)
@@ -71,6 +71,7 @@ def lit_shares(work, depth, points, bias, step, lit):
     step: texels between the 3 × 3 places that are looked up bilinearly around a point; 0: one
     place.
     """
+    call_helpers(work)
     size = len(depth)
     reach = 1 if step > 0 else 0
     for begin, end in pieces(work):

@@ -1,6 +1,7 @@
 """Sorting of projected splats into tiles, front to back."""
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
@@ -8,7 +9,7 @@ from . import inline_jit, jit, part_jit
 from .blend import BLOCKS, BLOCKS_ALONG, RUN_TILES, SIDE
 from .elementary import prefetch
 from .layout import MEAN_X, MEAN_Y, PRECISION_X, PRECISION_Y, SHEAR
-from .threads import parallel, pieces
+from .threads import call_helpers, end_stages, parallel, stage
 
 RADIX_BITS = 11
 DIGITS = 1 << RADIX_BITS
@@ -17,8 +18,8 @@ SPLATS_PER_SORT = 4_096
 SORT_PARTS = 16
 """Parallel parts: the splats, sorted near to far, are cut into as many of equal length."""
 SPLATS, PAIRS, LEAST, GREATEST = range(4)
-"""Columns of what `list_visible` finds in a part: splats with a tile, their pairs, and the bounds
-of their keys."""
+"""Columns of what is found in a part: splats with a tile, their pairs, and the bounds of their
+keys."""
 RUN_BUCKETS = 512
 """Kinds of runs of tiles, by how many pairs they have."""
 
@@ -28,42 +29,25 @@ def _digit(key, least, shift):
     return np.uint64((np.uint32(key - least) >> shift) & np.uint32(DIGITS - 1))
 
 
-@parallel(lambda rect, *_: parts_of(len(rect)))
-def list_visible(work, rect, depth_bits, found, keys, pairs, first_pair, parts, counts):
-    """List the splats with tiles in their bounds, rect (N, 4), by parts of SPLATS_PER_SORT splats.
+class Sorting(NamedTuple):
+    """Where `list_pairs` works, for N splats: parts (parts_of(N), 4) int64, see SPLATS; found,
+    order and moved (N,) int32, keys and moved_keys (N,) uint32; digits (parts, DIGITS) and counts
+    (SORT_PARTS, tiles) int32; totals (6,) int64, see FOUND."""
 
-    Writes from each part's first place on its visible splats to found (N,) int32, and their keys,
-    the bits of their depths (N,), to keys (N,) uint32. pairs, first_pair (N,) int32: how many pairs
-    each splat has, and how many in its part come before. parts (parts + 1, 4) int64: see SPLATS.
-    counts (parts, DIGITS) int32: of the keys' lowest digits.
-    """
-    for part, past_part in pieces(work):
-        for k in range(part, past_part):
-            row = counts[k]
-            count = np.uint64(0)
-            before = np.int32(0)
-            row[:] = 0
-            begin = np.uint64(k * SPLATS_PER_SORT)
-            least = np.uint32(0xFFFFFFFF)
-            greatest = np.uint32(0)
-            # Without a branch: the processor could not foresee which splats a local iteration sees.
-            for i in range(begin, np.uint64(min(len(rect), (k + 1) * SPLATS_PER_SORT))):
-                width = rect[i, 2] - rect[i, 0]
-                key = depth_bits[i]
-                seen = width > 0
-                found[begin + count] = i
-                keys[begin + count] = key
-                pairs[i] = width * (rect[i, 3] - rect[i, 1])
-                first_pair[i] = before
-                count = count + np.uint64(seen)
-                before = np.int32(before + pairs[i])
-                row[_digit(key, np.uint32(0), np.uint32(0))] += seen
-                least = min(least, key if seen else least)
-                greatest = max(greatest, key if seen else greatest)
-            parts[k, SPLATS] = count
-            parts[k, PAIRS] = before
-            parts[k, LEAST] = least
-            parts[k, GREATEST] = greatest
+    parts: np.ndarray
+    found: np.ndarray
+    keys: np.ndarray
+    order: np.ndarray
+    moved_keys: np.ndarray
+    moved: np.ndarray
+    digits: np.ndarray
+    counts: np.ndarray
+    totals: np.ndarray
+
+
+FOUND, WRITTEN, LEAST_KEY, KEY_SPAN, RENDERED = range(5)
+"""Of all splats: those with a tile; their pairs; what keys are counted from, of lowest digit 0, so
+that a key's lowest digit is its own; the greatest counted from there; tiles to be rendered."""
 
 
 def parts_of(splats: int) -> int:
@@ -71,20 +55,110 @@ def parts_of(splats: int) -> int:
     return -(-splats // SPLATS_PER_SORT)
 
 
-@jit
-def sum_parts(parts, counts):
-    """Turn the splats and pairs of `list_visible`'s parts into those of the parts before, with a
-    last row of all, and its counts of digits into places.
+@parallel(lambda projection, *_: max(1, parts_of(len(projection.rect))))
+def list_pairs(work, projection, tiles_x, tile_blocks, lists, tiles, sorting):
+    """Write `lists`, see `TileLists`, of splats that reach tiles, all parts together; tile_blocks
+    (tiles,) as of `find_needed_blocks`; tiles (tiles,) int32: first the RENDERED ones with a needed
+    block, in the order in which they are rendered.
 
-    Returns what all keys are counted from, of lowest digit 0, so that a key's lowest digit is its
-    own, and the greatest of the keys counted from there.
+    Least-significant-digit radix sort on the bits of the depth: positive floats order like their
+    bits. Counted from the least, the depths of a head have 22 bits, and take two of the three
+    passes. Equal depths keep their order. Where the pairs need more room than `lists` has, only
+    `totals` is of use.
     """
+    call_helpers(work)
+    rect = projection.rect
+    totals = sorting.totals
+    keys = sorting.keys
+    order = sorting.order
+    moved_keys = sorting.moved_keys
+    moved = sorting.moved
+    parts = len(sorting.parts)
+    for k in stage(work, 0, parts):
+        _list_visible(k, projection, lists, sorting)
+    for _ in stage(work, 1, 1):
+        _sum_parts(sorting)
+    for k in stage(work, 2, parts):
+        _move_visible(k, lists, sorting)
+    keys, moved_keys = moved_keys, keys
+    splats = totals[FOUND]
+    parts = (splats + SPLATS_PER_SORT - 1) // SPLATS_PER_SORT
+    step = np.int64(3)
+    shift = np.int64(RADIX_BITS)
+    while totals[KEY_SPAN] >> shift != 0:
+        least = np.uint32(totals[LEAST_KEY])
+        for k in stage(work, step, parts):
+            _count_digits(k, sorting.digits[k], keys[:splats], least, np.uint32(shift))
+        for _ in stage(work, step + 1, 1):
+            _sum_counts(sorting.digits[:parts])
+        for k in stage(work, step + 2, parts):
+            place = sorting.digits[k]
+            values = order[:splats]
+            _move_by_digit(k, place, keys, values, least, np.uint32(shift), moved_keys, moved)
+        keys, moved_keys = moved_keys, keys
+        order, moved = moved, order
+        step += 3
+        shift += RADIX_BITS
+    fits = totals[WRITTEN] <= len(lists.pair_splat)
+    if fits:
+        for k in stage(work, step, SORT_PARTS):
+            _count_pairs(k, rect, order[:splats], tiles_x, sorting.counts[k])
+        for _ in stage(work, step + 1, 1):
+            totals[RENDERED] = _arrange_tiles(sorting.counts, tile_blocks, lists.start, tiles)
+        for k in stage(work, step + 2, SORT_PARTS):
+            _fill_pairs(k, rect, order[:splats], tiles_x, sorting.counts[k], lists)
+    end_stages(work)
+
+
+@inline_jit
+def _list_visible(k, projection, lists, sorting):
+    """List the splats of a part with tiles in their bounds, and their keys, from the part's first
+    place on; `pairs`, and in `first_pair` how many pairs of the part come before."""
+    rect = projection.rect
+    depth_bits = projection.depth.view(np.uint32)
+    found = sorting.found
+    keys = sorting.keys
+    pairs = lists.pairs
+    first_pair = lists.first_pair
+    parts = sorting.parts
+    row = sorting.digits[k]
+    count = np.uint64(0)
+    before = np.int32(0)
+    row[:] = 0
+    begin = np.uint64(k * SPLATS_PER_SORT)
+    least = np.uint32(0xFFFFFFFF)
+    greatest = np.uint32(0)
+    # Without a branch: the processor could not foresee which splats a local iteration sees.
+    for i in range(begin, np.uint64(min(len(rect), (k + 1) * SPLATS_PER_SORT))):
+        width = rect[i, 2] - rect[i, 0]
+        key = depth_bits[i]
+        seen = width > 0
+        found[begin + count] = i
+        keys[begin + count] = key
+        pairs[i] = width * (rect[i, 3] - rect[i, 1])
+        first_pair[i] = before
+        count = count + np.uint64(seen)
+        before = np.int32(before + pairs[i])
+        row[_digit(key, np.uint32(0), np.uint32(0))] += seen
+        least = min(least, key if seen else least)
+        greatest = max(greatest, key if seen else greatest)
+    parts[k, SPLATS] = count
+    parts[k, PAIRS] = before
+    parts[k, LEAST] = least
+    parts[k, GREATEST] = greatest
+
+
+@inline_jit
+def _sum_parts(sorting):
+    """Turn the splats and pairs of parts into those of the parts before, their counts of digits
+    into places, and write `totals`."""
+    parts = sorting.parts
+    totals = sorting.totals
     splats = 0
     pairs = 0
     least = 0xFFFFFFFF
     greatest = 0
-    last = len(parts) - 1
-    for k in range(last):
+    for k in range(len(parts)):
         count = parts[k, SPLATS]
         before = parts[k, PAIRS]
         parts[k, SPLATS] = splats
@@ -93,15 +167,16 @@ def sum_parts(parts, counts):
         pairs = pairs + before
         least = min(least, parts[k, LEAST])
         greatest = max(greatest, parts[k, GREATEST])
-    parts[last, SPLATS] = splats
-    parts[last, PAIRS] = pairs
-    sum_counts(counts)
+    _sum_counts(sorting.digits)
     least = least // DIGITS * DIGITS
-    return least, max(0, greatest - least)
+    totals[FOUND] = splats
+    totals[WRITTEN] = pairs
+    totals[LEAST_KEY] = least
+    totals[KEY_SPAN] = max(0, greatest - least)
 
 
-@jit
-def sum_counts(counts):
+@part_jit
+def _sum_counts(counts):
     """Turn counts (parts, columns) int32 into places: column by column, in each one part after the
     other.
 
@@ -123,63 +198,56 @@ def sum_counts(counts):
     return start
 
 
-@parallel(lambda parts, *_: len(parts) - 1)
-def move_visible(work, parts, found, keys, place, first_pair, visible, moved_keys, moved):
-    """Write the splats of `list_visible`, M in all, to visible (M,), and with their keys sorted by
-    the lowest digit to moved (M,) and moved_keys (M,).
-
-    parts and `place`, the places of digits, as of `sum_parts`; `place` is advanced. first_pair
-    (N,): from now on counts the pairs of the parts before as well.
-    """
-    for part, past_part in pieces(work):
-        for k in range(part, past_part):
-            row = place[k]
-            begin = np.uint64(k * SPLATS_PER_SORT)
-            first = np.uint64(parts[k, SPLATS])
-            before = np.int32(parts[k, PAIRS])
-            for n in range(np.uint64(parts[k + 1, SPLATS] - parts[k, SPLATS])):
-                i = found[begin + n]
-                key = keys[begin + n]
-                visible[first + n] = i
-                first_pair[np.uint64(i)] += before
-                digit = _digit(key, np.uint32(0), np.uint32(0))
-                at = np.uint64(row[digit])
-                moved_keys[at] = key
-                moved[at] = i
-                row[digit] += 1
-
-
-@parallel(lambda counts, *_: len(counts))
-def count_digits(work, counts, keys, least, shift):
-    """Count in each part of the keys (M,) uint32, SPLATS_PER_SORT long, how often each digit
-    occurs.
-
-    The digit is that of the key minus `least`, from bit `shift` on, both uint32. counts (parts,
-    DIGITS) int32.
-    """
-    for part, past_part in pieces(work):
-        for k in range(part, past_part):
-            row = counts[k]
-            row[:] = 0
-            past = min(len(keys), (k + 1) * SPLATS_PER_SORT)
-            for n in range(np.uint64(k * SPLATS_PER_SORT), np.uint64(past)):
-                row[_digit(keys[n], least, shift)] += 1
+@inline_jit
+def _move_visible(k, lists, sorting):
+    """Write a part's splats to `visible`, and with their keys sorted by the lowest digit to
+    `order` and `moved_keys`; `first_pair` counts the pairs of the parts before from now on."""
+    parts = sorting.parts
+    found = sorting.found
+    keys = sorting.keys
+    moved_keys = sorting.moved_keys
+    order = sorting.order
+    visible = lists.visible
+    first_pair = lists.first_pair
+    row = sorting.digits[k]
+    begin = np.uint64(k * SPLATS_PER_SORT)
+    first = np.uint64(parts[k, SPLATS])
+    before = np.int32(parts[k, PAIRS])
+    is_last = k + 1 == len(parts)
+    past = sorting.totals[FOUND] if is_last else parts[k + 1, SPLATS]
+    for n in range(np.uint64(past) - first):
+        i = found[begin + n]
+        key = keys[begin + n]
+        visible[first + n] = i
+        first_pair[np.uint64(i)] += before
+        digit = _digit(key, np.uint32(0), np.uint32(0))
+        at = np.uint64(row[digit])
+        moved_keys[at] = key
+        order[at] = i
+        row[digit] += 1
 
 
-@parallel(lambda counts, *_: len(counts))
-def move_by_digit(work, place, keys, values, least, shift, moved_keys, moved):
-    """Write keys and values (M,) sorted by a digit; `place` holds the places of `sum_counts` and is
-    advanced."""
-    for part, past_part in pieces(work):
-        for k in range(part, past_part):
-            row = place[k]
-            past = min(len(keys), (k + 1) * SPLATS_PER_SORT)
-            for n in range(np.uint64(k * SPLATS_PER_SORT), np.uint64(past)):
-                digit = _digit(keys[n], least, shift)
-                at = np.uint64(row[digit])
-                moved_keys[at] = keys[n]
-                moved[at] = values[n]
-                row[digit] += 1
+@inline_jit
+def _count_digits(k, row, keys, least, shift):
+    """Count how often each digit occurs in part k of the keys (M,) uint32: that of the key minus
+    `least`, from bit `shift` on, both uint32."""
+    row[:] = 0
+    past = min(len(keys), (k + 1) * SPLATS_PER_SORT)
+    for n in range(np.uint64(k * SPLATS_PER_SORT), np.uint64(past)):
+        row[_digit(keys[n], least, shift)] += 1
+
+
+@inline_jit
+def _move_by_digit(k, row, keys, values, least, shift, moved_keys, moved):
+    """Write part k of keys and values (M,) sorted by a digit; `row` holds its places of
+    `_sum_counts` and is advanced."""
+    past = min(len(values), (k + 1) * SPLATS_PER_SORT)
+    for n in range(np.uint64(k * SPLATS_PER_SORT), np.uint64(past)):
+        digit = _digit(keys[n], least, shift)
+        at = np.uint64(row[digit])
+        moved_keys[at] = keys[n]
+        moved[at] = values[n]
+        row[digit] += 1
 
 
 SPLATS_AHEAD = 16
@@ -213,42 +281,32 @@ def _next_tile(tile, column, width, tiles_x):
     return tile + step, one if is_last else column + one
 
 
-@parallel(lambda *_: SORT_PARTS)
-def count_pairs(work, rect, order, tiles_x, counts):
-    """Count the (splat, tile) pairs of each part of order (M,) int32: the splats, near to far.
-
-    rect (N, 4) int32 tile bounds. Writes counts (SORT_PARTS, tiles) int32.
-    """
-    for part, past_part in pieces(work):
-        for k in range(part, past_part):
-            row = counts[k]
-            row[:] = 0
-            past = np.uint64((k + 1) * len(order) // SORT_PARTS)
-            for n in range(np.uint64(k * len(order) // SORT_PARTS), past):
-                _prefetch_rect(rect, order, n, past)
-                i = np.uint64(order[n])
-                tile, width, total = _tiles_of(rect, i, tiles_x)
-                column = np.uint64(1)
-                for _ in range(total):
-                    row[tile] += 1
-                    tile, column = _next_tile(tile, column, width, tiles_x)
+@inline_jit
+def _count_pairs(k, rect, order, tiles_x, row):
+    """Count the pairs of part k of order (M,), the splats near to far, in each tile (tiles,)."""
+    row[:] = 0
+    past = np.uint64((k + 1) * len(order) // SORT_PARTS)
+    for n in range(np.uint64(k * len(order) // SORT_PARTS), past):
+        _prefetch_rect(rect, order, n, past)
+        i = np.uint64(order[n])
+        tile, width, total = _tiles_of(rect, i, tiles_x)
+        column = np.uint64(1)
+        for _ in range(total):
+            row[tile] += 1
+            tile, column = _next_tile(tile, column, width, tiles_x)
 
 
-@jit
-def arrange_tiles(counts, tile_blocks):
-    """Turn the counts of `count_pairs` into the offset of each part's pairs in each tile's list.
-
-    tile_blocks (tiles,) as of `find_needed_blocks`. Returns start (tiles + 1,) int64: where each
-    tile's list begins, and tiles (T,) int32: those with a needed block, in the order in which they
-    are rendered.
-    """
-    start = sum_counts(counts)
-    tiles = np.empty(len(tile_blocks), np.int32)
+@inline_jit
+def _arrange_tiles(counts, tile_blocks, start, tiles):
+    """Turn the counts of `_count_pairs` into the offset of each part's pairs in each tile's list;
+    write start (tiles + 1,), where these begin, and the tiles to be rendered. Returns how many."""
+    start[:] = _sum_counts(counts)
     count = 0
     for tile in range(len(tile_blocks)):
         tiles[count] = tile
         count += tile_blocks[tile] != 0
-    return start, heaviest_first(tiles[:count], start)
+    tiles[:count] = heaviest_first(tiles[:count], start)
+    return count
 
 
 @part_jit
@@ -276,30 +334,26 @@ def heaviest_first(tiles, start):
     return ordered
 
 
-@parallel(lambda *_: SORT_PARTS)
-def fill_pairs(work, rect, order, tiles_x, place, first_pair, splat_pairs, pair_splat):
-    """Write every tile's pairs front to back; `place` holds the offsets of `arrange_tiles` and is
-    advanced.
-
-    pair_splat (P,) int32: whose pair it is. splat_pairs (P,) int32: where the pairs of a splat
-    stand, its first at first_pair[i].
-    """
-    for part, past_part in pieces(work):
-        for k in range(part, past_part):
-            row = place[k]
-            past = np.uint64((k + 1) * len(order) // SORT_PARTS)
-            for n in range(np.uint64(k * len(order) // SORT_PARTS), past):
-                _prefetch_rect(rect, order, n, past)
-                i = np.uint64(order[n])
-                tile, width, total = _tiles_of(rect, i, tiles_x)
-                first = np.uint64(first_pair[i])
-                column = np.uint64(1)
-                for found in range(first, first + total):
-                    at = row[tile]
-                    row[tile] = at + 1
-                    pair_splat[np.uint64(at)] = i
-                    splat_pairs[found] = at
-                    tile, column = _next_tile(tile, column, width, tiles_x)
+@inline_jit
+def _fill_pairs(k, rect, order, tiles_x, row, lists):
+    """Write part k's pairs to every tile's list; `row` holds its offsets of `_arrange_tiles` and is
+    advanced."""
+    first_pair = lists.first_pair
+    splat_pairs = lists.splat_pairs
+    pair_splat = lists.pair_splat
+    past = np.uint64((k + 1) * len(order) // SORT_PARTS)
+    for n in range(np.uint64(k * len(order) // SORT_PARTS), past):
+        _prefetch_rect(rect, order, n, past)
+        i = np.uint64(order[n])
+        tile, width, total = _tiles_of(rect, i, tiles_x)
+        first = np.uint64(first_pair[i])
+        column = np.uint64(1)
+        for found in range(first, first + total):
+            at = row[tile]
+            row[tile] = at + 1
+            pair_splat[np.uint64(at)] = i
+            splat_pairs[found] = at
+            tile, column = _next_tile(tile, column, width, tiles_x)
 
 
 def whole_tiles(count: int) -> np.ndarray:

@@ -5,9 +5,9 @@ from itertools import pairwise
 
 import numpy as np
 
-from ...raster.cpu.image_loss import LOSS_REACH_PX, add_up, image_loss
+from ...raster.cpu.image_loss import LOSS_REACH_PX, image_loss
 from ...raster.cpu.layout import TILE
-from ...raster.cpu.threads import threads
+from ...raster.cpu.threads import PROCESSORS, threads
 from ...raster.cpu.tiles import box_groups
 
 BAND_TILES = 4
@@ -29,7 +29,7 @@ def whole_image(height: int, width: int, bands: int | None = None) -> np.ndarray
     """Rectangles (R, 4) of pixels x0, y0, x1, y1 that tile an image; each channel of one is one
     thread's work. bands: how many, over the whole width, because pixels beyond left and right edges
     cost more; by default, so many that the threads are done soonest."""
-    count = min(bands or _bands(height, threads()), height)
+    count = min(bands or _bands(height, min(threads(), PROCESSORS)), height)
     tops = [height * n // count for n in range(count + 1)]
     return np.array([[0, y0, width, y1] for y0, y1 in pairwise(tops)], np.int64)
 
@@ -53,9 +53,11 @@ def image_gradient(
     image, out (3, H, W) float32; target (H, W, 3) uint8.
     """
     sums = np.zeros((2, 3, sum(y1 - y0 for _, y0, _, y1 in rectangles.tolist())))
+    totals = np.zeros(2)
     share = 1.0 / image.size
-    image_loss(image, target, rectangles, np.float32(ssim_weight), np.float32(share), out, sums)
-    l1, ssim = add_up(sums)
+    factors = np.float32(ssim_weight), np.float32(share)
+    image_loss(image, target, rectangles, *factors, out, sums, totals)
+    l1, ssim = totals.tolist()
     return l1 * share, ssim * share
 
 

@@ -13,6 +13,7 @@ from ...raster.cpu import USES_BUNDLED_KERNELS, image_loss, optimizer
 from ...raster.cpu.layout import Parameters
 from ...raster.cpu.precompile import compile_gradients, rasterizer_helper
 from ...raster.cpu.rasterize import frames_in_camera, render_backward, render_forward
+from ...raster.cpu.threads import Team
 from ...render.device import adapter_name
 from ...worker.launch import is_preparing
 from . import adam
@@ -67,7 +68,10 @@ def _render() -> None:
 
 
 def _step() -> None:
-    """Limits, replacement of the background, loss and Adam."""
+    """Limits, replacement of the background, loss and Adam; and what helpers run."""
+    team = Team(1)
+    team.start()
+    team.dismiss()
     image = np.zeros((3, 16, 16), np.float32)
     target = np.zeros((16, 16, 3), np.uint8)
     mask = np.zeros((16, 16), np.uint8)
