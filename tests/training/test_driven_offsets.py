@@ -76,7 +76,7 @@ def test_the_step_is_adams_on_the_gradient_of_the_loss(toy, name):
     strongest = touched[np.argsort(-np.abs(gradient[touched]).max((1, 2)))[:6]]
     for face in strongest:
         component, axis = np.unravel_index(np.abs(gradient[face]).argmax(), (3, 3))
-        step = 5e-4 if offset.target == POSITION else 5e-3
+        step = 1e-4 if offset.target == POSITION else 5e-3
         ends = []
         for sign in (1, -1):
             changed = before.copy()

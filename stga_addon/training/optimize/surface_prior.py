@@ -28,8 +28,8 @@ plausible at a turn; the least share of the way that is worth it."""
 HIDDEN_ORDER = 1
 HIDDEN_OPACITY = 3.0
 HIDDEN_FLATNESS = 0.25
-"""Of the layer on hidden triangles: order of the lattice, logit, and how much thinner it is than
-the lattice's splats."""
+"""Of the layer on hidden triangles: order of the lattice where none is chosen, logit, and how much
+thinner it is than the lattice's splats."""
 BORDER_INSET = 0.6
 """Of the distance from the middle of a triangle, and of the scale, at the mesh's edge."""
 HEAD_RADIUS_VOXELS = 22.5
@@ -180,7 +180,7 @@ def hidden_splats(frames: FrameStore, settings: TrainingSettings) -> Splats:
     layer = lattice_splats(
         capture.neutral,
         capture.faces,
-        HIDDEN_ORDER,
+        HIDDEN_ORDER if settings.lattice is None else settings.lattice,
         settings.sh_degree,
         HIDDEN_OPACITY,
         convention=frames.convention,

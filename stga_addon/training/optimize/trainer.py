@@ -249,11 +249,16 @@ def _placed_splats(frames: FrameStore, settings: TrainingSettings) -> tuple[Trai
     capture = frames.capture
     triangles = len(capture.faces)
     splats = initial_splats(capture, settings)
-    splats = splats.rows(splats.unbound | ~frames.surface.hidden[splats.face])
+    hidden = ~splats.unbound & frames.surface.hidden[splats.face]
+    layer = hidden_splats(frames, settings)
+    color = np.zeros((triangles, 3), np.float32)
+    color[splats.face[hidden]] = splats.sh[hidden, 0]
+    layer.sh[:, 0] = color[layer.face]
+    splats = splats.rows(~hidden)
     orders = settings.lattice_order, settings.first_lattice_order
     whole, first = (splats_per_triangle(order(triangles)) for order in orders)
     lattice = int((~splats.unbound).sum())
-    splats = joined([splats, hidden_splats(frames, settings)])
+    splats = joined([splats, layer])
     state = new_state(splats, unseen_share(capture, settings.convention, splats))
     state = with_offsets(state, settings.driven_offsets, triangles)
     return state, len(state) + lattice * whole // first - lattice

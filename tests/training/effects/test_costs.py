@@ -17,6 +17,7 @@ from stga_addon.training.effects.plan import plan_effects
 from stga_addon.training.optimize import cpu_backend, frames, initial_splats, trainer
 from stga_addon.training.optimize.density import DensityControl
 from stga_addon.training.optimize.image_preparation import exposure_correction
+from stga_addon.training.optimize.surface import Surface
 from stga_addon.training.run import session
 from stga_addon.training.run.checkpoint import read_checkpoint
 from stga_addon.training.run.folder import Run
@@ -63,7 +64,8 @@ def test_off_calls_nothing_and_on_calls_all(painted, tmp_path, monkeypatch):
     assert calls == {}
     assert state.parameters.sh.shape[1] == 1
     assert not state.driven_offsets
-    assert len(state) == 6 * len(painted().faces)
+    hidden = int(Surface(painted()).hidden.sum())  # half as many
+    assert len(state) == 6 * len(painted().faces) - 3 * hidden
     calls, state = train(painted(), tmp_path / "on", monkeypatch, "on")
     assert set(calls) == set(CALLS)
     assert calls["background"] == ITERATIONS
