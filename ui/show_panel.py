@@ -55,6 +55,9 @@ class ShowPanel(SidebarPanel, bpy.types.Panel):
         except StgaError as error:
             layout.label(text=str(error), icon="ERROR")
             return
+        filmed = settings.splats.get(tags.FILMED)
+        if filmed:
+            draw_text(layout, context, f"{filmed.capitalize()}: the rest is plausible", "INFO")
         mode = splat_object.display_mode(settings.splats)
         layout.operator_menu_enum("stga.choose_display", "display", text=f"Display: {mode}")
         column = layout.column(align=True)

@@ -47,6 +47,10 @@ MIN_SCALE_CHANGE = 0.02
 """Of splats that follow a signal: what never changes them by as much is not kept."""
 
 
+UNSEEN_REGION = "unseen"
+"""Region of the outside's triangles that no training view looked at: they are plausible only."""
+
+
 @dataclass(frozen=True)
 class AvatarLight:
     """Estimated once per run (`light.estimate`), by vertex of the neutral mesh.

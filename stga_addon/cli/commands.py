@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..avatar.file import read_avatar
+from ..avatar.filmed import filmed_sides
 from ..capture.model import Capture, summarize_capture
 from ..capture.open import open_capture
 from ..errors import StgaError, printable
@@ -342,6 +343,8 @@ def _info(options: Namespace, head: OpenHead | None) -> None:
         if avatar.light:
             light = describe_light(avatar.light)
         rows = [("splats", f"{len(avatar.splats)}, {len(avatar.faces)} triangles")]
+        sides = filmed_sides(avatar)
+        rows += [("sides", f"{sides}; what nobody filmed is plausible")] if sides else []
         rows += [(name, text.strip()) for name, _, text in (line.partition(":") for line in light)]
         print(*format_table(rows), sep="\n")
         return

@@ -19,6 +19,7 @@ IMAGE_SIZE = "stga_image_size"  # on a camera: width, height in pixels
 PIXEL_ASPECT = "stga_pixel_aspect"  # on a camera: fl_x / fl_y, the height of a pixel over its width
 CONVENTION = "stga_convention"  # on splats that follow a head: `Avatar.convention`
 ANTIALIASED = "stga_antialiased"  # on splats that follow a head: `Avatar.antialiased`
+FILMED = "stga_filmed"  # on splats that follow a head: `avatar.filmed.filmed_sides`
 REVISION = "stga_revision"  # on a splat object's mesh: changes whenever splats are written into it
 RELIT_FRAME = "stga_relit_frame"  # on that mesh: the frame in whose light other engines show it
 AVATAR = "stga_avatar"  # on splats that follow a head: the file of their avatar

@@ -1,5 +1,6 @@
 """What outlines tell of a head's surface, and what splats are like that no view tells of."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -7,6 +8,8 @@ import pytest
 from PIL import Image
 from scipy.ndimage import binary_dilation
 
+from stga_addon.avatar.file import UNSEEN_REGION, Avatar
+from stga_addon.avatar.filmed import filmed_sides
 from stga_addon.avatar.splats import SH_C0
 from stga_addon.capture.camera import look_at
 from stga_addon.capture.mesh_geometry import rasterize, silhouette
@@ -176,3 +179,21 @@ def test_what_views_tell_is_kept(filmed):
     edges = np.diff(filmed.neutral[filmed.faces[state.face[rows]]], axis=1).swapaxes(0, 1)
     skin = -0.1 * np.sqrt(np.linalg.norm(np.cross(*edges), axis=1))
     np.testing.assert_allclose(height, np.where(outer > 0, outer, skin), atol=1e-5)
+
+
+def test_the_sides_that_were_filmed(filmed):
+    """Catches left for right, the surface that is seen for where cameras were, and a turn of the
+    mesh."""
+    empty = hidden_splats(FrameStore(filmed, "stga"), quick_settings()).rows([])
+
+    def sides_of(turn: np.ndarray, angles: range) -> str:
+        views = tuple(view for view in filmed.views["train"] if view.timestep in angles)
+        hidden = Surface(replace(filmed, views={"train": views})).hidden
+        regions = {**filmed.regions, UNSEEN_REGION: hidden}
+        neutral = (filmed.neutral @ turn.T).astype(np.float32)
+        return filmed_sides(Avatar(empty, "stga", neutral, filmed.faces, regions=regions))
+
+    turned = np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]])
+    for turn in (np.eye(3), turned):
+        assert sides_of(turn, range(9)) == "filmed from 60° on its right to 60° on its left"
+        assert sides_of(turn, range(4, 9)) == "filmed from 0° on its right to 60° on its left"

@@ -10,6 +10,7 @@ import bpy
 import numpy as np
 
 from ...avatar.file import Avatar, AvatarLight
+from ...avatar.filmed import filmed_sides
 from ...avatar.offsets import OFFSETS
 from ...avatar.splats import Splats
 from ...errors import StgaError
@@ -79,6 +80,7 @@ def show_avatar(
         _exchange_tree(splat_object, splat_nodes.splat_tree(_tree_options(avatar)))
     splat_object[tags.CONVENTION] = avatar.convention
     splat_object[tags.ANTIALIASED] = avatar.antialiased
+    splat_object[tags.FILMED] = filmed_sides(avatar)
     set_input(splat_object, splat_nodes.HEAD, head)
     before = get_input(splat_object, splat_nodes.NEUTRAL)
     # In no collection: it is never displayed, and exists as long as the splats that point to it.

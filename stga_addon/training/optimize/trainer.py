@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ...avatar.file import Avatar
+from ...avatar.file import UNSEEN_REGION, Avatar
 from ...avatar.lattice import splats_per_triangle
 from ...avatar.splats import joined
 from ...capture.model import Capture, View
@@ -208,7 +208,7 @@ class Trainer:
             neutral=capture.neutral.astype(np.float32),
             faces=capture.faces,
             settings=to_json(settings),
-            regions=dict(capture.regions),
+            regions={**capture.regions, UNSEEN_REGION: self.frames.surface.hidden},
             background=settings.background,
             antialiased=settings.antialiased,
             principal_point=principal_point,

@@ -1,0 +1,51 @@
+"""Which sides of a head were filmed."""
+
+import numpy as np
+
+from ..flame.quaternions import unit
+from .file import UNSEEN_REGION, Avatar
+
+SECTOR_DEG = 10
+"""Of directions around the head that are filmed or not as a whole."""
+MAX_SLOPE = 0.5
+"""Of surfaces that count, up or down: others look to no side."""
+SEEN_TO_DEG = 90
+"""How far from a camera's direction a surface is seen."""
+
+
+def filmed_sides(avatar: Avatar) -> str:
+    """What training views looked at, as in "filmed from 50° on its right to 50° on its left";
+    "" where the avatar does not know it, or where its eyes and mouth are."""
+    unseen = avatar.regions.get(UNSEEN_REGION)
+    names = ("left_eye", "right_eye", "mouth")
+    known = [avatar.regions[name] for name in names if name in avatar.regions]
+    if unseen is None or len(known) < len(names) or not all(region.any() for region in known):
+        return ""
+    corners = np.asarray(avatar.neutral, np.float64)[avatar.faces]
+    center = corners.mean(1)
+    left, right, mouth = (center[region].mean(0) for region in known)
+    across = unit(left - right)
+    up = (left + right) / 2 - mouth
+    up = unit(up - (up @ across) * across)
+    ahead = np.cross(across, up)
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    area = np.linalg.norm(normal, axis=1)
+    normal = unit(normal, 1e-20)
+    outwards = ((center - center.mean(0)) * normal).sum(1) > 0
+    rows = np.flatnonzero(outwards & (np.abs(normal @ up) < MAX_SLOPE))
+    angle = np.degrees(np.arctan2(normal[rows] @ across, normal[rows] @ ahead))
+    sectors = 180 // SECTOR_DEG
+    reach = []
+    for side in (-1, 1):
+        number = (side * angle // SECTOR_DEG).astype(int)
+        is_side = number >= 0
+        total, hidden = (
+            np.bincount(number[is_side], weights[rows][is_side], sectors)[:sectors]
+            for weights in (area, area * unseen)
+        )
+        dark = np.flatnonzero(hidden > total / 2)
+        reach.append(dark[0] * SECTOR_DEG - SEEN_TO_DEG if len(dark) else None)
+    if reach == [None, None]:
+        return "filmed from all sides"
+    right_deg, left_deg = (SEEN_TO_DEG if end is None else max(0, int(end)) for end in reach)
+    return f"filmed from {right_deg}° on its right to {left_deg}° on its left"
