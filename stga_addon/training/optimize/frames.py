@@ -85,7 +85,7 @@ class FrameStore:
         beyond = max(self.surface.grazing_cosine, UNSEEN_COSINE + 1e-9)
         cosines = UNSEEN_COSINE, beyond
         limits *= np.interp(self.surface.facing, cosines, (UNSEEN_LIMIT_SHARE, 1))
-        limits[:, self.surface.border] *= BORDER_LIMIT_SHARE
+        limits[0, self.surface.border] *= BORDER_LIMIT_SHARE  # a torso's unbound splats follow it
         return np.asarray(limits, np.float32)
 
     def stray_limits(self, settings: TrainingSettings) -> np.ndarray:
