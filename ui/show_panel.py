@@ -57,7 +57,7 @@ class ShowPanel(SidebarPanel, bpy.types.Panel):
             return
         filmed = settings.splats.get(tags.FILMED)
         if filmed:
-            draw_text(layout, context, f"{filmed.capitalize()}: the rest is plausible", "INFO")
+            draw_text(layout, context, filmed.capitalize(), "INFO")
         mode = splat_object.display_mode(settings.splats)
         layout.operator_menu_enum("stga.choose_display", "display", text=f"Display: {mode}")
         column = layout.column(align=True)

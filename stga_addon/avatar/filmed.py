@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from ..capture.mesh_geometry import head_axes, triangle_normals
 from ..flame.quaternions import unit
 from .file import UNSEEN_REGION, Avatar
 
@@ -14,21 +15,17 @@ SEEN_TO_DEG = 90
 
 
 def filmed_sides(avatar: Avatar) -> str:
-    """What training views looked at, as in "filmed from 50° on its right to 50° on its left";
-    "" where the avatar does not know it, or where its eyes and mouth are."""
+    """What training views looked at, as in "filmed from 50° on its right to 50° on its left; what
+    is beyond is plausible"; "" where the avatar does not know it, or where its eyes and mouth
+    are."""
     unseen = avatar.regions.get(UNSEEN_REGION)
-    names = ("left_eye", "right_eye", "mouth")
-    known = [avatar.regions[name] for name in names if name in avatar.regions]
-    if unseen is None or len(known) < len(names) or not all(region.any() for region in known):
-        return ""
     corners = np.asarray(avatar.neutral, np.float64)[avatar.faces]
     center = corners.mean(1)
-    left, right, mouth = (center[region].mean(0) for region in known)
-    across = unit(left - right)
-    up = (left + right) / 2 - mouth
-    up = unit(up - (up @ across) * across)
-    ahead = np.cross(across, up)
-    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    axes = head_axes(center, avatar.regions)
+    if unseen is None or axes is None:
+        return ""
+    across, up, ahead = axes[1]
+    normal = triangle_normals(corners)
     area = np.linalg.norm(normal, axis=1)
     normal = unit(normal, 1e-20)
     outwards = ((center - center.mean(0)) * normal).sum(1) > 0
@@ -48,4 +45,5 @@ def filmed_sides(avatar: Avatar) -> str:
     if reach == [None, None]:
         return "filmed from all sides"
     right_deg, left_deg = (SEEN_TO_DEG if end is None else max(0, int(end)) for end in reach)
-    return f"filmed from {right_deg}° on its right to {left_deg}° on its left"
+    reached = f"{right_deg}° on its right to {left_deg}° on its left"
+    return f"filmed from {reached}; what is beyond is plausible"

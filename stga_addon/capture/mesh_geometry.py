@@ -1,5 +1,6 @@
 """Triangle meshes: normals, parts, rigid alignment, and which triangle a camera's pixels show."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -11,6 +12,7 @@ ArrayPair = tuple[np.ndarray, np.ndarray]
 MAX_ITERATIONS = 100
 MIN_RESIDUAL = 1e-7  # Share of the mesh's size below which residuals are rounding
 CHUNK_PIXELS = 1 << 21  # Candidate pixels that are tested at a time, to bound the memory
+MIN_EYE_HEIGHT_SHARE = 0.1  # Of the eyes' distance from each other, over the mouth
 MIN_DEPTH_M = 0.01  # Triangles nearer to the camera's plane, or behind it, are not drawn
 
 
@@ -248,3 +250,23 @@ def _barycentric_slopes(corners: np.ndarray) -> np.ndarray:
 
 def _at(slopes: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
     return slopes[..., 0] * x + slopes[..., 1] * y + slopes[..., 2]
+
+
+def head_axes(
+    centers: np.ndarray, regions: Mapping[str, np.ndarray]
+) -> tuple[np.ndarray, np.ndarray, float] | None:
+    """The middle of the eyes (3,); the unit vectors (3, 3) to the head's left, up and ahead; the
+    height of the eyes over the mouth. Of triangles' centers (F, 3); None where eyes and mouth are
+    not known, or not apart."""
+    found = [regions.get(name) for name in ("left_eye", "right_eye", "mouth")]
+    if not all(region is not None and region.any() for region in found):
+        return None
+    left, right, mouth = (centers[region].mean(0) for region in found)
+    eyes = (left + right) / 2
+    across = unit(left - right)
+    up = eyes - mouth
+    up = up - (up @ across) * across
+    height = float(np.linalg.norm(up))
+    if not height > MIN_EYE_HEIGHT_SHARE * np.linalg.norm(left - right):
+        return None
+    return eyes, np.stack([across, up / height, np.cross(across, up / height)]), height

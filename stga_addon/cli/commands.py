@@ -344,7 +344,7 @@ def _info(options: Namespace, head: OpenHead | None) -> None:
             light = describe_light(avatar.light)
         rows = [("splats", f"{len(avatar.splats)}, {len(avatar.faces)} triangles")]
         sides = filmed_sides(avatar)
-        rows += [("sides", f"{sides}; what nobody filmed is plausible")] if sides else []
+        rows += [("sides", sides)] if sides else []
         rows += [(name, text.strip()) for name, _, text in (line.partition(":") for line in light)]
         print(*format_table(rows), sep="\n")
         return

@@ -16,7 +16,6 @@ from stga_addon.capture.open import open_capture
 from stga_addon.training.optimize.backend import RenderOptions
 from stga_addon.training.optimize.cpu_backend import CpuBackend
 from stga_addon.training.optimize.frames import (
-    BORDER_LIMIT_SHARE,
     UNSEEN_LIMIT_SHARE,
     FrameStore,
 )
@@ -263,8 +262,7 @@ def test_scale_limits_in_meters(toy, convention):
     facing = store.surface.facing
     share = np.interp(facing, (UNSEEN_COSINE, GRAZING_COSINE), (UNSEEN_LIMIT_SHARE, 1))
     assert 0 < (share < 1).mean() < 0.8
-    of_bound = share * np.where(store.surface.border, BORDER_LIMIT_SHARE, 1)
-    np.testing.assert_allclose(bound, 3 * of_bound * store.units, rtol=1e-6)
+    np.testing.assert_allclose(bound, 3 * share * store.units, rtol=1e-6)
     diagonal = np.linalg.norm(toy.neutral.max(0) - toy.neutral.min(0))
     frames = face_frames(toy.neutral, toy.faces, toy.neutral, convention)
     expected = 2 * max(0.004, diagonal / 200) * share

@@ -15,7 +15,6 @@ from stga_addon.flame.model import faces_within
 from stga_addon.flame.parts import flame_model, key_regions
 from stga_addon.training.optimize.change import Turn
 from stga_addon.training.optimize.frames import FrameStore
-from stga_addon.training.optimize.likeness import outside
 from stga_addon.training.optimize.surface import Surface
 from stga_addon.training.optimize.surface_prior import SurfacePrior
 from stga_addon.training.optimize.trainer import Trainer
@@ -189,7 +188,7 @@ def test_hair_goes_round_the_head(from_one_side, tmp_path):
     assert (sides.color[teeth].min(1) > 0.6).all()
     part = connected_parts(len(neutral), model.faces)[model.faces[:, 0]]
     mouth = centers[key_regions(model)["mouth"]].mean(0)
-    throat = sides.triangles & (part == part[0]) & ~outside(bare)
+    throat = sides.triangles & (part == part[0]) & ~Surface(bare).outside
     throat &= np.linalg.norm(centers - mouth, axis=1) < 0.04
     assert throat.sum() > 20
     assert (sides.color[throat].max(1) < 0.3).all()

@@ -26,8 +26,8 @@ BORDER_DISTANCE_SHARE = 0.6
 """Of the scale limits, on triangles that face away from all cameras: a large splat that serves an
 outline hangs in the air for other cameras. Of the limits of scale and distance, where the mesh
 ends."""
-SHELL_HEIGHT_SHARE = 0.8
-SHELL_VOXELS = 0.5
+LAYER_HEIGHT_SHARE = 0.8
+LAYER_VOXELS = 0.5
 SKIN_DEPTH = 0.1
 """Share of the height of hair at which its outer layer lies, less its own thickness; depth of that
 on skin, in the triangles' units, so that it does not stand out of the surface."""
@@ -96,10 +96,10 @@ class FrameStore:
         return np.asarray(settings.stray_limit * self.units * share + hair, np.float32)
 
     @cached_property
-    def shell_height(self) -> np.ndarray:
+    def layer_height(self) -> np.ndarray:
         """(F,) of the middle of hair's outer layer over each triangle, just below the surface on
         skin, in local units."""
-        inner = SHELL_HEIGHT_SHARE * self.surface.hair_height - SHELL_VOXELS * self.voxel
+        inner = LAYER_HEIGHT_SHARE * self.surface.hair_height - LAYER_VOXELS * self.voxel
         skin = -SKIN_DEPTH * self.units
         return np.asarray(np.where(inner > 0, inner / self.unit_lengths, skin), np.float32)
 

@@ -164,14 +164,18 @@ def mean_colors(capture: Capture, views: Sequence[View]) -> tuple[np.ndarray, np
     return total / np.maximum(count, 1)[:, None] / 255, count
 
 
+def mirrored(points: np.ndarray) -> np.ndarray:
+    """Points (N, 3) of a head, on its other side."""
+    return points * [-1, 1, 1] + [2 * points[:, 0].mean(), 0, 0]
+
+
 def mirror_images(
     capture: Capture, hidden: np.ndarray, shown: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Triangles that are `hidden` (F,) bool and whose mirror images are `shown`, and these; none
     where the mesh is not symmetric."""
     centers = capture.neutral[capture.faces].mean(1)
-    across = centers * [-1, 1, 1] + [2 * centers[:, 0].mean(), 0, 0]
-    distance, partner = cKDTree(centers).query(across)
+    distance, partner = cKDTree(centers).query(mirrored(centers))
     rows = np.flatnonzero(hidden & shown[partner])
     if np.median(distance) > MAX_ASYMMETRY_SHARE * np.linalg.norm(np.ptp(capture.neutral, axis=0)):
         rows = rows[:0]

@@ -6,16 +6,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
-from ...capture.camera import look_at
-from ...capture.mesh_geometry import connected_parts, rasterize
+from ...capture.mesh_geometry import connected_parts, head_axes
 from ...capture.model import Capture
 from ...flame.model import faces_within
-
-OUTSIDE_CAMERAS = 15
-OUTSIDE_DISTANCE = 4.0
-OUTSIDE_SIDE_PX = 240
-"""Cameras that tell the neutral head's outside from its inside; their distance, in its radius;
-width and height of their images."""
 
 SCALP_ANGLE_DEG = 66.0
 SCALP_ELEVATION_DEG = 38.0
@@ -32,8 +25,6 @@ eyes and above them; heights over the eyes."""
 HAIRLINE_DEG = (90.0, 140.0)
 HAIRLINE = (-0.55, -1.15)
 """Angles from straight ahead, and heights over the eyes in that unit, below which no hair grows."""
-MIN_UNIT_SHARE = 0.1
-"""Of the eyes' distance from each other, that they are above the mouth at least."""
 EAR_SIDE = 0.93
 EAR_LEVEL = -0.2
 EAR_HEIGHT = 0.75
@@ -84,39 +75,13 @@ class HeadCoordinates:
     unit: float
 
 
-def outside(capture: Capture) -> np.ndarray:
-    """(F,) bool: triangles of the neutral mesh that some camera around it sees."""
-    neutral = np.asarray(capture.neutral, np.float64)
-    center = neutral.mean(0)
-    radius = max(float(np.linalg.norm(neutral - center, axis=1).max()), 1e-9)
-    seen = np.zeros(len(capture.faces), bool)
-    focal = OUTSIDE_SIDE_PX * OUTSIDE_DISTANCE / 2.2
-    for number in range(OUTSIDE_CAMERAS):
-        angle = 2 * np.pi * number / OUTSIDE_CAMERAS
-        height = (-0.5, 0.2, 0.9)[number % 3]
-        eye = center + OUTSIDE_DISTANCE * radius * np.array([np.sin(angle), height, np.cos(angle)])
-        camera = look_at(eye, center, OUTSIDE_SIDE_PX, OUTSIDE_SIDE_PX, focal_length=focal)
-        triangle, _ = rasterize(neutral, capture.faces, camera)
-        seen[np.unique(triangle[triangle >= 0])] = True
-    return seen
-
-
 def head_coordinates(capture: Capture) -> HeadCoordinates | None:
     """None for a mesh whose eyes and mouth are not known, or not apart."""
     centers = np.asarray(capture.neutral, np.float64)[capture.faces].mean(1)
-    regions = [capture.regions.get(name) for name in ("left_eye", "right_eye", "mouth")]
-    if not all(region is not None and region.any() for region in regions):
+    axes = head_axes(centers, capture.regions)
+    if axes is None:
         return None
-    left, right, mouth = (centers[region].mean(0) for region in regions)
-    eyes = (left + right) / 2
-    across = (left - right) / max(float(np.linalg.norm(left - right)), 1e-12)
-    up = eyes - mouth
-    up -= (up @ across) * across
-    unit = float(np.linalg.norm(up))
-    if not unit > MIN_UNIT_SHARE * np.linalg.norm(left - right):
-        return None
-    up /= unit
-    ahead = np.cross(across, up)
+    eyes, (across, up, ahead), unit = axes
     middle = eyes + unit * (BROWS_OVER_EYES * up - EYES_TO_MIDDLE * ahead)
     x, y, z = ((centers - middle) @ axis for axis in (across, up, ahead))
     return HeadCoordinates(

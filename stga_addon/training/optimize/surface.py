@@ -7,12 +7,13 @@ import numpy as np
 from scipy.ndimage import binary_dilation
 from scipy.spatial import cKDTree
 
+from ...capture.camera import look_at
 from ...capture.images import read_view
-from ...capture.mesh_geometry import connected_parts, silhouette, triangle_normals
+from ...capture.mesh_geometry import connected_parts, rasterize, silhouette, triangle_normals
 from ...capture.model import Capture, View, evenly_spread, views_by_timestep
 from ...flame.quaternions import unit
-from .initial_splats import FEW_CAMERAS, SAMPLED_HEIGHT_PIXELS, voxel_size
-from .likeness import BROWS_LEVEL, head_coordinates, kinds_of, outside
+from .initial_splats import FEW_CAMERAS, SAMPLED_HEIGHT_PIXELS, mirrored, voxel_size
+from .likeness import BROWS_LEVEL, head_coordinates, kinds_of
 
 FACING_TIMESTEPS = 300
 FACING_MESHES = 48
@@ -28,6 +29,11 @@ OUTLINE_VIEWS = 16
 OUTLINE_COSINE = 0.2
 """Views whose outlines are measured, spread over all; the largest cosine of the angle between a
 camera and a triangle that lies in the mesh's outline."""
+OUTSIDE_CAMERAS = 15
+OUTSIDE_DISTANCE = 4.0
+OUTSIDE_SIDE_PX = 240
+"""Cameras that tell the neutral head's outside from its inside; their distance, in its radius;
+width and height of their images."""
 STEPS_PER_VOXEL = 4
 MAX_HEIGHT_VOXELS = 10
 OUTLINE_VOXELS = 1.5
@@ -63,7 +69,21 @@ class Surface:
     @cached_property
     def outside(self) -> np.ndarray:
         """(F,) bool: triangles of the neutral mesh that some camera around it sees."""
-        return outside(self.capture)
+        neutral = np.asarray(self.capture.neutral, np.float64)
+        center = neutral.mean(0)
+        radius = max(float(np.linalg.norm(neutral - center, axis=1).max()), 1e-9)
+        seen = np.zeros(len(self.capture.faces), bool)
+        focal = OUTSIDE_SIDE_PX * OUTSIDE_DISTANCE / 2.2
+        for number in range(OUTSIDE_CAMERAS):
+            angle = 2 * np.pi * number / OUTSIDE_CAMERAS
+            height = (-0.5, 0.2, 0.9)[number % 3]
+            eye = center + OUTSIDE_DISTANCE * radius * np.array(
+                [np.sin(angle), height, np.cos(angle)]
+            )
+            camera = look_at(eye, center, OUTSIDE_SIDE_PX, OUTSIDE_SIDE_PX, focal_length=focal)
+            triangle, _ = rasterize(neutral, self.capture.faces, camera)
+            seen[np.unique(triangle[triangle >= 0])] = True
+        return seen
 
     @cached_property
     def has_few_cameras(self) -> bool:
@@ -110,8 +130,7 @@ class Surface:
         if not len(measured):
             return height
         center = np.asarray(self.capture.neutral, np.float64)[self.capture.faces].mean(1)
-        across = center[measured] * [-1, 1, 1] + [2 * center[:, 0].mean(), 0, 0]
-        sources = cKDTree(np.concatenate([center[measured], across]))
+        sources = cKDTree(np.concatenate([center[measured], mirrored(center)[measured]]))
         near = sources.query(center[scalp], min(AROUND, 2 * len(measured)))[1]
         near = measured[near.reshape(len(scalp), -1) % len(measured)]
         height[scalp] = np.median(self._measured_height[near], axis=1)

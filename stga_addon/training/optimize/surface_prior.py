@@ -1,5 +1,5 @@
-"""What is plausible of splats that no training view tells anything about: only what shines through
-the front trains them, which gives them any color, size and place."""
+"""Pulls splats of which training views tell little to what is plausible: what shines through the
+front, and a pixel of an outline, would give them any color, size and place."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -23,8 +23,8 @@ SHOWN_COSINE = 0.5
 those that others are compared with; above the second, what views show keeps its color."""
 DOUBT = 0.3
 MIN_PULL = 0.02
-"""Gradient, in the median of well seen splats, at which a splat is pulled halfway to what is
-plausible at a turn; the least share of the way that is worth it."""
+"""Gradient, as a share of the median of well seen splats, at which a splat is pulled halfway to
+what is plausible at a turn; the least share of the way that is worth it."""
 HIDDEN_ORDER = 1
 HIDDEN_OPACITY = 3.0
 HIDDEN_FLATNESS = 0.25
@@ -123,7 +123,7 @@ class SurfacePrior:
         opacity += share * (HIDDEN_OPACITY - opacity)
         xyz = columns["parameters/xyz"][rows]
         axis = NORMAL_AXIS[self._frames.convention]
-        height = self._frames.shell_height[face[rows]]
+        height = self._frames.layer_height[face[rows]]
         xyz[:, axis] += share * (height - xyz[:, axis])
         values = {"opacity": opacity, "xyz": xyz}
         backend.assign(bound[rows], parameters_and_average(values))
@@ -189,7 +189,7 @@ def hidden_splats(frames: FrameStore, settings: TrainingSettings) -> Splats:
     face = layer.face
     inset = np.where(surface.border, BORDER_INSET, 1.0)[face]
     xyz = layer.xyz * inset[:, None]
-    xyz[:, axis] += frames.shell_height[face]
+    xyz[:, axis] += frames.layer_height[face]
     lifted = inset * (1 + surface.hair_height[face] / (HEAD_RADIUS_VOXELS * frames.voxel))
     log_scale = layer.log_scale + np.log(lifted)[:, None]
     log_scale[:, axis] += np.log(HIDDEN_FLATNESS)

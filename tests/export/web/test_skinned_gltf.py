@@ -187,7 +187,7 @@ def test_ten_splats_are_where_the_page_says():
     ],
 )
 def test_damaged_splats_are_refused(changes, problem, tmp_path):
-    """Catches an exception of numpy or zlib, or memory taken, where a file is none of ours."""
+    """Catches an exception of numpy or zlib, or memory taken, by a file of another kind."""
     document, binary = document_of(ten_splats.FILE.read_bytes())
     document["extras"]["stga_splats"] |= changes
     (tmp_path / "a.glb").write_bytes(glb_bytes(document, binary))
