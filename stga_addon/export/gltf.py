@@ -11,7 +11,7 @@ import numpy as np
 
 from ..avatar.splats import SH_C0, Splats
 from ..capture.color import srgb_to_linear
-from ..files import parse_json, replacing
+from ..files import replacing
 
 EXTENSION = "KHR_gaussian_splatting"
 GENERATOR = "STGA for Blender"
@@ -28,8 +28,7 @@ _COMPONENTS = {
 }
 _TYPES = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
 DTYPES = {5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
-WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4, "MAT4": 16}
-"""Component and element types of accessors."""
+"""Component types of accessors."""
 
 
 def write_gltf(path: Path, world: Splats) -> None:
@@ -119,18 +118,6 @@ def glb_bytes(document: dict[str, Any], binary: bytes) -> bytes:
             struct.pack("<I", len(binary)) + _BINARY_CHUNK + binary,
         )
     )
-
-
-def parse_glb(data: bytes) -> tuple[dict[str, Any], bytes]:
-    """The document and the binary chunk of a .glb file. Raises ValueError where it is none."""
-    magic, version, size, length, kind = struct.unpack_from("<4sIII4s", data)
-    begin = 20 + length
-    if (magic, version, kind) != (_MAGIC, _VERSION, _JSON_CHUNK) or size > len(data):
-        raise ValueError("it is not a whole .glb file")
-    binary_size, kind = struct.unpack_from("<I4s", data, begin)
-    if kind != _BINARY_CHUNK:
-        raise ValueError("it has no binary chunk")
-    return parse_json(data[20:begin]), data[begin + 8 : begin + 8 + binary_size]
 
 
 def little_endian(array: np.ndarray) -> bytes:

@@ -12,10 +12,11 @@ from ..avatar.embedding import face_frames
 from ..avatar.file import Avatar
 from ..avatar.offsets import OFFSETS, POSITION
 from ..avatar.splats import Splats
+from ..capture.meshes import WIDTHS, glb_chunks
 from ..errors import StgaError
 from ..files import replacing
 from ..light.relight import Relighter
-from .gltf import DTYPES, GENERATOR, WIDTHS, glb_bytes, parse_glb
+from .gltf import DTYPES, GENERATOR, glb_bytes
 from .playback import Playback
 from .rig import Rig, RiggedAvatar, ShapeControls
 from .skinned_mesh import BASE_STEP_M, SHAPE_STEP_M, skinned_mesh
@@ -305,7 +306,7 @@ def in_planes(glb: bytes) -> bytes:
     """A .glb of this module as pages hold it, which compresses by a fifth more: of each accessor's
     buffer view one byte of all components after the other, and of integers without sign and floats
     the difference from the row before. Only the player reads it."""
-    document, binary = parse_glb(glb)
+    document, binary = glb_chunks(glb)
     document["extras"][EXTRA]["planes"] = True
     layouts = dict[int, tuple[int, str]]()
     for accessor in document["accessors"]:

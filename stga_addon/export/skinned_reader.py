@@ -11,11 +11,12 @@ import numpy as np
 from ..avatar.file import Avatar, AvatarLight, write_avatar
 from ..avatar.offsets import OFFSETS
 from ..avatar.splats import Splats
+from ..capture.meshes import WIDTHS, glb_chunks
 from ..errors import StgaError
 from ..files import read_bytes, write_npz
 from ..flame.model import JOINTS
 from ..flame.quaternions import to_axis_angle
-from .gltf import DTYPES, WIDTHS, parse_glb
+from .gltf import DTYPES
 from .rig import Rig
 from .skinned_gltf import AXES, EXTRA, VERSION
 
@@ -39,13 +40,15 @@ def read_skinned_splats(path: Path) -> SkinnedSplats:
     """Raises StgaError naming the file where it is none."""
     data = read_bytes(path)
     try:
-        document, binary = parse_glb(data)
+        document, binary = glb_chunks(data)
         header = document.get("extras", {}).get(EXTRA)
         if header is None:
             raise ValueError(f"it has no {EXTRA}; such files come from the format skinned-gltf")
         if header["version"] != VERSION:
             raise ValueError(f"version {header['version']}; known is {VERSION}")
         place = header["byteOffset"], header["byteOffset"] + header["byteLength"]
+        if place[1] > len(binary):
+            raise ValueError("it is cut off")
         arrays = _arrays(header["arrays"], binary[slice(*place)])
         rig, faces = _rig(document, binary, arrays, header)
         return SkinnedSplats(_avatar(header, arrays, rig, faces), rig, float(header["fps"]))
