@@ -138,6 +138,9 @@ def test_what_was_tracked_meanwhile_is_imported(extension, take, tmp_path, monke
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "a.blend"))
     perform_in_folder(out / "job")
     monkeypatch.setattr(extension.operators.timers, "has_timer", lambda: True)
+    # bpy 5.0 crashes now and then where a thread works while it opens a file
+    for part in (extension.operators.pose, extension.operators.import_capture):
+        monkeypatch.setattr(part, "begin_sliders", lambda head: None)
     bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "a.blend"))
     extension.operators.monitor.tick()
     assert list(bpy.context.scene.stga.head[tags.TIMESTEPS]) == [0, 1, 2, 3, 4]
