@@ -3,13 +3,13 @@
 from stga_addon.cli.main import main
 
 
-def stga(*words: object) -> int:
+def stga(*words):
     """Exit code of a command; texts are divided at spaces, paths and numbers are not."""
     parts = [word.split() if isinstance(word, str) else [str(word)] for word in words]
     return main([text for part in parts for text in part])
 
 
-def refused(capsys, *words: object) -> str:
+def refused(capsys, *words):
     """Run a command that must fail: exit code 2 and one sentence on stderr, which is returned."""
     capsys.readouterr()
     assert stga(*words) == 2

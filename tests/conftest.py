@@ -5,7 +5,6 @@ import os
 import shutil
 import signal
 import sys
-from collections.abc import Callable
 from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
@@ -22,7 +21,6 @@ from export.web.browser import find_browser
 from filelock import FileLock
 
 import stga_addon.development.commands  # noqa: F401  adds its commands, as `__main__` does
-from stga_addon.capture.model import Capture
 from stga_addon.capture.open import open_capture
 
 MAX_PROCESSES = 8
@@ -31,7 +29,7 @@ MIN_MEMORY_BYTES = 8 << 30
 """Free space of a memory disk with which the tests' files are kept there."""
 
 
-def memory_disk(folder: str = "/dev/shm") -> dict[str, str]:
+def memory_disk(folder="/dev/shm"):
     """The variable that has pytest keep its temporary folders in memory, where this machine has
     enough: what the tests write, most of it flushed file by file, is then no wait."""
     if not hasattr(os, "ST_NOEXEC") or not os.path.isdir(folder):
@@ -47,19 +45,19 @@ if "PYTEST_XDIST_WORKER" not in os.environ:  # those inherit it
 
 
 @pytest.hookimpl(optionalhook=True)
-def pytest_xdist_auto_num_workers() -> int:
+def pytest_xdist_auto_num_workers():
     """Two processes more than cores, because some tests wait: for a cluster, a browser or another
     process."""
     return min((os.cpu_count() or 1) + 2, MAX_PROCESSES)
 
 
-def pytest_collection_finish() -> None:
+def pytest_collection_finish():
     """Objects of modules and tests, which stay to the end, are no longer looked through for
     garbage."""
     gc.freeze()
 
 
-def has_adapter() -> bool:
+def has_adapter():
     if find_spec("wgpu") is None:
         return False
     from stga_addon.raster.gpu.adapters import adapters
@@ -68,7 +66,7 @@ def has_adapter() -> bool:
 
 
 VALIDATION_LAYER = "vulkan/explicit_layer.d/VkLayer_khronos_validation.json"
-TOOLS: dict[str, tuple[Callable[[], object], str]] = {
+TOOLS = {
     "adapter": (has_adapter, "no WebGPU adapter (Debian's software Vulkan: mesa-vulkan-drivers)"),
     "vulkan-validation": (
         lambda: any(
@@ -85,13 +83,13 @@ said where not."""
 
 
 @cache
-def missing(tool: str) -> str | None:
+def missing(tool):
     is_there, reason = TOOLS[tool]
     return None if is_there() else reason
 
 
 @pytest.hookimpl(tryfirst=True)
-def pytest_runtest_setup(item: pytest.Item) -> None:
+def pytest_runtest_setup(item):
     """Before any fixture, which might begin the work that the tool is for."""
     for mark in item.iter_markers("needs"):
         for tool in mark.args:
@@ -105,7 +103,7 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 @pytest.fixture(scope="session")
-def alone(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], FileLock]:
+def alone(tmp_path_factory):
     """Name -> a lock that one at a time of the processes which run the tests holds, for what they
     have in common."""
     folder = tmp_path_factory.getbasetemp()
@@ -114,7 +112,7 @@ def alone(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], FileLock]
 
 
 @pytest.fixture(scope="session")
-def kernel_bundle() -> tuple[Path, str]:
+def kernel_bundle():
     """Folder of all kernels as the complete edition brings them, and what raster/kernel_bits.py
     printed where they were compiled, in one process, which takes most of a minute."""
     folder = kernels.bundle()
@@ -124,19 +122,19 @@ def kernel_bundle() -> tuple[Path, str]:
 
 
 @pytest.fixture(scope="session")
-def toy_root(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def toy_root(tmp_path_factory):
     """A ball of 10 cm, of one color per view: timesteps 0, 1, 3, 4 (the last one `test`), cameras 0
     to 3 (the last one `val`)."""
     return factory.write_mesh_capture(tmp_path_factory.mktemp("toy"), (0, 1, 3, 4), range(4))
 
 
 @pytest.fixture(scope="session")
-def toy(toy_root: Path) -> Capture:
+def toy(toy_root):
     return open_capture(toy_root)
 
 
 @pytest.fixture(scope="session")
-def take(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def take(tmp_path_factory):
     """footage/ of the small head, head.npz and its exact landmarks points/, for tests that only
     read it; in black, so that landmarks alone are tracked, in a third of the time."""
     from flame.small_head import small_head
@@ -150,7 +148,7 @@ def take(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="session")
-def shared_data() -> Path:
+def shared_data():
     """Folder of development data (studio_head, raster_reference, …), which is not part of the
     project."""
     beside = Path(__file__).resolve().parents[2] / "shared" / "data"
@@ -161,7 +159,7 @@ def shared_data() -> Path:
 
 
 @pytest.fixture(params=["cpu", pytest.param("gpu", marks=pytest.mark.needs("adapter"))])
-def back_end(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
+def back_end(request, monkeypatch):
     """The kernels that a test's `render_differentiable` runs: Numba's, and WebGPU's on the first
     adapter."""
     if request.param == "gpu":

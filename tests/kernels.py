@@ -9,7 +9,6 @@ a change, a test compiles what it needs.
 import os
 import shutil
 import sys
-from collections.abc import Mapping
 from importlib.metadata import version
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -36,7 +35,7 @@ SCRIPT = compiled_kernels.SCRIPT.replace("from", "os.cpu_count = lambda: 1\nfrom
 SCRIPT = SCRIPT.replace("print(", BITS.format(str(KERNEL_BITS)))
 
 
-def bundle(compiles: bool = True) -> Path | None:
+def bundle(compiles=True):
     """Folder of the kernels and their bits.txt; None where no edition brings any, or where it
     should not compile."""
     with TemporaryDirectory() as name, mock.patch.object(compiled_kernels, "SCRIPT", SCRIPT):
@@ -54,13 +53,13 @@ def bundle(compiles: bool = True) -> Path | None:
         return folder if folder.exists() else None
 
 
-def _are_newer(bits: Path) -> bool:
+def _are_newer(bits):
     """Whether the kernels were compiled, to the end, after their sources were written."""
     sources = compiled_kernels.ROOT.joinpath("stga_addon/raster/cpu").glob("*.py")
     return bits.exists() and bits.stat().st_mtime >= max(path.stat().st_mtime for path in sources)
 
 
-def shared_kernels() -> Mapping[str, str]:
+def shared_kernels():
     """Environment variables of processes that use a copy of the bundle, and add to it; none where
     there is no bundle of the sources as they are, or Numba is told already what to do."""
     folder = bundle(compiles=False)

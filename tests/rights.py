@@ -4,7 +4,6 @@ import ctypes
 import os
 import platform
 import sys
-from collections.abc import Iterator
 from contextlib import contextmanager
 
 import pytest
@@ -15,7 +14,7 @@ OVERRIDES = 1 << 1 | 1 << 2  # CAP_DAC_OVERRIDE, CAP_DAC_READ_SEARCH
 
 
 @contextmanager
-def as_a_user() -> Iterator[None]:
+def as_a_user():
     """Take root's capabilities of reading and entering everything from this thread, for the block;
     others have none."""
     if not hasattr(os, "geteuid") or os.geteuid() != 0:

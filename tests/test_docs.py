@@ -4,7 +4,6 @@ parse."""
 import re
 import shlex
 from collections import defaultdict
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -36,7 +35,7 @@ PROSE = {".py": r'(?:^|\s)#\s.*|"""[\s\S]*?"""'} | dict.fromkeys(
 )
 """Suffix of a source -> its comments and docstrings."""
 SOURCES = {path: path.read_text(encoding="utf-8") for path in FILES if path.suffix in PROSE}
-BY_PATH: dict[str, list[Path]] = defaultdict(list)
+BY_PATH = defaultdict(list)
 """What is meant by a path whose folders may be left out, "run.py" or "jobs/batch/run.py"."""
 for _path in FILES:
     _parts = _path.relative_to(ROOT).parts
@@ -67,26 +66,26 @@ OTHERS = {
 """References to what is not ours, though it looks so."""
 
 
-def name_of(page: Path) -> str:
+def name_of(page):
     return page.relative_to(ROOT).as_posix()
 
 
-def anchors(text: str) -> set[str]:
+def anchors(text):
     """Anchors of a page's headings, as Git hosts make them."""
     headings = re.findall(r"^#+ (.+)$", text, re.MULTILINE)
     return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
 
 
-def prose(path: Path) -> str:
+def prose(path):
     """Comments and docstrings of a source."""
     return "\n".join(re.findall(PROSE[path.suffix], SOURCES[path]))
 
 
-def defines(path: Path, name: str) -> bool:
+def defines(path, name):
     return re.search(DEFINITION.format(name), SOURCES.get(path, ""), re.MULTILINE) is not None
 
 
-def stale_paths(text: str) -> Iterator[str]:
+def stale_paths(text):
     """Sources that are named with a folder or in backticks and are not there, and functions
     (`test_docs.py:stale_paths`) that are not in theirs."""
     quoted = set(re.findall(REFERENCE, text))
@@ -99,7 +98,7 @@ def stale_paths(text: str) -> Iterator[str]:
             yield found[0]
 
 
-def stale_names(text: str, code: str = "") -> Iterator[str]:
+def stale_names(text, code=""):
     """Names in backticks that no source has: alone, of a module or class of ours
     (`module.function`), or of what the code beside the text uses."""
     used = set(re.findall(r"\w+", code))
@@ -117,7 +116,7 @@ def stale_names(text: str, code: str = "") -> Iterator[str]:
             yield reference
 
 
-def is_there(names: list[str], used: set[str]) -> bool:
+def is_there(names, used):
     """Whether `module.function` or `Class.member` is there, or begins with what the code uses and
     is not ours."""
     for count in range(len(names), 0, -1):

@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.testing import assert_array_equal
 from refusal import refusal
 
 from stga_addon import files
@@ -30,7 +31,7 @@ from stga_addon.files import (
 )
 
 
-def write_half(path: Path) -> None:
+def write_half(path):
     with replacing(path) as partial:
         partial.write_text("half of t")
         raise RuntimeError("mine")
@@ -112,7 +113,7 @@ def test_npz_round_trip(tmp_path, compressed):
     assert os.listdir(tmp_path) == ["file.part"]
     assert set(again) == set(arrays)
     for name, array in arrays.items():
-        np.testing.assert_array_equal(again[name], array)
+        assert_array_equal(again[name], array)
         assert again[name].dtype == np.asarray(array).dtype
 
 
@@ -128,7 +129,7 @@ def test_flipped_bits(tmp_path):
         damaged[position] ^= 0x55
         path.write_bytes(damaged)
         try:
-            np.testing.assert_array_equal(read_npz(path)["a"], expected)
+            assert_array_equal(read_npz(path)["a"], expected)
         except (StgaError, KeyError):  # KeyError: the name itself was hit
             refused += 1
     assert refused > 30
@@ -158,7 +159,7 @@ write_json(Path(sys.argv[1]), 1)
 """
 
 
-def run(code: str, path: Path) -> int:
+def run(code, path):
     return subprocess.run([sys.executable, "-c", code, str(path)], check=False).returncode
 
 
@@ -214,7 +215,7 @@ def test_temporary_name_is_new(tmp_path, monkeypatch):
     assert stat.S_IMODE((tmp_path / "b.json").stat().st_mode) == 0o640
 
 
-def refused(times: int, winerror: int | None):
+def refused(times, winerror):
     """An os.replace that fails `times` times as Windows does (None: as POSIX does), and the number
     of its calls."""
     calls = []
@@ -260,7 +261,7 @@ def test_a_file_that_another_program_has_open(
     assert os.listdir(tmp_path) == ["a.json"]
 
 
-def write_half_a_pair(folder: Path) -> None:
+def write_half_a_pair(folder):
     with replacing_together() as new_file:
         with new_file(folder / "a.json") as partial:
             partial.write_text("2")
@@ -287,7 +288,7 @@ def test_files_that_appear_together(tmp_path):
     assert found == {"a.json": 2, "b.json": 2}
 
 
-def write_together(folder: Path, *names: str) -> None:
+def write_together(folder, *names):
     with replacing_together() as new_file:
         for name in names:
             with new_file(folder / name) as content:

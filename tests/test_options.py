@@ -5,7 +5,6 @@ from argparse import ArgumentParser
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -51,7 +50,7 @@ class Drawing:
     hidden: int = 5
 
 
-def parsed(*words: str) -> dict[str, Any]:
+def parsed(*words):
     parser = ArgumentParser()
     add_options(parser, Drawing)
     return given_options(parser.parse_args(["a.png", "--out", "b", *words]), Drawing)

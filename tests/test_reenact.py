@@ -1,7 +1,5 @@
 """`stga render --motion`: an avatar moved by another person, without Blender."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 from capture import factory
@@ -17,7 +15,7 @@ RENDER = "render {avatar} --cameras {cameras} --motion {motion} --out"
 
 
 @pytest.fixture
-def parts(tmp_path: Path) -> dict[str, Path]:
+def parts(tmp_path):
     """A capture's model, an avatar of its identity, another's motion of two frames, cameras."""
     folder, model = factory.write_flame_capture(tmp_path / "capture")
     capture = open_capture(folder, model)

@@ -6,7 +6,6 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -53,7 +52,7 @@ class Drawing:
     others: tuple[Circle | Square, ...] = ()
     last: Square = field(default_factory=Square)
 
-    def check(self) -> None:
+    def check(self):
         if self.count == 13:
             raise StgaError("13 is not drawn")
 
@@ -98,7 +97,7 @@ def test_round_trip():
     assert from_json(Circle | Square, to_json(Square(5), kinds=Circle | Square)) == Square(5)
 
 
-REFUSED: list[tuple[dict[str, Any], str]] = [
+REFUSED = [
     ({"count": -1}, "setting count: expected a whole number from 0, got -1"),
     ({"count": 1.0}, "setting count: expected a whole number from 0, got 1.0"),
     ({"count": True}, "setting count: expected a whole number from 0, got True"),
@@ -148,7 +147,7 @@ def test_limits():
             validate(Free(value))
 
 
-OTHER_FORMS: list[tuple[dict[str, Any], str]] = [
+OTHER_FORMS = [
     ({"frames": {"x": {}}}, "d: setting frames: expected whole numbers as names, got 'x'"),
     ({"frames": {"1": {"side": 1}}}, "d: frames.1: fields are missing or unknown (points)"),
     ({"main": {"side": 1, "points": None}}, f"d: setting main.kind: {KINDS}, got None"),

@@ -18,7 +18,7 @@ FACES = np.arange(3 * COUNT).reshape(COUNT, 3)
 NEUTRAL = np.random.default_rng(0).normal(size=(3 * COUNT, 3))
 
 
-def moved(offsets: dict[int, float]) -> np.ndarray:
+def moved(offsets):
     """The neutral mesh with some triangles shifted by so many meters, each in its own direction."""
     mesh = NEUTRAL.copy()
     rng = np.random.default_rng(1)
@@ -28,12 +28,12 @@ def moved(offsets: dict[int, float]) -> np.ndarray:
     return mesh
 
 
-def region(*faces: int) -> np.ndarray:
+def region(*faces):
     return np.isin(np.arange(COUNT), faces)
 
 
 TWO = {"mouth": region(0, 4), "nose": region(3, 4, 5, 6)}
-RULES: list[tuple[dict[int, float], dict[str, np.ndarray], list[int]]] = [
+RULES = [
     # a triangle outside of regions by its own offset
     ({1: 0.011, 2: 0.0099, 5: 0.5}, {}, [1, 5]),
     ({}, {}, []),
@@ -68,8 +68,8 @@ def test_offsets_are_distances_of_centers():
     assert np.flatnonzero(chosen).tolist() == [0, 1]
 
 
-def capture(given_selection: dict[int, np.ndarray], asked: list[tuple[int, str]]) -> Capture:
-    def expression_mesh(timestep: int, zero_pose: str) -> np.ndarray:
+def capture(given_selection, asked):
+    def expression_mesh(timestep, zero_pose):
         asked.append((timestep, zero_pose))
         return moved({timestep: 0.03})
 
@@ -87,7 +87,7 @@ def capture(given_selection: dict[int, np.ndarray], asked: list[tuple[int, str]]
     )
 
 
-def numbers(chosen: dict[int, np.ndarray]) -> dict[int, list[int]]:
+def numbers(chosen):
     return {timestep: np.flatnonzero(mask).tolist() for timestep, mask in chosen.items()}
 
 

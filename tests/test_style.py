@@ -1,7 +1,6 @@
 """Rules of CONTRIBUTING.md, "How we write", that ruff has no rule for."""
 
 import ast
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -12,11 +11,11 @@ FILES = [path for folder in FOLDERS for path in sorted((ROOT / folder).rglob("*.
 MAX_FUNCTION_LINES = 60
 
 
-def names(node: ast.AST) -> set[str]:
+def names(node):
     return {each.id for each in ast.walk(node) if isinstance(each, ast.Name)}
 
 
-def packed_values(tree: ast.AST) -> Iterator[int]:
+def packed_values(tree):
     """Lines that assign independent values at once, `a, b = c, d`, and swap or unpack nothing."""
     for node in ast.walk(tree):
         if isinstance(node, ast.Assign) and isinstance(node.value, ast.Tuple):
@@ -25,7 +24,7 @@ def packed_values(tree: ast.AST) -> Iterator[int]:
                 yield node.lineno
 
 
-def long_functions(tree: ast.AST) -> Iterator[str]:
+def long_functions(tree):
     for node in ast.walk(tree):
         if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
             lines = (node.end_lineno or node.lineno) - node.lineno + 1
@@ -34,7 +33,7 @@ def long_functions(tree: ast.AST) -> Iterator[str]:
 
 
 @pytest.mark.parametrize("folder", FOLDERS)
-def test_one_assignment_a_line(folder: str) -> None:
+def test_one_assignment_a_line(folder):
     """Catches values packed into one line to save lines, which then read slower."""
     files = [path for path in FILES if path.is_relative_to(ROOT / folder)]
     assert files
@@ -43,7 +42,7 @@ def test_one_assignment_a_line(folder: str) -> None:
 
 
 @pytest.mark.parametrize("folder", FOLDERS)
-def test_functions_fit_on_a_screen(folder: str) -> None:
+def test_functions_fit_on_a_screen(folder):
     """Catches a function that has become several."""
     for path in (path for path in FILES if path.is_relative_to(ROOT / folder)):
         assert not list(long_functions(ast.parse(path.read_text()))), path.relative_to(ROOT)

@@ -38,15 +38,15 @@ LIGHT = (
 )  # fmt: skip
 
 
-def name_of(path: Path) -> str:
+def name_of(path):
     return path.relative_to(ROOT).as_posix()
 
 
 @cache
-def imports(path: Path) -> tuple[tuple[str, int], ...]:
+def imports(path):
     """(dotted module, level) of every import, at the top or inside a function; `from x import y`
     gives x.y."""
-    found: list[tuple[str, int]] = []
+    found = []
     for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
         if isinstance(node, ast.Import):
             found += ((alias.name, 0) for alias in node.names)
@@ -57,10 +57,10 @@ def imports(path: Path) -> tuple[tuple[str, int], ...]:
 
 
 @cache
-def imports_by_name(path: Path) -> tuple[tuple[str, int], ...]:
+def imports_by_name(path):
     """The same for every string that is the name of a module, whatever reads it: `import_module`,
     `find_spec`, a table of them, or another Python after `-m`."""
-    named: list[tuple[str, int]] = []
+    named = []
     depth = len(path.relative_to(ROOT).parts)
     for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
         text = node.value if isinstance(node, ast.Constant) else None
@@ -77,14 +77,14 @@ def imports_by_name(path: Path) -> tuple[tuple[str, int], ...]:
     return tuple(named)
 
 
-def module_file(path: Path) -> Path | None:
+def module_file(path):
     """The source of the module or package at a path without suffix."""
     return next(
         (file for file in (path.with_suffix(".py"), path / "__init__.py") if file.is_file()), None
     )
 
 
-def imported_file(path: Path, module: str, level: int) -> Path | None:
+def imported_file(path, module, level):
     """The source file that an import in `path` is of; None where it is none of this package's."""
     if level == 0:
         return None
@@ -93,7 +93,7 @@ def imported_file(path: Path, module: str, level: int) -> Path | None:
 
 
 @cache
-def import_graph(sources: tuple[Path, ...]) -> dict[Path, set[Path]]:
+def import_graph(sources):
     """File -> the other files that it imports."""
     return {
         path: {
@@ -105,7 +105,7 @@ def import_graph(sources: tuple[Path, ...]) -> dict[Path, set[Path]]:
     }
 
 
-def reached(graph: dict[T, set[T]], path: T) -> set[T]:
+def reached(graph, path):
     """All files, or parts, that one imports, or that those import in turn."""
     seen = set[T]()
     left = [path]
@@ -145,7 +145,7 @@ def test_packages_are_imported_only_where_they_may_be(path):
     assert not (path.is_relative_to(ROOT / "operators") and "ui" in above)
 
 
-def layer(name: str) -> int:
+def layer(name):
     found = [index for index, names in enumerate(LAYERS) if name in names]
     assert found, f"stga_addon/{name} has no layer in tests/test_walls.py"
     return found[0]
@@ -184,7 +184,7 @@ def test_no_part_of_a_room_imports_itself_by_way_of_others(room):
     inside = {
         path: path.relative_to(room).parts[0] for path in SOURCES if path.is_relative_to(room)
     }
-    parts: dict[str, set[str]] = {part: set() for part in inside.values()}
+    parts = {part: set() for part in inside.values()}
     for path, others in import_graph(SOURCES).items():
         if path in inside:
             parts[inside[path]] |= {inside[other] for other in others if other in inside} - {
@@ -245,7 +245,7 @@ OTHERS = {"torch", "numba", "wgpu", "trimesh", "scipy", "PIL", "tqdm", "smplx"}
 """Packages that a plain Blender lacks."""
 
 
-def run(script: str, *arguments: str) -> None:
+def run(script, *arguments):
     command = [sys.executable, "-c", script, *arguments]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr

@@ -10,7 +10,7 @@ from stga_addon.avatar.splats import Splats
 from stga_addon.capture.camera import look_at
 
 
-def splats_of(xyz, rotation=(1, 0, 0, 0), log_scale=-4.0, opacity=0.0, sh=0.0, face=0) -> Splats:
+def splats_of(xyz, rotation=(1, 0, 0, 0), log_scale=-4.0, opacity=0.0, sh=0.0, face=0):
     """Bound splats, of these values or of one for all: sh (3,) is a color's."""
     count = len(xyz)
 
@@ -29,10 +29,10 @@ def splats_of(xyz, rotation=(1, 0, 0, 0), log_scale=-4.0, opacity=0.0, sh=0.0, f
     )
 
 
-def random_splats(seed: int, count: int, faces: int, sh_degree: int = 3) -> Splats:
+def random_splats(seed, count, faces, sh_degree=3):
     rng = np.random.default_rng(seed)
 
-    def normal(*shape: int) -> np.ndarray:
+    def normal(*shape):
         return rng.normal(size=shape).astype(np.float32)
 
     bound = splats_of(
@@ -46,7 +46,7 @@ def random_splats(seed: int, count: int, faces: int, sh_degree: int = 3) -> Spla
     return replace(bound, unbound=rng.random(count) < 0.3)
 
 
-def world_splats(xyz, rotation, log_scale, opacity, sh) -> Splats:
+def world_splats(xyz, rotation, log_scale, opacity, sh):
     """Splats of another program's numbers; opacity from 0 to 1."""
     logit = np.log(opacity / (1 - opacity))
     nothing = np.zeros(len(xyz), np.int32)
@@ -54,7 +54,7 @@ def world_splats(xyz, rotation, log_scale, opacity, sh) -> Splats:
     return Splats(*values, face=nothing, unbound=nothing.astype(bool))
 
 
-def random_mesh(seed: int, vertices: int = 20, faces: int = 30) -> tuple[np.ndarray, np.ndarray]:
+def random_mesh(seed, vertices=20, faces=30):
     """Vertices (V, 3) float64 and faces (F, 3) int32 of different corners: a soup of well-shaped
     triangles."""
     rng = np.random.default_rng(seed)
@@ -62,7 +62,7 @@ def random_mesh(seed: int, vertices: int = 20, faces: int = 30) -> tuple[np.ndar
     return rng.normal(size=(vertices, 3)) * 0.1, np.ascontiguousarray(corners)
 
 
-def rendered(world: Splats) -> np.ndarray:
+def rendered(world):
     """(3, 48, 64) picture of world-space splats."""
     from stga_addon.render.render import render
 
@@ -72,7 +72,7 @@ def rendered(world: Splats) -> np.ndarray:
 
 
 @pytest.fixture
-def avatar() -> Avatar:
+def avatar():
     neutral, faces = random_mesh(0)
     return Avatar(
         splats=random_splats(1, 50, len(faces)),

@@ -6,9 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from numpy.testing import assert_array_equal, assert_equal
 from refusal import refusal
 
-from stga_addon.avatar.file import Avatar, read_avatar, write_avatar
+from stga_addon.avatar.file import read_avatar, write_avatar
 from stga_addon.files import save_npz
 
 SPLAT_FIELDS = ("xyz", "rotation", "log_scale", "opacity", "sh", "face", "unbound")
@@ -27,20 +28,20 @@ def test_round_trip_is_exact(is_empty, tmp_path, avatar):
         have = getattr(back.splats, name)
         want = getattr(avatar.splats, name)
         assert have.dtype == want.dtype, name
-        np.testing.assert_array_equal(have, want, err_msg=name)
+        assert_array_equal(have, want, err_msg=name)
     for name in ("neutral", "faces"):
-        np.testing.assert_array_equal(getattr(back, name), getattr(avatar, name), err_msg=name)
+        assert_array_equal(getattr(back, name), getattr(avatar, name), err_msg=name)
     for name in ("convention", "settings", "background"):
         assert getattr(back, name) == getattr(avatar, name)
     assert list(back.regions) == list(avatar.regions)
-    np.testing.assert_equal(back.regions, avatar.regions)
+    assert_equal(back.regions, avatar.regions)
 
 
-def with_splats(avatar: Avatar, **changes) -> Avatar:
+def with_splats(avatar, **changes):
     return replace(avatar, splats=replace(avatar.splats, **changes))
 
 
-def spoiled(array: np.ndarray, value: float) -> np.ndarray:
+def spoiled(array, value):
     array = array.copy()
     array.flat[3] = value
     return array

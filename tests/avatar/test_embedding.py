@@ -3,6 +3,7 @@ triangles without area, and quaternions."""
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 from scipy.spatial.transform import Rotation
 
 from stga_addon.avatar.embedding import (
@@ -20,11 +21,11 @@ from stga_addon.avatar.splats import sh_color
 from .conftest import random_mesh, random_splats
 
 
-def unit(v: np.ndarray) -> np.ndarray:
+def unit(v):
     return v / np.sqrt(v @ v)
 
 
-def heron(p: np.ndarray, q: np.ndarray, r: np.ndarray) -> float:
+def heron(p, q, r):
     a, b, c = (np.sqrt(((u - v) ** 2).sum()) for u, v in ((p, q), (q, r), (r, p)))
     s = (a + b + c) / 2
     return float(np.sqrt(s * (s - a) * (s - b) * (s - c)))
@@ -46,7 +47,7 @@ def frame_by_hand(posed, neutral, convention):
     return center, np.column_stack([first, normal, third]), scale
 
 
-def scipy_rotation(wxyz: np.ndarray) -> Rotation:
+def scipy_rotation(wxyz):
     return Rotation.from_quat(wxyz[..., [1, 2, 3, 0]])
 
 
@@ -64,12 +65,12 @@ def test_frames_are_the_published_ones(convention):
     frames = face_frames(posed, faces, neutral, convention)
     for i, corners in enumerate(faces):
         origin, axes, scale = frame_by_hand(posed[corners], neutral[corners], convention)
-        np.testing.assert_allclose(frames.origin[i], origin, atol=1e-12)
-        np.testing.assert_allclose(frames.rotation[i], axes, atol=1e-9)
+        assert_allclose(frames.origin[i], origin, atol=1e-12)
+        assert_allclose(frames.rotation[i], axes, atol=1e-9)
         assert frames.scale[i] == pytest.approx(scale, rel=1e-6)
         assert face_areas(neutral, faces)[i] == pytest.approx(heron(*neutral[corners]), rel=1e-6)
     rotation = scipy_rotation(frames.quaternion).as_matrix()
-    np.testing.assert_allclose(rotation, frames.rotation, atol=1e-12)
+    assert_allclose(rotation, frames.rotation, atol=1e-12)
 
 
 @pytest.mark.parametrize("convention", CONVENTIONS)
@@ -84,17 +85,17 @@ def test_world_covariance_is_the_transformed_local_one(convention):
     linear = frames.rotation[splats.face] * frames.scale[splats.face, None, None]
     expected = linear @ covariance(splats) @ linear.transpose(0, 2, 1)
     atol = 1e-6 * np.abs(expected).max()
-    np.testing.assert_allclose(covariance(world), expected, rtol=1e-4, atol=atol)
+    assert_allclose(covariance(world), expected, rtol=1e-4, atol=atol)
     positions = np.einsum("nij,nj->ni", linear, splats.xyz) + frames.origin[splats.face]
-    np.testing.assert_allclose(world.xyz, positions, atol=1e-6)
+    assert_allclose(world.xyz, positions, atol=1e-6)
     for name in ("opacity", "sh", "unbound"):
-        np.testing.assert_array_equal(getattr(world, name), getattr(splats, name))
+        assert_array_equal(getattr(world, name), getattr(splats, name))
     back = to_local(world, frames, splats.face)
-    np.testing.assert_allclose(back.xyz, splats.xyz, atol=2e-6 / frames.scale.min())
-    np.testing.assert_allclose(back.log_scale, splats.log_scale, atol=2e-6)
+    assert_allclose(back.xyz, splats.xyz, atol=2e-6 / frames.scale.min())
+    assert_allclose(back.log_scale, splats.log_scale, atol=2e-6)
     found, expected = (scipy_rotation(s.rotation).as_matrix() for s in (back, splats))
-    np.testing.assert_allclose(found, expected, atol=2e-6)
-    np.testing.assert_array_equal(back.face, splats.face)
+    assert_allclose(found, expected, atol=2e-6)
+    assert_array_equal(back.face, splats.face)
 
 
 def test_world_frame_changes_nothing():
@@ -102,9 +103,9 @@ def test_world_frame_changes_nothing():
     splats = random_splats(5, 20, 1)
     splats.rotation[0] = 0
     world = to_world(splats, WORLD)
-    np.testing.assert_array_equal(world.xyz, splats.xyz)
-    np.testing.assert_array_equal(world.log_scale, splats.log_scale)
-    np.testing.assert_array_equal(world.rotation[0], [1, 0, 0, 0])
+    assert_array_equal(world.xyz, splats.xyz)
+    assert_array_equal(world.log_scale, splats.log_scale)
+    assert_array_equal(world.rotation[0], [1, 0, 0, 0])
     with pytest.raises(ValueError, match="gaussian-avatars"):
         face_frames(*random_mesh(0), random_mesh(0)[0], "gaussian-avatars")
 
@@ -135,7 +136,7 @@ def test_backward_agrees_with_differences():
 
 
 @pytest.mark.parametrize("kind", ["scaled", "mirrored", "sheared"])
-def test_splats_are_placed_by_any_matrix(kind: str) -> None:
+def test_splats_are_placed_by_any_matrix(kind):
     """Catches ellipsoids and colors that do not turn, scale, mirror or shear with their place."""
     turn = Rotation.from_euler("xyz", (0.4, -1.1, 2.0)).as_matrix()
     change = {
@@ -150,10 +151,10 @@ def test_splats_are_placed_by_any_matrix(kind: str) -> None:
     found = placed(splats, matrix)
     expected = linear @ covariance(splats) @ linear.T
     size = np.abs(expected).max((1, 2), keepdims=True)
-    np.testing.assert_allclose(covariance(found) / size, expected / size, atol=1e-5)
-    np.testing.assert_allclose(found.xyz, splats.xyz @ linear.T + [1, 2, 3], atol=1e-6)
+    assert_allclose(covariance(found) / size, expected / size, atol=1e-5)
+    assert_allclose(found.xyz, splats.xyz @ linear.T + [1, 2, 3], atol=1e-6)
     left, _, right = np.linalg.svd(linear)
     seen = np.random.default_rng(0).normal(size=(40, 3))
     seen /= np.linalg.norm(seen, axis=1, keepdims=True)
     own = sh_color(splats.sh, seen @ (left @ right))
-    np.testing.assert_allclose(sh_color(found.sh, seen), own, atol=1e-5)
+    assert_allclose(sh_color(found.sh, seen), own, atol=1e-5)

@@ -3,6 +3,7 @@ area."""
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
 from stga_addon.avatar.embedding import CONVENTIONS, face_areas, face_frames, to_world
 from stga_addon.avatar.lattice import lattice_splats
@@ -19,7 +20,7 @@ def test_points_a_triangle(order, count):
     assert len(splats) == count * len(faces)
     assert splats.sh.shape[1:] == (9, 3)
     assert not any(values.any() for values in (splats.sh, splats.opacity, splats.unbound))
-    np.testing.assert_array_equal(splats.face, np.repeat(np.arange(len(faces)), count))
+    assert_array_equal(splats.face, np.repeat(np.arange(len(faces)), count))
     assert len(np.unique(splats.xyz[:count].round(6), axis=0)) == count
     assert splats.face.dtype == np.int32
     for name in ("xyz", "rotation", "log_scale", "opacity", "sh"):
@@ -65,4 +66,4 @@ def test_world_scale_is_flat_along_the_normal(convention):
     for face, axis in enumerate(along):
         want = np.full(3, expected[face])
         want[axis] *= 0.5
-        np.testing.assert_allclose(sigma[face], np.tile(want, (6, 1)), rtol=1e-5)
+        assert_allclose(sigma[face], np.tile(want, (6, 1)), rtol=1e-5)

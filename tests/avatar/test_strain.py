@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from numpy.linalg import norm
 from numpy.random import default_rng
+from numpy.testing import assert_allclose, assert_array_equal, assert_equal
 from refusal import refusal
 from scipy.spatial.transform import Rotation
 
@@ -39,7 +40,7 @@ from stga_addon.render.render import render, render_avatar
 FACES = np.array([[0, 1, 2], [2, 1, 3], [2, 3, 4], [0, 2, 4]], np.int32)
 
 
-def sheet(seed: int = 0) -> np.ndarray:
+def sheet(seed=0):
     """Five vertices of four triangles in space, edges of a centimeter."""
     flat = np.array([[0, 0, 0], [1, 0.1, 0], [0.4, 1, 0], [1.3, 1.2, 0], [-0.2, 1.8, 0]])
     bumpy = flat + default_rng(seed).normal(0, 0.1, flat.shape)
@@ -100,17 +101,17 @@ def test_deformation_stays_within_what_was_seen():
             lowest = rest[component] - RANGE_MARGIN * (rest[component] - min(values))
             highest = rest[component] + RANGE_MARGIN * (max(values) - rest[component])
             expected = max(lowest, -MAX_STRAIN), min(highest, allowed[face, 1, component])
-            np.testing.assert_allclose(limits[face, :, component], expected, atol=1e-6)
+            assert_allclose(limits[face, :, component], expected, atol=1e-6)
     assert limits[:, 0, :2].max() < -MIN_COMPRESSION
     assert (limits[:, 1, :2] == np.float32(-MIN_COMPRESSION)).all()
     limited = strain_basis(neutral, FACES, limits)
     for mesh, found in zip(posed, every, strict=True):
-        np.testing.assert_array_equal(deformation(limited, mesh), found)
+        assert_array_equal(deformation(limited, mesh), found)
     stronger = neutral + 4 * (posed[0] - neutral)
     free, clipped = (
         deformation(basis, stronger) for basis in (strain_basis(neutral, FACES), limited)
     )
-    np.testing.assert_array_equal(clipped, np.clip(free, limits[:, 0], limits[:, 1]))
+    assert_array_equal(clipped, np.clip(free, limits[:, 0], limits[:, 1]))
     assert (np.abs(free) > np.abs(clipped) + 0.01).any(0)[[0, 1, 3, 4]].all()
 
 
@@ -123,8 +124,8 @@ def test_the_range_is_in_the_file_and_in_renderings(tmp_path):
     avatar = replace(colored(neutral), strain_range=limits)
     write_avatar(tmp_path / "a.npz", avatar)
     found = read_avatar(tmp_path / "a.npz")
-    np.testing.assert_equal(found.driven_offsets, avatar.driven_offsets)
-    np.testing.assert_array_equal(found.strain_range, limits)
+    assert_equal(found.driven_offsets, avatar.driven_offsets)
+    assert_array_equal(found.strain_range, limits)
     assert np.abs(colored(neutral).frames(stretched).color).max() > 0.01
     assert not found.frames(stretched).color.any()
     with refusal(r"strain_range is float32 \(3, 2, 6\), expected float32 \(4, 2, 6\)"):
@@ -142,11 +143,11 @@ def test_baking_keeps_the_picture():
     white = (1.0, 1.0, 1.0)
     drawn = render_avatar(avatar, posed, camera, white)
     baked = to_world(avatar.splats, avatar.frames(posed))
-    np.testing.assert_allclose(render(baked, camera, white), drawn, atol=2e-5)
+    assert_allclose(render(baked, camera, white), drawn, atol=2e-5)
     plain = replace(avatar, driven_offsets={})
     assert np.abs(render_avatar(plain, posed, camera, white) - drawn).max() > 0.05
     undeformed = face_frames(posed, FACES, neutral)
-    np.testing.assert_array_equal(to_world(avatar.splats, undeformed).sh, avatar.splats.sh)
+    assert_array_equal(to_world(avatar.splats, undeformed).sh, avatar.splats.sh)
 
 
 def following(neutral):
@@ -163,7 +164,7 @@ def test_neighbors_share_an_edge():
     assert found == [[1, 2], [0, 2], [0, 1, 3], [2], [], []]
 
 
-def finned_sheet(seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+def finned_sheet(seed=0):
     """Vertices and triangles of a mesh with a boundary, an edge of three triangles, and a vertex
     without any."""
     faces = np.concatenate([FACES[[2, 0]], [[2, 1, 5]], FACES[[3, 1]]])
@@ -198,7 +199,7 @@ def test_strain_is_averaged_over_whatever_touches():
         expected = 5 * np.array([a @ mean @ b for a, b in pairs])
         assert np.abs(expected).max() > 0.1
         found = deformation(strain_basis(neutral, faces), posed)[f, :3]
-        np.testing.assert_allclose(found, np.clip(expected, -MAX_STRAIN, MAX_STRAIN), atol=1e-5)
+        assert_allclose(found, np.clip(expected, -MAX_STRAIN, MAX_STRAIN), atol=1e-5)
 
 
 def test_smoothed_strain_is_averaged_over_edges():
@@ -213,10 +214,10 @@ def test_smoothed_strain_is_averaged_over_edges():
         average[f, members] = 1 / len(members)
     moved = deformed[:, :3] - [-MIN_COMPRESSION, -MIN_COMPRESSION, 0]
     expected = np.linalg.matrix_power(average, AVERAGING_ROUNDS) @ moved
-    np.testing.assert_allclose(smoothed_strain(basis, deformed), expected, atol=1e-6)
+    assert_allclose(smoothed_strain(basis, deformed), expected, atol=1e-6)
     assert np.abs(expected).max() > 0.1
     turned = neutral @ Rotation.from_rotvec([0.3, 1, -2]).as_matrix().T
-    np.testing.assert_allclose(smoothed_strain(basis, deformation(basis, turned)), 0, atol=1e-6)
+    assert_allclose(smoothed_strain(basis, deformation(basis, turned)), 0, atol=1e-6)
 
 
 @pytest.mark.parametrize("convention", ["stga", "gaussian_avatars"])
@@ -236,9 +237,9 @@ def test_colors_follow_strain_and_normals(convention):
         skin = sum(smoothed[f, k] * by_strain[f, k] for k in range(3))
         light = sum((after - before)[k] * by_normal[f, k] for k in range(3))
         assert np.abs(light).max() > 1e-3
-        np.testing.assert_allclose(avatar.frames(posed).color[f], skin + light, atol=1e-6)
-        np.testing.assert_allclose(avatar.without_light.frames(posed).color[f], skin, atol=1e-6)
-    np.testing.assert_allclose(avatar.frames(neutral).color, 0, atol=1e-6)
+        assert_allclose(avatar.frames(posed).color[f], skin + light, atol=1e-6)
+        assert_allclose(avatar.without_light.frames(posed).color[f], skin, atol=1e-6)
+    assert_allclose(avatar.frames(neutral).color, 0, atol=1e-6)
 
 
 @pytest.mark.parametrize("convention", ["stga", "gaussian_avatars"])
@@ -258,12 +259,12 @@ def test_positions_follow_strain(convention, tmp_path):
     shifted = replace(avatar.splats, xyz=xyz.astype(np.float32))
     plain = face_frames(posed, FACES, neutral, convention)
     baked = to_world(found.splats, found.frames(posed))
-    np.testing.assert_allclose(baked.xyz, to_world(shifted, plain).xyz, atol=1e-7)
-    np.testing.assert_array_equal(baked.rotation, to_world(shifted, plain).rotation)
+    assert_allclose(baked.xyz, to_world(shifted, plain).xyz, atol=1e-7)
+    assert_array_equal(baked.rotation, to_world(shifted, plain).rotation)
     assert np.abs(baked.xyz - to_world(avatar.splats, plain).xyz).max() > 1e-4
     still = to_world(avatar.splats, face_frames(neutral, FACES, neutral, convention))
     rest = to_world(found.splats, found.frames(neutral))
-    np.testing.assert_allclose(rest.xyz, still.xyz, atol=1e-7)
+    assert_allclose(rest.xyz, still.xyz, atol=1e-7)
     wrong = replace(avatar, driven_offsets={"strain_position": moves[1:]})
     with refusal(r"strain_position is float32 \(3, 3, 3\), expected float32 \(4, 3, 3\)"):
         write_avatar(tmp_path / "b.npz", wrong)
@@ -312,7 +313,7 @@ def test_only_what_shows_is_kept(name, convention):
         )
         pruned = whole.without_invisible_offsets
         is_kept = pruned.driven_offsets[name].any((1, 2))
-        np.testing.assert_array_equal(
+        assert_array_equal(
             pruned.driven_offsets[name][is_kept], whole.driven_offsets[name][is_kept]
         )
         shares.append(is_kept.mean())

@@ -14,11 +14,11 @@ TrainedHere = Callable[..., Plan]
 
 
 @pytest.fixture(scope="session")
-def trained_here(tmp_path_factory: pytest.TempPathFactory) -> TrainedHere:
+def trained_here(tmp_path_factory):
     """Number of seeds and iterations -> `tiny_plan` with its results, without any engine."""
 
     @cache
-    def train(seeds: int, iterations: int) -> Plan:
+    def train(seeds, iterations):
         plan = tiny_plan(tmp_path_factory.mktemp("here"), seeds, iterations)
         for job in plan.jobs:
             perform(job.request)

@@ -1,11 +1,9 @@
 """An engine that does no work, one without workers, and batches of jobs that ask for none."""
 
-from collections.abc import Callable, Mapping
-from pathlib import Path
-from typing import Any
+from collections.abc import Callable
 
 from stga_addon.jobs.batch.folder import hold_batch
-from stga_addon.jobs.batch.plan import Ended, Engine, Job, Plan, make_plan
+from stga_addon.jobs.batch.plan import Ended, Engine, Job, make_plan
 from stga_addon.jobs.batch.run import Batch, BatchRun
 from stga_addon.jobs.perform import perform_in_folder
 from stga_addon.worker.status import StatusWriter, WorkerState, inspect_worker
@@ -13,7 +11,7 @@ from stga_addon.worker.status import StatusWriter, WorkerState, inspect_worker
 Outcome = Callable[[Job], tuple[WorkerState | None, str]]
 
 
-def finished(job: Job) -> tuple[WorkerState | None, str]:
+def finished(job):
     return WorkerState.FINISHED, ""
 
 
@@ -29,26 +27,26 @@ class SimulatedEngine(Engine):
         self.most = 0
         self.jobs: dict[str, Job] = {}
 
-    def has_room(self, job: Job) -> bool:
+    def has_room(self, job):
         return len(self.jobs) < self.room
 
-    def submit(self, job: Job) -> None:
+    def submit(self, job):
         self.submitted.append(job.name)
         self.jobs[job.name] = job
         self.most = max(self.most, len(self.jobs))
 
-    def adopt(self, job: Job) -> None:
+    def adopt(self, job):
         self.jobs[job.name] = job
 
-    def running(self) -> Mapping[str, str]:
+    def running(self):
         return dict.fromkeys(self.jobs, "simulated")
 
-    def ended(self) -> Mapping[str, Ended]:
+    def ended(self):
         jobs = self.jobs
         self.jobs = {}
         return {name: self.end(job) for name, job in jobs.items()}
 
-    def end(self, job: Job) -> Ended:
+    def end(self, job):
         state, error = self.outcome(job)
         if state is not None:
             StatusWriter(job.request_folder).finish(state, error)
@@ -58,12 +56,12 @@ class SimulatedEngine(Engine):
 class InProcessEngine(SimulatedEngine):
     """Carries each job out in this process."""
 
-    def end(self, job: Job) -> Ended:
+    def end(self, job):
         perform_in_folder(job.request_folder, lambda text: None)
         return Ended(inspect_worker(job.request_folder), False)
 
 
-def empty_jobs(base: Path, count: int, again: bool = False, **jobs: Any) -> Plan:
+def empty_jobs(base, count, again=False, **jobs):
     """A plan of `count` analyses, which write no file but their result; again: each by another job
     after it as well; and of further jobs."""
     (base / "capture").mkdir(exist_ok=True)
@@ -77,9 +75,9 @@ def empty_jobs(base: Path, count: int, again: bool = False, **jobs: Any) -> Plan
     return make_plan({"out": "runs", "job": jobs}, base, "plan")
 
 
-def carry_out(plan: Plan, engine: Engine) -> tuple[Batch, list[str]]:
+def carry_out(plan, engine):
     """The batch after its end, and what was said."""
-    said: list[str] = []
+    said = []
     with hold_batch(plan.out) as lease:
         batch = Batch(plan)
         BatchRun(batch, engine, lease, lambda batch: None, said.append).run()

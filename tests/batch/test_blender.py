@@ -3,7 +3,6 @@
 import os
 import shlex
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -54,7 +53,7 @@ memory_gb = 1
 
 
 @pytest.fixture(scope="module")
-def shot(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+def shot(tmp_path_factory):
     """A folder with an animated head in a .blend file, and its frames 0 to 4 in `whole`."""
     folder = tmp_path_factory.mktemp("shot")
     with pytest.MonkeyPatch.context() as patch:
@@ -73,15 +72,15 @@ def shot(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
         yield folder
 
 
-def blender(words: str) -> None:
+def blender(words):
     output_of([*BLENDER, *words.split()], timeout=600, cwd=ROOT)
 
 
-def pictures(folder: Path) -> dict[str, np.ndarray]:
+def pictures(folder):
     return {path.name: np.asarray(Image.open(path)) for path in sorted(folder.rglob("*.png"))}
 
 
-def check(shot: Path, engine: str) -> None:
+def check(shot, engine):
     whole = pictures(shot / "whole")
     found = pictures(shot / engine)
     assert list(found) == list(whole) == [f"{frame:06d}.png" for frame in range(5)]
@@ -93,13 +92,13 @@ def check(shot: Path, engine: str) -> None:
     ]
 
 
-def plan_of(shot: Path, engine: str) -> Path:
+def plan_of(shot, engine):
     path = shot / f"{engine}.toml"
     path.write_text(PLAN.format(engine=engine))
     return path
 
 
-def test_frames_through_the_local_engine(shot: Path) -> None:
+def test_frames_through_the_local_engine(shot):
     """Catches frames that a worker's Blender renders by another engine, leaves out, or repeats."""
     plan = read_plan(plan_of(shot, "local"))
     batch, _ = carry_out(plan, LocalEngine(2, 8.0))

@@ -85,7 +85,7 @@ def test_killed_workers_resume_to_the_same_bits(tmp_path, trained_here, monkeypa
         assert qualities[0] == qualities[1]
 
 
-def test_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_command(tmp_path, capsys):
     """Catches a failure nobody sees, Ctrl-C that loses work, and a report that needs more files."""
     tiny_plan(tmp_path)
     check_interrupted(tmp_path, *interrupt_batch(tmp_path))
@@ -119,7 +119,7 @@ def test_captures_of_the_command(tmp_path, capsys, monkeypatch):
     )
 
 
-def test_commands_carry_out_the_batch(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_commands_carry_out_the_batch(tmp_path, capsys):
     """Catches commands that a shell elsewhere cannot run, in another order, or of finished jobs."""
     write_mesh_capture(tmp_path / "a capture")
     look = '[job.{}]\nrequest = "select"\ncapture = "a capture"\nafter = {}\n'

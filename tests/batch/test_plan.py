@@ -1,15 +1,13 @@
 """Plans: which jobs a table makes, what each comes after, and the sentence for each mistake."""
 
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
 
 import pytest
 from refusal import refusal
 
 from stga_addon.driving.open_motion import MotionOptions
 from stga_addon.jobs.batch.folder import job_digests
-from stga_addon.jobs.batch.plan import Plan, Resources, make_plan, plan_of_captures, read_plan
+from stga_addon.jobs.batch.plan import Resources, make_plan, plan_of_captures, read_plan
 from stga_addon.jobs.export import Export
 from stga_addon.jobs.finished_run import Evaluate
 from stga_addon.jobs.render import Render
@@ -45,19 +43,19 @@ after = ["anna-val"]
 
 
 @pytest.fixture
-def base(tmp_path: Path) -> Path:
+def base(tmp_path):
     for name in ("anna", "ben"):
         (tmp_path / "footage" / name).mkdir(parents=True)
     (tmp_path / "head.npz").touch()
     return tmp_path
 
 
-def plan_of(base: Path, text: str = PLAN) -> Plan:
+def plan_of(base, text=PLAN):
     (base / "plan.toml").write_text(text)
     return read_plan(base / "plan.toml")
 
 
-def test_jobs_of_a_plan(base: Path) -> None:
+def test_jobs_of_a_plan(base):
     """Catches fields that do not reach a request, and a job before what it reads is there."""
     plan = plan_of(base)
     runs = base / "runs"
@@ -87,7 +85,7 @@ def test_jobs_of_a_plan(base: Path) -> None:
     assert smile.minutes == 2
 
 
-def test_names_of_captures(base: Path) -> None:
+def test_names_of_captures(base):
     """Catches captures that cannot be trained together, or not as `stga train` would train them."""
     folders = ["anna/take", "ben/take", "_anna", "_é_ben", "film/東京", "film/大阪", "c 1"]
     for name in folders:
@@ -256,7 +254,7 @@ out = "r
 
 
 @pytest.mark.parametrize("mistake", MISTAKES.strip().split("\n\n"), ids=lambda text: text[-40:])
-def test_a_mistake_is_a_sentence(base: Path, mistake: str) -> None:
+def test_a_mistake_is_a_sentence(base, mistake):
     """Catches a mistake in a plan that is carried out, or ends in a traceback."""
     text, _, message = mistake.partition("\n! ")
     with refusal(message) as caught:
@@ -264,7 +262,7 @@ def test_a_mistake_is_a_sentence(base: Path, mistake: str) -> None:
     assert str(caught.value).startswith(str(base / "plan.toml"))
 
 
-def changed(before: dict[str, str], after: dict[str, str]) -> set[str]:
+def changed(before, after):
     assert before.keys() == after.keys()
     return {name for name in before if before[name] != after[name]}
 
@@ -285,7 +283,7 @@ def test_what_changed_is_done_again(base):
     run.mkdir()
     for name in ("run.json", "avatar.npz"):
         (run / name).write_text("1")
-    values: dict[str, Any] = {"out": "r", "job": {"a": {"request": "evaluate", "run": "run"}}}
+    values = {"out": "r", "job": {"a": {"request": "evaluate", "run": "run"}}}
     before = job_digests(make_plan(values, base, "plan"))
     (run / "quality_val.json").touch()
     assert changed(before, job_digests(make_plan(values, base, "plan"))) == set()
@@ -293,7 +291,7 @@ def test_what_changed_is_done_again(base):
     assert changed(before, job_digests(make_plan(values, base, "plan"))) == {"a"}
 
 
-def test_texts_that_name_files(base: Path) -> None:
+def test_texts_that_name_files(base):
     """Catches a file looked for where the worker runs, or whose change goes unnoticed."""
     text = """
 out = "runs"

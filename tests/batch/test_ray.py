@@ -13,7 +13,6 @@ from refusal import refusal
 from stga_addon.jobs.batch import ray as ray_engine
 from stga_addon.jobs.batch.engines import make_engine
 
-from .conftest import TrainedHere
 from .tiny import (
     ITERATIONS,
     check_interrupted,
@@ -90,7 +89,7 @@ KILLS = int(os.environ.get("STGA_BATCH_NODE_KILLS", 2))
 docs/batch.md."""
 
 
-def run_script(script: str, *arguments: object, **variables: str) -> list[str]:
+def run_script(script, *arguments, **variables):
     """Lines that a script prints in a process of its own, which Ray leaves its settings to."""
     command = [sys.executable, "-c", script, ROOT, *arguments]
     environment = {**ray_variables(), **variables}
@@ -98,7 +97,7 @@ def run_script(script: str, *arguments: object, **variables: str) -> list[str]:
 
 
 @pytest.mark.nightly
-def test_jobs_of_killed_nodes_resume_elsewhere(tmp_path: Path, trained_here: TrainedHere) -> None:
+def test_jobs_of_killed_nodes_resume_elsewhere(tmp_path, trained_here):
     """Catches a token that cannot be used, jobs lost or changed, and two workers on one."""
     pytest.importorskip("torch")
     pytest.importorskip("ray", reason="Ray is not installed: pip install 'stga-addon[ray]'")
@@ -119,7 +118,7 @@ def test_jobs_of_killed_nodes_resume_elsewhere(tmp_path: Path, trained_here: Tra
 
 
 @pytest.mark.slow
-def test_a_cluster_of_this_machine_is_its_users(tmp_path: Path) -> None:
+def test_a_cluster_of_this_machine_is_its_users(tmp_path):
     """Catches a cluster that anyone on this machine may use, and jobs not carried out there."""
     pytest.importorskip("ray", reason="Ray is not installed: pip install 'stga-addon[ray]'")
     write_mesh_capture(tmp_path / "capture")
@@ -127,7 +126,7 @@ def test_a_cluster_of_this_machine_is_its_users(tmp_path: Path) -> None:
 
 
 @pytest.mark.nightly
-def test_ctrl_c_through_ray(tmp_path: Path) -> None:
+def test_ctrl_c_through_ray(tmp_path):
     """Catches Ctrl-C that tasks do not hear, or that takes the cluster before they have saved."""
     pytest.importorskip("torch")
     pytest.importorskip("ray", reason="Ray is not installed: pip install 'stga-addon[ray]'")
@@ -135,7 +134,7 @@ def test_ctrl_c_through_ray(tmp_path: Path) -> None:
     check_interrupted(tmp_path, *interrupt_batch(tmp_path, "--engine", "ray"))
 
 
-def test_without_ray(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_ray(monkeypatch):
     """Catches a traceback where Ray is not installed, and an address that is silently ignored."""
     monkeypatch.setattr(ray_engine, "find_spec", lambda name: None)
     with refusal("--engine ray: the package ray is not installed"):

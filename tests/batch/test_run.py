@@ -10,7 +10,6 @@ import time
 from collections import Counter
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
 
 import pytest
 from refusal import refusal
@@ -38,11 +37,11 @@ AFTER = [f"again-{number:05d}" for number in range(3)]
 LAST = {"request": "analyze", "capture": "capture", "after": AFTER}
 
 
-def states(batch: Batch) -> dict[str, JobState]:
+def states(batch):
     return {name: entry.state for name, entry in batch.entries.items()}
 
 
-def test_second_start_does_only_what_is_left(tmp_path: Path) -> None:
+def test_second_start_does_only_what_is_left(tmp_path):
     """Catches work repeated, and work not done though its input or result has changed."""
     plan = empty_jobs(tmp_path, 3, again=True, last=LAST)
     engine = SimulatedEngine(room=2)
@@ -67,10 +66,10 @@ def test_second_start_does_only_what_is_left(tmp_path: Path) -> None:
     assert (moved / "job/request.json").exists()
 
 
-def test_a_batch_that_writes_into_what_it_reads(tmp_path: Path) -> None:
+def test_a_batch_that_writes_into_what_it_reads(tmp_path):
     """Catches jobs that are never finished, because what they write changes what they read."""
 
-    def outcome(job: Job) -> tuple[WorkerState, str]:
+    def outcome(job):
         if isinstance(job.request, ConvertMotion):
             job.request.output.touch()
         return WorkerState.FINISHED, ""
@@ -90,10 +89,10 @@ def test_a_batch_that_writes_into_what_it_reads(tmp_path: Path) -> None:
         assert engine.submitted == submitted
 
 
-def test_a_frame_that_is_gone_is_rendered_again(tmp_path: Path) -> None:
+def test_a_frame_that_is_gone_is_rendered_again(tmp_path):
     """Catches a picture that was removed to be rendered anew, and counts as finished."""
 
-    def outcome(job: Job) -> tuple[WorkerState, str]:
+    def outcome(job):
         assert isinstance(job.request, RenderBlend)
         for picture in job.request.pictures.values():
             picture.touch()
@@ -112,10 +111,10 @@ def test_a_frame_that_is_gone_is_rendered_again(tmp_path: Path) -> None:
         assert engine.submitted == submitted
 
 
-def test_a_failed_job_fails_alone(tmp_path: Path) -> None:
+def test_a_failed_job_fails_alone(tmp_path):
     """Catches a failure that stops other jobs, or is passed on as if the next had failed itself."""
 
-    def outcome(job: Job) -> tuple[WorkerState, str]:
+    def outcome(job):
         failed = job.name == "look-00001"
         return (WorkerState.FAILED, "capture: is empty") if failed else (WorkerState.FINISHED, "")
 
@@ -135,11 +134,11 @@ def test_a_failed_job_fails_alone(tmp_path: Path) -> None:
     assert all(state.is_done for state in states(batch).values())
 
 
-def test_a_lost_worker_is_replaced(tmp_path: Path) -> None:
+def test_a_lost_worker_is_replaced(tmp_path):
     """Catches a batch that ends because a machine died, and one that tries a job for ever."""
     deaths = Counter({"look-00000": 2, "look-00001": 99})
 
-    def outcome(job: Job) -> tuple[WorkerState | None, str]:
+    def outcome(job):
         deaths[job.name] -= 1
         return (None, "") if deaths[job.name] >= 0 else (WorkerState.FINISHED, "")
 
@@ -160,10 +159,10 @@ def test_waiting_in_a_queue_is_no_work(tmp_path, monkeypatch):
     monkeypatch.setattr(status, "time", SimpleNamespace(monotonic=lambda: now))  # of the workers
 
     class Queued(SimulatedEngine):
-        def running(self) -> dict[str, str]:
+        def running(self):
             return {}
 
-        def end(self, job: Job) -> Ended:
+        def end(self, job):
             nonlocal now
             now += queue_s
             writer = StatusWriter(job.request_folder)
@@ -175,14 +174,11 @@ def test_waiting_in_a_queue_is_no_work(tmp_path, monkeypatch):
     batch, _ = carry_out(empty_jobs(tmp_path, 1), Queued())
     (entry,) = batch.entries.values()
     record = read_record(entry.job)
-    assert record is not None
     assert now == queue_s + work_s
     assert record.seconds == entry.seconds == work_s
 
 
-def test_the_pace_of_this_machine_is_measured_once(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_pace_of_this_machine_is_measured_once(tmp_path, monkeypatch):
     """Catches a plan of 200 trainings whose forecast takes 200 calibrations, and one time that is
     given to all of them whatever their iterations are."""
     (tmp_path / "capture").mkdir()
@@ -193,7 +189,7 @@ def test_the_pace_of_this_machine_is_measured_once(
     batch = Batch(make_plan({"out": "runs", "job": jobs}, tmp_path, "plan"))
     measured = []
 
-    def pace(job: Job, request: Any, iterations: int) -> float:
+    def pace(job, request, iterations):
         measured.append(job.name)
         return 0.5
 
@@ -204,7 +200,7 @@ def test_the_pace_of_this_machine_is_measured_once(
     assert found == {name: 0.5 * count for name, count in iterations.items()}
 
 
-def test_the_report_shows_the_avatar_that_is_kept(tmp_path: Path) -> None:
+def test_the_report_shows_the_avatar_that_is_kept(tmp_path):
     """Catches figures of an earlier state for a continuation, which keeps its latest, and heads
     fitted to held-out images in a column that is not called so."""
     lines = [(25.0, 0.1, {}), (24.0, 0.2, {"psnr_fitted_heads": 27.25})]
@@ -233,11 +229,11 @@ def test_the_report_shows_the_avatar_that_is_kept(tmp_path: Path) -> None:
     assert "PSNR, heads fitted" in text
 
 
-def test_ctrl_c_leaves_the_rest(tmp_path: Path) -> None:
+def test_ctrl_c_leaves_the_rest(tmp_path):
     """Catches an interrupted batch that starts further jobs, or forgets finished ones."""
     plan = empty_jobs(tmp_path, 4)
 
-    def outcome(job: Job) -> tuple[WorkerState, str]:
+    def outcome(job):
         if job.name == "look-00001":
             raise KeyboardInterrupt
         return WorkerState.FINISHED, ""
@@ -251,7 +247,7 @@ def test_ctrl_c_leaves_the_rest(tmp_path: Path) -> None:
     assert second.submitted == ["look-00001", "look-00002", "look-00003"]
 
 
-def test_files_of_others_stay(tmp_path: Path) -> None:
+def test_files_of_others_stay(tmp_path):
     """Catches a batch that moves what no job wrote, or starts the jobs after it."""
     plan = empty_jobs(tmp_path, 2, again=True)
     own = tmp_path / "runs/look-00000/run.json"
@@ -266,11 +262,11 @@ def test_files_of_others_stay(tmp_path: Path) -> None:
     assert own.read_text() == "mine"
 
 
-def test_a_job_that_an_engine_refuses_fails_alone(tmp_path: Path) -> None:
+def test_a_job_that_an_engine_refuses_fails_alone(tmp_path):
     """Catches a batch that ends, or waits for ever, where a worker cannot be started."""
 
     class Refusing(SimulatedEngine):
-        def submit(self, job: Job) -> None:
+        def submit(self, job):
             if job.name == "look-00000":
                 raise StgaError("python: cannot be run")
             super().submit(job)
@@ -281,7 +277,7 @@ def test_a_job_that_an_engine_refuses_fails_alone(tmp_path: Path) -> None:
     assert states(batch)["again-00001"] == JobState.FINISHED
 
 
-def test_a_damaged_record_is_no_result(tmp_path: Path) -> None:
+def test_a_damaged_record_is_no_result(tmp_path):
     """Catches a traceback, or a job that counts as finished, where its record is cut off."""
     plan = empty_jobs(tmp_path, 1)
     carry_out(plan, SimulatedEngine())
@@ -294,11 +290,11 @@ def test_a_damaged_record_is_no_result(tmp_path: Path) -> None:
     assert is_done(plan.jobs[0], digest)
 
 
-def test_room_on_this_machine(tmp_path: Path) -> None:
+def test_room_on_this_machine(tmp_path):
     """Catches more workers than there are processors or memory, and one that never fits."""
     engine = LocalEngine(cores=4, memory_gb=8.0)
 
-    def job(name: str, **needs: float) -> Job:
+    def job(name, **needs):
         found = empty_jobs(tmp_path, 1).jobs[0]
         resources = Resources(**{"threads": 1, **needs})
         return Job(name, found.request, tmp_path / name, resources=resources)
@@ -342,7 +338,7 @@ def test_a_killed_worker_is_told_from_a_mistake(tmp_path, monkeypatch, windows, 
 LEASE = f"{LOCK}.lease"
 
 
-def _hold(folder: str, held: Any) -> None:
+def _hold(folder, held):
     with hold_batch(Path(folder)):
         held.set()
         time.sleep(120)
@@ -353,7 +349,7 @@ def test_two_batches_cannot_take_one_folder(tmp_path, locks, monkeypatch):
     """Catches two batches in one folder, also where the storage knows no file locks."""
     if locks == "fail":
 
-        def no_lock(path: Path) -> None:
+        def no_lock(path):
             raise OSError(errno.ENOLCK, "No locks available")
 
         monkeypatch.setattr(lock, "_hold_file_lock", no_lock)
@@ -379,12 +375,12 @@ def test_two_batches_cannot_take_one_folder(tmp_path, locks, monkeypatch):
     assert not (tmp_path / LEASE).exists()
 
 
-def test_a_lease_that_was_taken_is_noticed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_lease_that_was_taken_is_noticed(tmp_path, monkeypatch):
     """Catches a batch that goes on in a folder which another took while it was suspended."""
     monkeypatch.setattr(lock, "BEAT_S", 0.05)
     plan = empty_jobs(tmp_path, 1)
 
-    def outcome(job: Job) -> tuple[WorkerState | None, str]:
+    def outcome(job):
         os.replace(plan.out / LEASE, plan.out / "suspended")
         (plan.out / LEASE).touch()
         time.sleep(0.5)
@@ -416,7 +412,7 @@ JOBS = int(os.environ.get("STGA_BATCH_JOBS", 2000))
 
 
 @pytest.mark.slow
-def test_a_job_costs_the_same_in_a_large_batch(tmp_path: Path) -> None:
+def test_a_job_costs_the_same_in_a_large_batch(tmp_path):
     """Catches time or memory that grows faster than the number of jobs, in a process of its own."""
     if not Path("/proc/self/status").exists():
         pytest.skip("peak memory of a process is read from Linux's /proc")

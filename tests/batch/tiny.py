@@ -8,13 +8,12 @@ import subprocess
 import sys
 import time
 from pathlib import Path
-from typing import Any
 
 from capture.factory import write_mesh_capture
 
 from stga_addon.avatar.file import read_avatar
 from stga_addon.files import read_npz
-from stga_addon.jobs.batch.plan import Plan, make_plan
+from stga_addon.jobs.batch.plan import make_plan
 from stga_addon.training.run.folder import AVATAR
 from stga_addon.worker.status import read_status
 
@@ -34,13 +33,13 @@ a killed node is noticed after 3 s, and a node that is only slow has 10 s to ans
 SETTINGS = {"strategy": "selective", "hull_points": False}
 
 
-def tiny_plan(base: Path, seeds: int = 2, iterations: int = ITERATIONS) -> Plan:
+def tiny_plan(base, seeds=2, iterations=ITERATIONS):
     """Trainings of one capture with several seeds, and an evaluation after each."""
     if not (base / "capture").exists():
         write_mesh_capture(base / "capture", (0, 1, 3, 4), range(4))
     train = {"request": "train", "capture": "capture", "principal_point": "opencv"}
     train |= {"device": "cpu", "minutes": 0.1}
-    jobs: dict[str, Any] = {}
+    jobs = {}
     for seed in range(seeds):
         settings = {**SETTINGS, "iterations": iterations, "seed": seed}
         jobs[f"train-seed{seed}"] = {**train, "settings": settings}
@@ -50,7 +49,7 @@ def tiny_plan(base: Path, seeds: int = 2, iterations: int = ITERATIONS) -> Plan:
     return make_plan({"out": "runs", "resources": resources, "job": jobs}, base, "plan")
 
 
-def splats_of(plan: Plan, name: str) -> dict[str, bytes]:
+def splats_of(plan, name):
     """The arrays of a run's avatar as bytes; without its header, whose figures of the light depend
     in their last bits on the threads of the linear algebra."""
     path = plan.out / name / AVATAR
@@ -58,13 +57,13 @@ def splats_of(plan: Plan, name: str) -> dict[str, bytes]:
     return {key: array.tobytes() for key, array in read_npz(path).items() if key != "header"}
 
 
-def ray_variables() -> dict[str, str]:
+def ray_variables():
     """This process's variables, but of Ray's only RAY_SETTINGS."""
     kept = {name: value for name, value in os.environ.items() if not name.startswith("RAY_")}
     return kept | {f"RAY_{name}": value for name, value in RAY_SETTINGS.items()}
 
 
-def interrupt_batch(base: Path, *options: str) -> tuple[int, str]:
+def interrupt_batch(base, *options):
     """Exit code and output of `stga batch` on `base`/plan.toml after Ctrl-C, which came when its
     job `train-good` was training and its job `train-bad` had failed."""
     (base / "bad").mkdir()
@@ -99,7 +98,7 @@ def interrupt_batch(base: Path, *options: str) -> tuple[int, str]:
     return started.returncode, output
 
 
-def check_interrupted(base: Path, code: int, output: str) -> None:
+def check_interrupted(base, code, output):
     """What `interrupt_batch` has to leave: one job's failure, and the other's checkpoint."""
     assert code == 130, output
     assert "train-good: stopped" in output

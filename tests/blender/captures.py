@@ -1,49 +1,46 @@
 """Captures and FLAME sequences made by hand, so that the scene is tested, not readers."""
 
-from collections.abc import Mapping, Sequence
-from pathlib import Path
-
 import bpy
 import numpy as np
 from flame.small_head import small_head, write_flame
 
-from stga_addon.capture.model import Capture, View
+from stga_addon.capture.model import Capture
 from stga_addon.flame.forward import FlameFrame
 from stga_addon.flame.model import FlameModel
 from stga_addon.flame.sequence import FlameSequence, expression_mesh, neutral_mesh, sequence_mesh
 from stga_addon.scene.arrays import evaluated_vertices
 
 
-def at_frame(head, frame: float) -> np.ndarray:
+def at_frame(head, frame):
     """(V, 3) of an object's evaluated mesh."""
     whole = int(np.floor(frame))
     bpy.context.scene.frame_set(whole, subframe=frame - whole)
     return evaluated_vertices(head)
 
 
-def strip(vertices: int) -> np.ndarray:
+def strip(vertices):
     """(vertices - 2, 3) triangles of a strip."""
     first = np.arange(vertices - 2)
     return np.stack([first, first + 1, first + 2], 1).astype(np.int32)
 
 
-def closure(selected: np.ndarray, faces: np.ndarray) -> np.ndarray:
+def closure(selected, faces):
     """(F,) bool: triangles (F, 3) whose vertices all belong to a selected triangle."""
     return np.isin(faces, faces[selected]).all(axis=1)
 
 
 def mesh_capture(
-    root: Path,
-    timesteps: Sequence[int] = (2, 3, 7),
-    vertices: int = 60,
-    views: Mapping[str, tuple[View, ...]] | None = None,
-    seed: int = 0,
-) -> Capture:
+    root,
+    timesteps=(2, 3, 7),
+    vertices=60,
+    views=None,
+    seed=0,
+):
     """A mesh capture of random vertices; the mesh of each timestep is another draw."""
     neutral = np.random.default_rng(seed).normal(0, 0.1, (vertices, 3))
     faces = strip(vertices)
 
-    def mesh(timestep: int) -> np.ndarray:
+    def mesh(timestep):
         return neutral + np.random.default_rng([seed, timestep]).normal(0, 0.02, neutral.shape)
 
     regions = {"mouth": np.arange(len(faces)) % 3 == 0}
@@ -53,9 +50,7 @@ def mesh_capture(
     return Capture(root=root, layout="mesh", views=views or {}, **head, **times)
 
 
-def flame_model(
-    vertices: int = 80, components: int = 40, identity: int = 10, seed: int = 0
-) -> FlameModel:
+def flame_model(vertices=80, components=40, identity=10, seed=0):
     """A random model whose joints depend on more terms than one driver holds."""
     rng = np.random.default_rng(seed)
     weights = rng.random((vertices, 5)) ** 4
@@ -73,9 +68,7 @@ def flame_model(
     )
 
 
-def flame_sequence(
-    model: FlameModel, timesteps: Sequence[int] = (4, 5, 9), seed: int = 0, dynamic: bool = False
-) -> FlameSequence:
+def flame_sequence(model, timesteps=(4, 5, 9), seed=0, dynamic=False):
     """Large random poses, so that a transposed rotation or a wrong pivot is centimeters off."""
     rng = np.random.default_rng(seed)
     size = len(model.v_template)
@@ -96,7 +89,7 @@ def flame_sequence(
     return FlameSequence(model, shape, offset, tuple(timesteps), frames.__getitem__)
 
 
-def motion_capture(sequence: FlameSequence, source: Path) -> Capture:
+def motion_capture(sequence, source):
     """The sequence as what `open_capture` makes of a motion file."""
     return Capture(
         root=source,
@@ -112,7 +105,7 @@ def motion_capture(sequence: FlameSequence, source: Path) -> Capture:
     )
 
 
-def import_small_head(folder: Path, **motion: np.ndarray) -> FlameSequence:
+def import_small_head(folder, **motion):
     """The small head in the scene, by an importer's files in the folder, with a motion of its own;
     its identity as a sequence without frames."""
     model = small_head(0)

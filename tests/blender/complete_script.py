@@ -16,14 +16,14 @@ import bpy
 RESULT, WAIT, BUDGET = sys.argv[sys.argv.index("--") + 1 :]
 module = next(name for name in bpy.context.preferences.addons.keys() if name.endswith(".stga"))  # noqa: SIM118
 own_python = sys.modules[f"{module}.stga_addon.worker.training_python"].own_python
-seen: dict[str, object] = {"version": bpy.app.version_string, "python": sys.version.split()[0]}
+seen = {"version": bpy.app.version_string, "python": sys.version.split()[0]}
 
 
-def write() -> None:
+def write():
     Path(RESULT).write_text(json.dumps(seen, indent=1))
 
 
-def leave(worker: int) -> None:
+def leave(worker):
     seen["worker"] = worker
     write()
     os._exit(0)

@@ -74,7 +74,7 @@ def extension():
 
 
 @pytest.fixture
-def head(extension, tmp_path: Path):
+def head(extension, tmp_path):
     """The head of a mesh capture, in the folder `capture`."""
     import bpy
 
@@ -103,7 +103,7 @@ def worker(extension, head, tmp_path):
 
 
 @pytest.fixture(scope="session")
-def zip_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def zip_file(tmp_path_factory):
     """The built zip of the small edition."""
     try:
         fetch_wheels(ROOT / "wheels")
@@ -113,7 +113,7 @@ def zip_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="session")
-def demo(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def demo(tmp_path_factory):
     """A capture with its FLAME file, in place of the demo of the complete edition."""
     folder, model = write_flame_capture(tmp_path_factory.mktemp("demo") / "capture")
     model.rename(folder / OWN_MODELS[0])

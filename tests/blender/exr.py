@@ -1,14 +1,13 @@
 """Reads the uncompressed float OpenEXR files that a test lets Blender write."""
 
 import struct
-from pathlib import Path
 
 import numpy as np
 
 MULTI_PART = 0x1000
 
 
-def read_exr(path: Path) -> dict[str, np.ndarray]:
+def read_exr(path):
     """Channel name -> (H, W) float32, top row first, of scanlines without compression."""
     data = path.read_bytes()
     magic, version = struct.unpack_from("<2i", data)
@@ -39,7 +38,7 @@ def read_exr(path: Path) -> dict[str, np.ndarray]:
     return found
 
 
-def _header(data: bytes, at: int) -> tuple[dict[str, bytes], int]:
+def _header(data, at):
     header = {}
     while data[at]:
         name, kind, _ = data[at:].split(b"\0", 2)
@@ -51,7 +50,7 @@ def _header(data: bytes, at: int) -> tuple[dict[str, bytes], int]:
     return header, at + 1
 
 
-def _channels(left: bytes) -> list[str]:
+def _channels(left):
     names = []
     while left[0]:
         name, left = left.split(b"\0", 1)

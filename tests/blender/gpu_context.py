@@ -1,20 +1,18 @@
 """A GPU context in the module bpy: Blender gives one to render engines, also without a window."""
 
-from collections.abc import Callable
-
 import bpy
 
 
-def run_with_gpu(work: Callable[[], None]) -> None:
+def run_with_gpu(work):
     """Call `work` while a render engine with a GPU context renders; raises what it raised."""
-    errors: list[BaseException] = []
+    errors = []
 
     class Engine(bpy.types.RenderEngine):
         bl_idname = "STGA_TEST_GPU"
         bl_label = "Test"
         bl_use_gpu_context = True
 
-        def render(self, depsgraph: object) -> None:
+        def render(self, depsgraph):
             try:
                 work()
             except BaseException as error:

@@ -8,7 +8,6 @@ drawn from.
 import sys
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import bpy
 import numpy as np
@@ -34,10 +33,10 @@ FIELDS = {
     "FLOAT_VECTOR": ("vector", 3),
     "QUATERNION": ("value", 4),
 }
-found: dict[str, Any] = {}
+found = {}
 
 
-def read(case: str) -> None:
+def read(case):
     depsgraph = bpy.context.evaluated_depsgraph_get()
     (cloud,) = [
         each.object.data for each in depsgraph.object_instances if each.object.type == "POINTCLOUD"

@@ -4,7 +4,6 @@ import json
 import re
 import sys
 import time
-from pathlib import Path
 
 import bpy
 import pytest
@@ -70,7 +69,7 @@ def answer(**values):
 """
 
 
-def write_interpreter(path: Path, body: str) -> str:
+def write_interpreter(path, body):
     """A program that stands in for the training Python, given the folder of a request."""
     path.write_text(f"#!{sys.executable}\n{WORKER}{body}\n")
     path.chmod(0o755)
@@ -81,7 +80,7 @@ def write_interpreter(path: Path, body: str) -> str:
 def analyze(extension, monkeypatch, tmp_path):
     """Start an analysis by a stand-in for the worker, with a timer that the test calls."""
 
-    def start(body: str) -> None:
+    def start(body):
         python = write_interpreter(tmp_path / "python", body)
         monkeypatch.setattr(extension.operators.train, "training_python", lambda context: python)
         bpy.ops.stga.analyze_capture()
@@ -91,11 +90,11 @@ def analyze(extension, monkeypatch, tmp_path):
     extension.operators.monitor._close()
 
 
-def error_of(extension, kind: Kind) -> str:
+def error_of(extension, kind):
     return extension.operators.monitor.state_of(bpy.context.scene, kind).error
 
 
-def tick_until_done(extension, kind: Kind = Kind.ANALYSIS) -> None:
+def tick_until_done(extension, kind=Kind.ANALYSIS):
     for _ in range(300):
         extension.operators.monitor.tick()
         if not extension.operators.monitor.state_of(bpy.context.scene, kind).is_running:

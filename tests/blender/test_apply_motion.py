@@ -1,6 +1,5 @@
 """Apply Motion as a script calls it, and what leaves Blender again."""
 
-from pathlib import Path
 from types import SimpleNamespace
 
 import bpy
@@ -8,8 +7,8 @@ import numpy as np
 import pytest
 from capture.factory import ball, flame_parameters, write_flame_capture, write_mesh_capture
 from gui.layouts import Layout
+from numpy.testing import assert_allclose, assert_array_equal
 
-from stga_addon.capture.model import Capture
 from stga_addon.capture.open import open_capture
 from stga_addon.flame.forward import FlameFrame, flame_forward
 from stga_addon.scene.arrays import evaluated_vertices
@@ -25,7 +24,7 @@ UNDRAWN = {"filepath", "source", "filter_glob", "is_open"}
 class Reenacted:
     """A capture that is imported, and another person's motion in a file."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder):
         capture_folder, self.model_file = write_flame_capture(folder / "own")
         self.folder = capture_folder
         self.own = open_capture(capture_folder, self.model_file).flame
@@ -43,17 +42,17 @@ class Reenacted:
         self.file = folder / "other.npz"
         np.savez(self.file, **self.other)
 
-    def mesh(self, **values: np.ndarray) -> np.ndarray:
+    def mesh(self, **values):
         return flame_forward(
             self.own.model, self.own.shape, FlameFrame(**values), self.own.static_offset
         )
 
-    def theirs(self, row: int) -> dict[str, np.ndarray]:
+    def theirs(self, row):
         return {name: value[row] for name, value in self.other.items() if name != "shape"}
 
 
 @pytest.fixture
-def scene(tmp_path) -> Reenacted:
+def scene(tmp_path):
     return Reenacted(tmp_path)
 
 
@@ -61,12 +60,12 @@ def the_head():
     return bpy.context.scene.stga.head
 
 
-def at(frame: int) -> np.ndarray:
+def at(frame):
     bpy.context.scene.frame_set(frame)
     return evaluated_vertices(the_head())
 
 
-def write_refined(folder: Path, capture: Capture, rng: np.random.Generator) -> None:
+def write_refined(folder, capture, rng):
     """A run's file, whose parameters are disturbed."""
     tracking = RefinedTracking(capture, "stga")
     refined = tracking.parameters.copy()
@@ -91,10 +90,10 @@ def test_refined_tracking_keeps_the_offsets_of_each_frame(tmp_path, place):
     assert np.abs(at(3) - shown.mesh(3)).max() > 1e-3  # as anybody's motion: without
     bpy.ops.stga.apply_motion(filepath=path, start=0, place=place, own_offsets=True)
     for timestep in own.timesteps:
-        np.testing.assert_allclose(at(timestep), shown.mesh(timestep), atol=2 * TOLERANCE)
+        assert_allclose(at(timestep), shown.mesh(timestep), atol=2 * TOLERANCE)
     bpy.ops.stga.apply_motion(filepath=path, start=10, speed=0.5, place=place, own_offsets=True)
     for timestep in own.timesteps:
-        np.testing.assert_allclose(at(10 + 2 * timestep), shown.mesh(timestep), atol=2 * TOLERANCE)
+        assert_allclose(at(10 + 2 * timestep), shown.mesh(timestep), atol=2 * TOLERANCE)
 
 
 def test_undo(scene):
@@ -108,7 +107,7 @@ def test_undo(scene):
     bpy.ops.ed.undo()
     assert sorted(bpy.data.actions.keys()) == actions
     assert not rig_of(the_head()).animation_data.nla_tracks
-    np.testing.assert_array_equal(at(1), before)
+    assert_array_equal(at(1), before)
 
 
 def test_a_file_its_parts_and_its_frames(scene):
@@ -116,19 +115,19 @@ def test_a_file_its_parts_and_its_frames(scene):
     chosen = {"jaw": False, "eyes": False, "neck": False, "head": False, "strength": 0.5}
     bpy.ops.stga.apply_motion(filepath=str(scene.file), start=0, **chosen)
     own = vars(scene.own.frame(1)) | {"expr": scene.other["expr"][1] / 2}
-    np.testing.assert_allclose(at(1), scene.mesh(**own), atol=TOLERANCE)
+    assert_allclose(at(1), scene.mesh(**own), atol=TOLERANCE)
     with pytest.raises(RuntimeError, match="no part is chosen"):
         bpy.ops.stga.apply_motion(filepath=str(scene.file), **chosen, expression=False)
     bpy.ops.stga.apply_motion(filepath=str(scene.file), start=10)
     for row in range(5):
-        np.testing.assert_allclose(at(10 + row), scene.mesh(**scene.theirs(row)), atol=TOLERANCE)
+        assert_allclose(at(10 + row), scene.mesh(**scene.theirs(row)), atol=TOLERANCE)
     assert bpy.context.scene.frame_end == 14
     bpy.context.scene.render.fps = 24
     bpy.ops.stga.apply_motion(filepath=str(scene.file), start=1, fps=48)
     for frame, row in ((1, 0), (2, 2), (3, 4)):
-        np.testing.assert_allclose(at(frame), scene.mesh(**scene.theirs(row)), atol=TOLERANCE)
+        assert_allclose(at(frame), scene.mesh(**scene.theirs(row)), atol=TOLERANCE)
     bpy.ops.stga.apply_motion(filepath=str(scene.file), start=1, fps=48, speed=0.5)
-    np.testing.assert_allclose(at(4), scene.mesh(**scene.theirs(3)), atol=TOLERANCE)
+    assert_allclose(at(4), scene.mesh(**scene.theirs(3)), atol=TOLERANCE)
 
 
 def test_a_capture_and_another_head(scene, tmp_path):
@@ -137,7 +136,7 @@ def test_a_capture_and_another_head(scene, tmp_path):
     name = the_head().name
     bpy.ops.stga.apply_motion(filepath=str(folder), start=20)
     expected = {**vars(scene.own.frame(1)), **read_row(2)}
-    np.testing.assert_allclose(at(22), scene.mesh(**expected), atol=TOLERANCE)
+    assert_allclose(at(22), scene.mesh(**expected), atol=TOLERANCE)
     bpy.ops.stga.import_capture(directory=str(folder), flame=str(model))
     second = the_head()
     rig_of(second).animation_data.action = None
@@ -147,10 +146,10 @@ def test_a_capture_and_another_head(scene, tmp_path):
     bpy.ops.stga.apply_motion(source=second.name, start=40, head=False, jaw=False, eyes=False)
     # What is not taken stays: frame 42 lies behind the last keyframe of before, which holds.
     own = expected | {"expr": read_row(2)["expr"], "neck_pose": np.array([0, 0.4, 0])}
-    np.testing.assert_allclose(at(42), scene.mesh(**own), atol=TOLERANCE)
+    assert_allclose(at(42), scene.mesh(**own), atol=TOLERANCE)
 
 
-def read_row(timestep: int) -> dict[str, np.ndarray]:
+def read_row(timestep):
     fields = ("expr", "rotation", "neck_pose", "jaw_pose", "eyes_pose", "translation")
     arrays = flame_parameters(timestep)
     return {name: arrays[name][0].astype(np.float64) for name in fields}
@@ -178,7 +177,7 @@ def test_wrong_sources_change_nothing(scene, tmp_path):
         with pytest.raises(RuntimeError, match=message):
             bpy.ops.stga.apply_motion(**arguments)
     assert sorted(bpy.data.actions.keys()) == actions
-    np.testing.assert_array_equal(at(1), before)
+    assert_array_equal(at(1), before)
     scene.model_file.rename(tmp_path / "elsewhere.npz")
     with pytest.raises(RuntimeError, match=r"model\.npz: cannot be read"):
         bpy.ops.stga.apply_motion(filepath=str(scene.file))

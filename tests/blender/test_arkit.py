@@ -1,12 +1,12 @@
 """Face performances: Apply Motion, face sliders, and heads with ARKit's shape keys."""
 
-from pathlib import Path
 from types import SimpleNamespace
 
 import bpy
 import numpy as np
 import pytest
 from mathutils import Euler
+from numpy.testing import assert_allclose
 
 from stga_addon.driving.head_map import head_map
 from stga_addon.driving.inverse import write_performance
@@ -26,7 +26,7 @@ RNG = np.random.default_rng(4)
 
 
 @pytest.fixture
-def scene(tmp_path: Path) -> SimpleNamespace:
+def scene(tmp_path):
     """The small head of another identity with its own motion; a performance of 7 rows, 30 Hz."""
     expr = RNG.normal(0, 0.3, (3, 10))
     own = import_small_head(tmp_path, expr=expr, jaw_pose=np.zeros((3, 3)))
@@ -43,16 +43,16 @@ def the_head():
     return bpy.context.scene.stga.head
 
 
-def at(frame: int) -> np.ndarray:
+def at(frame):
     return at_frame(the_head(), frame)
 
 
-def posed(scene, weights: np.ndarray, turn: np.ndarray | None = None) -> np.ndarray:
+def posed(scene, weights, turn=None):
     take = Performance(np.zeros(1), weights[None], None if turn is None else turn[None], 30.0)
     return flame_forward(scene.own.model, scene.own.shape, scene.map.frames(take)[0])
 
 
-def expected(scene, row: int) -> np.ndarray:
+def expected(scene, row):
     return posed(scene, scene.weights[row], scene.turns[row])
 
 
@@ -60,10 +60,10 @@ def test_apply_a_performance(scene):
     """Catches a performance at another rate or place than asked for, or on another identity."""
     assert bpy.ops.stga.apply_motion(filepath=str(scene.take), start=10) == {"FINISHED"}
     for row in (0, 3, 6):
-        np.testing.assert_allclose(at(10 + row), expected(scene, row), atol=TOLERANCE_M)
+        assert_allclose(at(10 + row), expected(scene, row), atol=TOLERANCE_M)
     assert bpy.context.scene.frame_end >= 16
     bpy.ops.stga.apply_motion(filepath=str(scene.take), start=10, speed=0.5, place="strip")
-    np.testing.assert_allclose(at(16), expected(scene, 3), atol=TOLERANCE_M)
+    assert_allclose(at(16), expected(scene, 3), atol=TOLERANCE_M)
 
 
 def test_sliders(scene):
@@ -76,7 +76,7 @@ def test_sliders(scene):
     assert set(ARKIT_SHAPES) <= set(keys.key_blocks.keys())
     assert all(driver.driver.is_simple_expression for driver in keys.animation_data.drivers)
     for frame in range(3):
-        np.testing.assert_allclose(at(frame), before[frame], atol=1e-7)
+        assert_allclose(at(frame), before[frame], atol=1e-7)
     zero = np.zeros(3)
     neutral = FlameFrame(np.zeros(10), zero, zero, zero, zero, np.zeros(6))
     apply_motion(head, [neutral], Placement(1, "neutral"))
@@ -88,10 +88,10 @@ def test_sliders(scene):
         for name, weight in zip(ARKIT_SHAPES, weights.tolist(), strict=True):
             keys.key_blocks[name].value = weight
         bpy.context.view_layer.update()
-        np.testing.assert_allclose(evaluated_vertices(head), posed(scene, weights), atol=1e-5)
+        assert_allclose(evaluated_vertices(head), posed(scene, weights), atol=1e-5)
         found = sample_pose(head, model)
         again = flame_forward(model, scene.own.shape, found)
-        np.testing.assert_allclose(again, posed(scene, weights), atol=1e-5)
+        assert_allclose(again, posed(scene, weights), atol=1e-5)
     bone = rig_of(head).pose.bones["jaw"]
     keys.key_blocks["jawOpen"].value = 0.5
     bone.rotation_quaternion = Euler((0.1, 0, 0)).to_quaternion()
@@ -113,9 +113,9 @@ def test_a_performance_on_sliders(scene):
         assert not any(abs(keys[f"expr_{k:03d}"].value) > 1e-6 for k in range(10))
         found = sample_pose(the_head(), scene.own.model)
         turned = flame_forward(scene.own.model, scene.own.shape, found)
-        np.testing.assert_allclose(turned, expected(scene, 3), atol=1e-5)
+        assert_allclose(turned, expected(scene, 3), atol=1e-5)
     assert bpy.ops.stga.apply_motion(filepath=str(scene.take), start=10) == {"FINISHED"}
-    np.testing.assert_allclose(at(13), expected(scene, 3), atol=TOLERANCE_M)
+    assert_allclose(at(13), expected(scene, 3), atol=TOLERANCE_M)
 
 
 def test_curves_come_back_from_an_action(scene, tmp_path):
@@ -133,8 +133,8 @@ def test_curves_come_back_from_an_action(scene, tmp_path):
     back = read_performance(tmp_path / "back.csv")
     assert back.fps == pytest.approx(30, rel=1e-3)
     found, wanted = map(scene.map.parameters, (back.weights, weights))
-    np.testing.assert_allclose(found, wanted, atol=0.02)
-    np.testing.assert_allclose(back.head, scene.turns, atol=1e-4)
+    assert_allclose(found, wanted, atol=0.02)
+    assert_allclose(back.head, scene.turns, atol=1e-4)
 
 
 def test_a_head_with_shape_keys(scene, tmp_path):

@@ -2,7 +2,6 @@
 
 import sys
 from importlib import import_module
-from pathlib import Path
 
 import bpy
 import numpy as np
@@ -17,7 +16,7 @@ from stga_addon.scene import tags
 
 
 @pytest.fixture
-def video(tmp_path: Path) -> Path:
+def video(tmp_path):
     path = tmp_path / "anna.mp4"
     path.write_bytes(b"video")
     return path
@@ -26,7 +25,7 @@ def video(tmp_path: Path) -> Path:
 @pytest.fixture
 def asked(extension, monkeypatch):
     """The requests that the operator starts, which are not carried out."""
-    requests: list[object] = []
+    requests = []
     start = lambda scene, request, python: requests.append(request)  # noqa: E731
     monkeypatch.setattr(extension.operators.track, "start", start)
     return requests
@@ -54,7 +53,7 @@ def test_it_is_the_request_of_the_command_line(extension, asked, video, tmp_path
         import_module(f"{extension.__name__}.stga_addon.cli.{name}")
         for name in ("main", "commands")
     )
-    made: list[object] = []
+    made = []
     monkeypatch.setattr(commands, "carry_out", made.append)
     options = ["--out", str(out), "--budget", "3s", "--focal", "2308.3", "--no-blend"]
     assert main.main(["avatar", str(video), *options]) == 0
@@ -73,7 +72,7 @@ def test_it_is_the_request_of_the_command_line(extension, asked, video, tmp_path
 def test_the_folder_is_proposed_beside_the_file(asked, video, tmp_path):
     """Catches an avatar continued with another video or begun anew, and a folder far away."""
 
-    def make(path: Path) -> Path:
+    def make(path):
         bpy.ops.stga.avatar_from_video(filepath=str(path))
         return asked[-1].out
 

@@ -10,10 +10,11 @@ import pytest
 from bpy_extras.object_utils import world_to_camera_view
 from capture.factory import write_mesh_capture
 from mathutils import Matrix, Vector
+from numpy.testing import assert_allclose
 from PIL import Image
 
-from stga_addon.capture.camera import Camera, camera_from_gl, look_at
-from stga_addon.capture.model import Capture, View
+from stga_addon.capture.camera import camera_from_gl, look_at
+from stga_addon.capture.model import View
 from stga_addon.capture.open import open_capture
 from stga_addon.errors import StgaError
 from stga_addon.scene import objects, tags
@@ -25,7 +26,7 @@ from stga_addon.tracking.footage.open import open_footage
 from .captures import mesh_capture
 
 
-def pose(seed: int) -> np.ndarray:
+def pose(seed):
     """Camera-to-world (4, 4), OpenGL axes: a meter from the origin, looking at it, rolled."""
     rng = np.random.default_rng(seed)
     back = rng.normal(size=3)
@@ -38,11 +39,11 @@ def pose(seed: int) -> np.ndarray:
     return matrix
 
 
-def camera(seed: int = 0, width: int = 550, height: int = 802, fl_y: float = 2050.0) -> Camera:
+def camera(seed=0, width=550, height=802, fl_y=2050.0):
     return camera_from_gl(pose(seed), (width, height), (2050.0, fl_y), (243.7, 431.9))
 
 
-def capture_of(root: Path, cameras: dict[int, list[Camera]]) -> Capture:
+def capture_of(root, cameras):
     """cameras: index -> its camera at timesteps 3, 4, …; with an image for each."""
     views = []
     for index, row in cameras.items():
@@ -57,7 +58,7 @@ def capture_of(root: Path, cameras: dict[int, list[Camera]]) -> Capture:
     return mesh_capture(root, timesteps=timesteps, views=split)
 
 
-def pixels_in_blender(camera_object, points: np.ndarray) -> np.ndarray:
+def pixels_in_blender(camera_object, points):
     """(N, 2) pixels where the scene's render puts the capture's points (N, 3)."""
     render = bpy.context.scene.render
     depsgraph = bpy.context.evaluated_depsgraph_get()
@@ -71,10 +72,10 @@ def pixels_in_blender(camera_object, points: np.ndarray) -> np.ndarray:
     return (ndc * [0.5, -0.5] + 0.5) * [render.resolution_x, render.resolution_y]
 
 
-def assert_projects(camera_object, one: Camera) -> None:
+def assert_projects(camera_object, one):
     points = np.random.default_rng(9).normal(0, 0.1, (50, 3))
     expected, _ = one.project(points)
-    np.testing.assert_allclose(pixels_in_blender(camera_object, points), expected, atol=0.01)
+    assert_allclose(pixels_in_blender(camera_object, points), expected, atol=0.01)
 
 
 @pytest.mark.parametrize("fl_y", [1900.0, 2300.0])
@@ -187,7 +188,7 @@ def test_looking_through_cameras_gives_the_resolution_back(extension, head):
     area = next(area for area in window.screen.areas if area.type == "VIEW_3D")
     view = area.spaces.active.region_3d
 
-    def press(step: int = 0) -> tuple[int, int]:
+    def press(step=0):
         with bpy.context.temp_override(window=window, area=area, region=area.regions[-1]):
             bpy.ops.stga.view_footage(step=step)
         return render.resolution_x, render.resolution_y
@@ -286,8 +287,8 @@ def test_exported_cameras(tmp_path):
         thing = bpy.data.objects[camera.name]
         seen = [world_to_camera_view(scene, thing, Vector(point)) for point in points]
         expected = [(x * WIDTH, (1 - y) * HEIGHT) for x, y, _ in seen]
-        np.testing.assert_allclose(pixels, expected, atol=2e-3, err_msg=camera.name)
-        np.testing.assert_allclose(depths, [z for _, _, z in seen], atol=1e-5)
+        assert_allclose(pixels, expected, atol=2e-3, err_msg=camera.name)
+        assert_allclose(depths, [z for _, _, z in seen], atol=1e-5)
     left = bpy.data.objects["left"]
     path = tmp_path / "cameras.json"
     left.select_set(True)

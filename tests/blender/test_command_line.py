@@ -2,12 +2,12 @@
 
 import sys
 from importlib import import_module
-from pathlib import Path
 
 import bpy
 import numpy as np
 import pytest
 from capture.factory import write_flame_capture, write_mesh_capture
+from numpy.testing import assert_allclose, assert_array_equal
 
 from stga_addon.avatar.embedding import to_world
 from stga_addon.avatar.file import read_avatar
@@ -27,7 +27,7 @@ def stga(extension):
     )
 
 
-def save_and_open(path: Path) -> None:
+def save_and_open(path):
     bpy.ops.wm.save_as_mainfile(filepath=str(path))
     bpy.ops.wm.read_factory_settings(use_empty=True)
     bpy.ops.wm.open_mainfile(filepath=str(path))
@@ -80,9 +80,9 @@ def test_what_the_open_head_plays(stga, here, tmp_path):
     bpy.context.scene.frame_set(2)  # not among the tracked timesteps
     frames = avatar.frames(evaluated_vertices(bpy.context.scene.stga.head))
     expected = to_world(avatar.splats, frames).xyz
-    np.testing.assert_allclose(read_ply(tmp_path / "plys/00002.ply").xyz, expected, atol=1e-6)
+    assert_allclose(read_ply(tmp_path / "plys/00002.ply").xyz, expected, atol=1e-6)
     with np.load(tmp_path / "pair/flame_param.npz") as pair:
-        np.testing.assert_allclose(pair["expr"][:, 1], 2.5)
+        assert_allclose(pair["expr"][:, 1], 2.5)
         assert len(pair["expr"]) == 4
     cameras = ("--cameras", folder / "transforms_val.json", "--out")
     assert here("render", *cameras, tmp_path / "here") == 0
@@ -145,11 +145,11 @@ def test_training_is_the_panels(stga, here, head, tmp_path):
     for run in runs:
         with np.load(tmp_path / run / "selection.npz") as stored:
             for timestep, faces in painted.items():
-                np.testing.assert_array_equal(stored[f"{timestep:05d}"], faces)
+                assert_array_equal(stored[f"{timestep:05d}"], faces)
     one, *others = (read_avatar(tmp_path / run / "avatar.npz").splats for run in runs)
     for other in others:
         for name in ("xyz", "rotation", "log_scale", "opacity", "sh", "face"):
-            np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
+            assert_array_equal(getattr(one, name), getattr(other, name))
 
 
 @pytest.mark.slow

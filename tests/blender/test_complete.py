@@ -77,9 +77,7 @@ TARGET = Target(this_platform(), "{}.{}".format(*sys.version_info), ("4.2.0", "5
 
 
 @pytest.fixture(scope="module")
-def archive(
-    demo: Path, kernel_bundle: tuple[Path, str], tmp_path_factory: pytest.TempPathFactory
-) -> Path:
+def archive(demo, kernel_bundle, tmp_path_factory):
     try:
         check_wheels(collect_wheels(wheel_folder(TARGET), TARGET), TARGET)
     except StgaError as error:
@@ -88,7 +86,7 @@ def archive(
     return build_zip(tmp_path_factory.mktemp("dist"), edition=complete(TARGET), **parts)
 
 
-def bare_python(folder: Path) -> Path:
+def bare_python(folder):
     """A Python of this version with Blender and numpy alone."""
     subprocess.run([sys.executable, "-m", "venv", "--without-pip", str(folder)], check=True)
     site = next(folder.glob("lib/python*/site-packages"))
@@ -100,7 +98,7 @@ def bare_python(folder: Path) -> Path:
 
 
 @pytest.mark.slow
-def test_track_and_train_at_once(archive: Path, demo: Path, tmp_path: Path) -> None:
+def test_track_and_train_at_once(archive, demo, tmp_path):
     """Catches a missing wheel, a worker that needs more, and files that uninstalling leaves."""
     python = bare_python(tmp_path / "bare")
     video = tmp_path / "head.mp4"
@@ -129,7 +127,7 @@ def test_track_and_train_at_once(archive: Path, demo: Path, tmp_path: Path) -> N
     assert abs(found - expected) < MAX_DIFFERENCE_DB
 
 
-def test_bundled_wheels_are_unmodified(archive: Path) -> None:
+def test_bundled_wheels_are_unmodified(archive):
     """Catches a wheel that the build changes, and a manifest that names others."""
     with zipfile.ZipFile(archive) as made:
         names = {name for name in made.namelist() if name.startswith("wheels/")}

@@ -123,7 +123,7 @@ def test_residuals_are_shown_on_the_head(head, run, extension):
         bpy.ops.stga.heat_map(of="RESIDUAL", directory=str(run.parent))
 
 
-def answer(extension, tmp_path, selection) -> str:
+def answer(extension, tmp_path, selection):
     """The body of a stand-in for a worker that selects these triangles."""
     given = tmp_path / "given"
     given.mkdir(exist_ok=True)
@@ -136,7 +136,7 @@ def answer(extension, tmp_path, selection) -> str:
 def worker(extension, monkeypatch, tmp_path):
     """Let this program stand in for the worker that selects triangles."""
 
-    def stand_in(body: str) -> None:
+    def stand_in(body):
         program = write_interpreter(tmp_path / "python", body)
         monkeypatch.setattr(extension.operators.train, "training_python", lambda context: program)
 

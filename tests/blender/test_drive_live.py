@@ -4,13 +4,13 @@ import gc
 import socket
 import tempfile
 import tracemalloc
-from pathlib import Path
 from types import SimpleNamespace
 
 import bpy
 import numpy as np
 import pytest
 from driving.live import wire
+from numpy.testing import assert_allclose
 
 from stga_addon.driving.head_map import head_map
 from stga_addon.driving.open_motion import exchanged_neutral, quiet_neutral
@@ -29,7 +29,7 @@ TOLERANCE_M = 2e-5
 
 
 @pytest.fixture
-def live(tmp_path: Path, extension) -> SimpleNamespace:
+def live(tmp_path, extension):
     """The small head, driven by packets that the test sends."""
     expr = np.random.default_rng(4).normal(0, 0.3, (5, 10))
     jaw = np.linspace([0, 0, 0], [0.2, 0, 0], 5)
@@ -63,7 +63,7 @@ def the_head():
     return bpy.context.scene.stga.head
 
 
-def mesh() -> np.ndarray:
+def mesh():
     bpy.context.view_layer.update()
     return evaluated_vertices(the_head())
 
@@ -71,15 +71,15 @@ def mesh() -> np.ndarray:
 TURN = (0.1, 0.2, -0.1)
 
 
-def assert_shows(live, weights: dict[str, float]) -> None:
+def assert_shows(live, weights):
     """The head is posed by the weights, and by TURN."""
     row = np.array([[weights.get(name, 0.0) for name in ARKIT_SHAPES]])
     take = Performance(np.zeros(1), row, np.array([TURN]), 60.0)
     expected = flame_forward(live.own.model, live.own.shape, live.map.frames(take)[0])
-    np.testing.assert_allclose(mesh(), expected, atol=TOLERANCE_M)
+    assert_allclose(mesh(), expected, atol=TOLERANCE_M)
 
 
-def half(seed: int) -> dict[str, float]:
+def half(seed):
     return {name: 0.5 * value for name, value in wire.mixed(seed).items()}
 
 
@@ -97,7 +97,7 @@ def test_the_head_follows_and_comes_back(live):
     assert_shows(live, weights)
     bpy.context.scene.frame_set(1)
     bpy.ops.stga.stop_live()
-    np.testing.assert_allclose(mesh(), before, atol=1e-7)
+    assert_allclose(mesh(), before, atol=1e-7)
     assert sorted(bpy.data.actions.keys()) == actions
     assert live.sessions.session() is None
     assert not bpy.ops.stga.stop_live.poll()
@@ -140,7 +140,7 @@ def test_a_rendered_animation_keeps_its_own_pose(live):
         bpy.utils.unregister_class(Recorder)
     for number in (1, 2, 3):
         wanted = flame_forward(live.own.model, live.own.shape, live.frames[number])
-        np.testing.assert_allclose(rendered[number], wanted, atol=TOLERANCE_M)
+        assert_allclose(rendered[number], wanted, atol=TOLERANCE_M)
 
 
 def test_record_with_a_calibrated_face(live):
@@ -158,16 +158,16 @@ def test_record_with_a_calibrated_face(live):
     bpy.ops.stga.record_live()
     take = read_performance(live.takes / "take_001.csv")
     assert len(take.times) == 9
-    np.testing.assert_allclose(take.times, np.arange(9) / 60, atol=1e-5)
+    assert_allclose(take.times, np.arange(9) / 60, atol=1e-5)
     assert take.weights[0].max() == pytest.approx(0, abs=1e-6)
-    np.testing.assert_allclose(mesh(), shown, atol=TOLERANCE_M)  # still live
+    assert_allclose(mesh(), shown, atol=TOLERANCE_M)  # still live
     bpy.ops.stga.stop_live()
     bpy.context.scene.frame_set(14)  # 8/60 s after frame 10
-    np.testing.assert_allclose(mesh(), shown, atol=TOLERANCE_M)
+    assert_allclose(mesh(), shown, atol=TOLERANCE_M)
     bpy.context.scene.frame_set(10)  # at rest, as the head itself was recorded
     quiet = exchanged_neutral(live.map.frames(take), None, quiet_neutral(live.frames))[0]
     quiet_mesh = flame_forward(live.own.model, live.own.shape, quiet)
-    np.testing.assert_allclose(mesh(), quiet_mesh, atol=TOLERANCE_M)
+    assert_allclose(mesh(), quiet_mesh, atol=TOLERANCE_M)
     bpy.ops.stga.drive_live()
     bpy.ops.stga.record_live()
     for number in range(3):
@@ -176,7 +176,7 @@ def test_record_with_a_calibrated_face(live):
     assert (live.takes / "take_002.csv").is_file()
 
 
-def record(live, faces: int = 60) -> None:
+def record(live, faces=60):
     """Begin to record, and receive some faces."""
     if live.sessions.session() is None:
         bpy.ops.stga.drive_live()
@@ -185,7 +185,7 @@ def record(live, faces: int = 60) -> None:
         live.send({"jawOpen": 0.5}, number)
 
 
-def taken(folder: Path) -> list[int]:
+def taken(folder):
     """Faces of each take in the folder."""
     return [len(read_performance(path).times) for path in sorted(folder.glob("*.csv"))]
 
@@ -282,7 +282,7 @@ def test_sliders_that_are_moved_meanwhile(live):
     head = the_head()
     keys = head.data.shape_keys.key_blocks
 
-    def move(name: str, way: str) -> None:
+    def move(name, way):
         head.active_shape_key_index = keys.find(name)
         with bpy.context.temp_override(object=head):
             bpy.ops.object.shape_key_move(type=way)
@@ -316,7 +316,7 @@ def test_the_trained_range(live):
     head = the_head()
     rig = rig_of(the_head())
     trained = stored_range(head)
-    np.testing.assert_allclose(trained.middle["jaw"][0], 0.1, atol=0.01)
+    assert_allclose(trained.middle["jaw"][0], 0.1, atol=0.01)
     assert outside_now(head, rig, trained)["jaw"] == 0
     bpy.ops.stga.drive_live()
     live.send({"jawOpen": 1.0}, 0)
@@ -368,7 +368,7 @@ def test_a_minute_without_growth(live):
     noise = np.random.default_rng(0)
     rows = [half(number) for number in range(10)]
 
-    def minute(first: int) -> None:
+    def minute(first):
         for number in range(600):
             live.send(rows[number % 10], first + number, subject="A" if number % 7 else "B")
             other = wire.live_link_face({}, number, subject=str(first + number))

@@ -48,7 +48,7 @@ print("RESULT " + json.dumps([took / reference, panels]))
 """
 
 
-def test_enabling_needs_numpy_alone_and_no_time(tmp_path: Path) -> None:
+def test_enabling_needs_numpy_alone_and_no_time(tmp_path):
     """Catches an import that a plain Blender cannot satisfy, and one that makes every start of
     Blender slower.
 

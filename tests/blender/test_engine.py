@@ -1,14 +1,14 @@
 """The render engine against `render_avatar`, through files that Blender writes, and its errors."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import bpy
 import numpy as np
 import pytest
 from mathutils import Matrix, Vector
+from numpy.testing import assert_allclose, assert_array_equal
 
-from stga_addon.avatar.file import Avatar, AvatarLight
+from stga_addon.avatar.file import AvatarLight
 from stga_addon.avatar.splats import SH_C0
 from stga_addon.capture.camera import Camera
 from stga_addon.capture.color import linear_to_srgb
@@ -62,11 +62,11 @@ def _engine(empty_scene):
         bpy.utils.register_class(other)
 
 
-def no_python() -> str:
+def no_python():
     raise StgaError("no training Python")
 
 
-def camera_at(lens: float = 60.0, **data: object):
+def camera_at(lens=60.0, **data):
     """A camera in front of `sphere`'s head, which stands turned around in the world."""
     camera = active_camera((0.45, -0.85, 1.05))
     camera.rotation_euler = (1.5, 0.1, 0.15)
@@ -77,7 +77,7 @@ def camera_at(lens: float = 60.0, **data: object):
     return camera
 
 
-def add_sun(energy: float = 1.0):
+def add_sun(energy=1.0):
     sun = bpy.data.objects.new("sun", bpy.data.lights.new("sun", "SUN"))
     sun.data.energy = energy
     sun.rotation_euler = (1.2, 0.0, 0.4)
@@ -85,7 +85,7 @@ def add_sun(energy: float = 1.0):
     return sun
 
 
-def textured(avatar: Avatar, scale: float = -6.0) -> Avatar:
+def textured(avatar, scale=-6.0):
     """Visible splats in muted colors."""
     rng = np.random.default_rng(5)
     count = len(avatar.splats)
@@ -94,7 +94,7 @@ def textured(avatar: Avatar, scale: float = -6.0) -> Avatar:
     return replace(avatar, splats=replace(avatar.splats, sh=sh, log_scale=log_scale))
 
 
-def show(avatar: Avatar):
+def show(avatar):
     head = animated_head(avatar.neutral, avatar.faces)
     head.hide_render = True
     shown = show_avatar(avatar, head)
@@ -102,7 +102,7 @@ def show(avatar: Avatar):
     return shown, head
 
 
-def multilayer(settings: object) -> None:
+def multilayer(settings):
     """Choose files that hold all passes in float."""
     if hasattr(settings, "media_type"):
         settings.media_type = "MULTI_LAYER_IMAGE"
@@ -111,7 +111,7 @@ def multilayer(settings: object) -> None:
     settings.color_depth = "32"
 
 
-def render(folder: Path) -> dict[str, np.ndarray]:
+def render(folder):
     """Passes of one image in float: R, G, B, A and Depth, top row first."""
     multilayer(bpy.context.scene.render.image_settings)
     bpy.context.scene.render.filepath = str(folder / "image.exr")
@@ -119,13 +119,13 @@ def render(folder: Path) -> dict[str, np.ndarray]:
     return read_passes(folder / "image.exr")
 
 
-def read_passes(path: Path) -> dict[str, np.ndarray]:
+def read_passes(path):
     ends = {c: f"Combined.{c}" for c in "RGBA"} | {"Depth": "Depth.Z"}
     found = read_exr(path).items()
     return {short: next(v for k, v in found if k.endswith(end)) for short, end in ends.items()}
 
 
-def displayed(passes: dict[str, np.ndarray], background: float) -> np.ndarray:
+def displayed(passes, background):
     """(3, H, W) sRGB values of an image with alpha over a gray sRGB background."""
     alpha = passes["A"]
     straight = np.stack([passes[c] for c in "RGB"]) / np.maximum(alpha, 1e-12)
@@ -133,7 +133,7 @@ def displayed(passes: dict[str, np.ndarray], background: float) -> np.ndarray:
     return np.clip(srgb * alpha + (1 - alpha) * background, 0, 1)
 
 
-def expected_camera(camera, shown, width: int = WIDTH, height: int = HEIGHT) -> Camera:
+def expected_camera(camera, shown, width=WIDTH, height=HEIGHT):
     """The expected camera in the splats' space: focal length in pixels, shift in widths."""
     bpy.context.view_layer.update()
     data = camera.data
@@ -148,7 +148,7 @@ def expected_camera(camera, shown, width: int = WIDTH, height: int = HEIGHT) -> 
     return Camera(width, height, focal, focal, cx, cy, view)
 
 
-def driven() -> Avatar:
+def driven():
     """An avatar with every part that the deformation moves or colors."""
     return replace(textured(driven_avatar("stga", count=3000), -6.5), antialiased=True)
 
@@ -168,11 +168,11 @@ def test_image_equals_render_avatar(make, background, tmp_path):
     assert np.abs(displayed(render(tmp_path), background) - expected).max() < TOLERANCE
 
 
-def no_context() -> None:
+def no_context():
     raise SystemError("GPU functions are not available")
 
 
-def with_light(avatar: Avatar) -> Avatar:
+def with_light(avatar):
     transfer, occlusion = transfer_of(avatar.neutral, avatar.faces, 32)
     radiance = uniform(np.full(3, 0.3)).astype(np.float32)
     roughness = np.zeros(len(occlusion), np.float32)
@@ -257,7 +257,7 @@ def test_render_region(crop, tmp_path):
     part = render(tmp_path)["R"]
     assert whole[rows, columns].max() > 0.1
     part = part if crop else part[rows, columns]
-    np.testing.assert_allclose(part, whole[rows, columns], atol=1e-4)
+    assert_allclose(part, whole[rows, columns], atol=1e-4)
 
 
 @pytest.mark.parametrize("is_linked", [True, False])
@@ -396,12 +396,12 @@ def test_webgpu_renders_where_blender_has_no_gpu_context(tmp_path, monkeypatch):
     passes = render(tmp_path)
     assert engine._rasterizer._composer.device == wanted[0]
     for channel in "RGBA":
-        np.testing.assert_allclose(passes[channel], on_cpu[channel], atol=1e-4)
+        assert_allclose(passes[channel], on_cpu[channel], atol=1e-4)
     seen = on_cpu["A"] > 0.05
     assert seen.any()
-    np.testing.assert_allclose(passes["Depth"][seen], on_cpu["Depth"][seen], rtol=1e-3)
+    assert_allclose(passes["Depth"][seen], on_cpu["Depth"][seen], rtol=1e-3)
 
-    def lost(*_: object) -> None:
+    def lost(*_):
         raise DeviceError("Card 9000 was lost", "try again")
 
     monkeypatch.setattr(on_gpu, "compose", lost)
@@ -440,7 +440,7 @@ def test_what_cannot_be_rendered_is_named():
 def test_failed_render_is_an_error_and_an_empty_image(stage, raised, tmp_path, monkeypatch):
     """Catches an image without passes, and a failure saved as an image."""
 
-    def fail(*_: object) -> None:
+    def fail(*_):
         raise raised
 
     scene = bpy.context.scene
@@ -544,30 +544,30 @@ def test_collections_of_holdouts_and_of_indirect_light(tmp_path, transparent):
     masked = render(tmp_path)
     assert 0.2 < before["A"].max() < 0.98
     if transparent:
-        np.testing.assert_allclose(masked["A"], behind["A"] * (1 - before["A"]), atol=TOLERANCE)
+        assert_allclose(masked["A"], behind["A"] * (1 - before["A"]), atol=TOLERANCE)
         is_seen = masked["A"] > 0.1
         for channel in "RGB":
             straight = [each[channel] / np.maximum(each["A"], 1e-6) for each in (masked, behind)]
-            np.testing.assert_allclose(straight[0][is_seen], straight[1][is_seen], atol=0.02)
+            assert_allclose(straight[0][is_seen], straight[1][is_seen], atol=0.02)
     else:
-        np.testing.assert_allclose(masked["A"], 1 - before["A"], atol=TOLERANCE)
+        assert_allclose(masked["A"], 1 - before["A"], atol=TOLERANCE)
         place.holdout = False
         whole = render(tmp_path)
         empty = before["A"] == 0
         assert empty.any()
-        np.testing.assert_array_equal(masked["R"][empty], whole["R"][empty])
+        assert_array_equal(masked["R"][empty], whole["R"][empty])
         return
     place.holdout = False
     front.is_holdout = True
-    np.testing.assert_array_equal(render(tmp_path)["A"], masked["A"])
+    assert_array_equal(render(tmp_path)["A"], masked["A"])
     front.is_holdout = False
     place.indirect_only = True
-    np.testing.assert_array_equal(render(tmp_path)["A"], behind["A"])
+    assert_array_equal(render(tmp_path)["A"], behind["A"])
     place.indirect_only = False
     front.visible_camera = False
-    np.testing.assert_array_equal(render(tmp_path)["A"], behind["A"])
+    assert_array_equal(render(tmp_path)["A"], behind["A"])
     front.visible_camera = True
-    np.testing.assert_array_equal(render(tmp_path)["A"], both["A"])
+    assert_array_equal(render(tmp_path)["A"], both["A"])
 
 
 @pytest.mark.skipif(not compat.NATIVE_SPLATS, reason="Blender before 5.3 has no native splats")
@@ -588,7 +588,7 @@ def test_native_splats_of_others_are_sorted_among_ours(tmp_path):
     show_world_splats(splats.rows(np.arange(1, 60, 2)), "ours")
     both = render(tmp_path)
     for name, values in both.items():
-        np.testing.assert_allclose(values, expected[name], rtol=1e-4, atol=1e-4)
+        assert_allclose(values, expected[name], rtol=1e-4, atol=1e-4)
     cache = SplatCache()
     depsgraph = bpy.context.evaluated_depsgraph_get()
     bpy.app.handlers.depsgraph_update_post.append(lambda _, graph: cache.scene_changed(graph))

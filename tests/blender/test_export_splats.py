@@ -1,9 +1,7 @@
 """Export of all that shows splats in a scene, read back by Blender 5.3 and by others."""
 
-from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import bpy
 import numpy as np
@@ -11,10 +9,11 @@ import pytest
 import trimesh
 from avatar.conftest import random_splats, world_splats
 from mathutils import Matrix
+from numpy.testing import assert_allclose, assert_array_equal
 from scipy.spatial.transform import Rotation
 
 from stga_addon.avatar.file import write_avatar
-from stga_addon.avatar.splats import Splats, harmonics
+from stga_addon.avatar.splats import harmonics
 from stga_addon.capture.open import open_capture
 from stga_addon.export.ply import read_ply, write_ply
 from stga_addon.scene import compat
@@ -32,7 +31,7 @@ PLACES = {
     "mirrored": 0.5 * TURN @ np.diag([1, 1, -1]),
     "sheared": TURN @ [[1, 0.5, 0], [0, 2, 0], [0, 0, 0.5]],
 }
-IMPORTS: dict[str, tuple[str, Callable[[], Any]]] = {
+IMPORTS = {
     "a.ply": ("ply", lambda: bpy.ops.wm.ply_import),
     "a.spz": ("spz", lambda: bpy.ops.wm.spz_import),
     "a.glb": ("gltf", lambda: bpy.ops.import_scene.gltf),
@@ -51,18 +50,18 @@ class Seen(NamedTuple):
     color: np.ndarray
     opacity: np.ndarray
 
-    def check(self, expected: "Seen", is_coarse: bool = False) -> None:
+    def check(self, expected, is_coarse=False):
         """Whether they are those expected, in float32, or in SPZ's bits."""
         within = 0.07 if is_coarse else 0
-        np.testing.assert_allclose(self.xyz, expected.xyz, atol=2e-6 + within / 1000)
+        assert_allclose(self.xyz, expected.xyz, atol=2e-6 + within / 1000)
         size = np.abs(expected.covariance).max((1, 2), keepdims=True)
         relative = [each.covariance / size for each in (self, expected)]
-        np.testing.assert_allclose(*relative, atol=1e-5 + 2 * within)
-        np.testing.assert_allclose(self.color, expected.color, atol=1e-5 + within)
-        np.testing.assert_allclose(self.opacity, expected.opacity, atol=2e-6 + within / 20)
+        assert_allclose(*relative, atol=1e-5 + 2 * within)
+        assert_allclose(self.color, expected.color, atol=1e-5 + within)
+        assert_allclose(self.opacity, expected.opacity, atol=2e-6 + within / 20)
 
 
-def seen(splats: Splats, linear: np.ndarray, move: Any = (0, 0, 0)) -> Seen:
+def seen(splats, linear, move=(0, 0, 0)):
     turn = Rotation.from_quat(splats.rotation[:, [1, 2, 3, 0]]).as_matrix()
     axes = linear @ (turn * np.exp(splats.log_scale)[:, None])
     left, _, right = np.linalg.svd(linear)
@@ -76,13 +75,13 @@ def seen(splats: Splats, linear: np.ndarray, move: Any = (0, 0, 0)) -> Seen:
     )
 
 
-def values(cloud: Any, name: str, field: str, width: int) -> np.ndarray:
+def values(cloud, name, field, width):
     found = np.empty(len(cloud.points) * width, np.float32)
     cloud.attributes[name].data.foreach_get(field, found)
     return found.reshape(-1, width)
 
 
-def imported() -> Seen:
+def imported():
     """What the only native splats in the scene are, as Blender evaluates them."""
     depsgraph = bpy.context.evaluated_depsgraph_get()
     found = []
@@ -105,7 +104,7 @@ def imported() -> Seen:
     return only
 
 
-def some_splats(degree: int = 3) -> Splats:
+def some_splats(degree=3):
     """Within what SPZ keeps: sizes of centimeters, coefficients below 1 however they turn."""
     rng = np.random.default_rng(3)
     splats = random_splats(1, 300, 1)
@@ -114,20 +113,20 @@ def some_splats(degree: int = 3) -> Splats:
     return world_splats(splats.xyz, splats.rotation, size, splats.opacities(), sh)
 
 
-def place(thing: Any, linear: np.ndarray) -> None:
+def place(thing, linear):
     """By a parent, without which nothing shears."""
     thing.parent = bpy.data.objects.new("parent", None)
     bpy.context.scene.collection.objects.link(thing.parent)
     thing.matrix_parent_inverse = Matrix(linear.tolist()).to_4x4()
 
 
-def native_cloud(folder: Path, splats: Splats) -> Any:
+def native_cloud(folder, splats):
     write_ply(folder / "given.ply", splats)
     bpy.ops.wm.ply_import(filepath=str(folder / "given.ply"))
     return bpy.context.object
 
 
-def instanced(collection: Any) -> Any:
+def instanced(collection):
     empty = bpy.data.objects.new("instance", None)
     empty.instance_type = "COLLECTION"
     empty.instance_collection = collection
@@ -135,7 +134,7 @@ def instanced(collection: Any) -> Any:
     return empty
 
 
-def instanced_by_nodes(thing: Any, place: tuple[float, float, float]) -> None:
+def instanced_by_nodes(thing, place):
     mesh = bpy.data.meshes.new("points")
     mesh.from_pydata([place], [], [])
     points = bpy.data.objects.new("points", mesh)
@@ -155,7 +154,7 @@ def instanced_by_nodes(thing: Any, place: tuple[float, float, float]) -> None:
 @needs_native
 @pytest.mark.parametrize("standing", PLACES)
 @pytest.mark.parametrize("name", IMPORTS)
-def test_blender_reads_what_it_exports(extension, tmp_path, name, standing) -> None:
+def test_blender_reads_what_it_exports(extension, tmp_path, name, standing):
     """Catches other axes than the importer's, splats and colors that do not turn, scale, shear or
     mirror with their object, and activations that are not those of the format."""
     splats = some_splats()
@@ -166,17 +165,17 @@ def test_blender_reads_what_it_exports(extension, tmp_path, name, standing) -> N
     bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
     importer()(filepath=str(tmp_path / name))
     if standing == "sheared" and name == "a.spz":  # whose scales have steps of 6 %
-        np.testing.assert_allclose(imported().xyz, seen(splats, linear).xyz, atol=1e-4)
+        assert_allclose(imported().xyz, seen(splats, linear).xyz, atol=1e-4)
     else:
         imported().check(seen(splats, linear), is_coarse=name == "a.spz")
     if name in ("a.ply", "a.glb"):
         (read,) = trimesh.load_scene(tmp_path / name).geometry.values()
         turned = read.vertices if name == "a.ply" else read.vertices[:, [0, 2, 1]] * [1, -1, 1]
-        np.testing.assert_allclose(turned, seen(splats, linear).xyz, atol=2e-6)
+        assert_allclose(turned, seen(splats, linear).xyz, atol=2e-6)
 
 
 @needs_native
-def test_instances_and_frames_of_others_are_exported(extension, tmp_path) -> None:
+def test_instances_and_frames_of_others_are_exported(extension, tmp_path):
     """Catches splats of instanced collections and of geometry nodes that are left out, hidden ones
     that are not, degrees of harmonics mixed up, the axes of a PLY, and an animation that is
     exported as it is now."""
@@ -206,7 +205,7 @@ def test_instances_and_frames_of_others_are_exported(extension, tmp_path) -> Non
     one = read_ply(tmp_path / "one.ply")
     assert (len(one), one.sh_degree) == (900, 3)
     turned = read_ply(many / "00004.ply")
-    np.testing.assert_array_equal(turned.xyz, one.xyz[:, [0, 2, 1]] * [1, 1, -1])
+    assert_array_equal(turned.xyz, one.xyz[:, [0, 2, 1]] * [1, 1, -1])
     expected = (
         seen(some_splats(0), np.eye(3), first.matrix_world.translation),
         seen(some_splats(2), PLACES["mirrored"]),
@@ -222,12 +221,12 @@ def test_instances_and_frames_of_others_are_exported(extension, tmp_path) -> Non
     assert positions.GetTimeSamples() == [2, 3, 4, 5]
     for frame in (2, 3, 4, 5):
         expected = read_ply(many / f"{frame:05d}.ply").xyz
-        np.testing.assert_array_equal(positions.Get(frame), expected)
+        assert_array_equal(positions.Get(frame), expected)
     assert prim.GetAttribute("scales").GetTimeSamples() == [2]
 
 
 @pytest.mark.parametrize("display", ["As Trained", "Points", "Native Splats"])
-def test_avatars_are_exported_as_they_are_posed(extension, head, tmp_path, display) -> None:
+def test_avatars_are_exported_as_they_are_posed(extension, head, tmp_path, display):
     """Catches an export without what only this add-on shows, twice what Blender shows too,
     another frame, size or place, and colors for linear light in another file than USD's."""
     if display == "Native Splats" and not compat.NATIVE_SPLATS:
@@ -245,15 +244,15 @@ def test_avatars_are_exported_as_they_are_posed(extension, head, tmp_path, displ
     bpy.ops.stga.export_splats(filepath=str(tmp_path / "a.ply"), format="ply", up="Y")
     expected = expected_world(avatar, capture.mesh(3))
     found = read_ply(tmp_path / "a.ply")
-    np.testing.assert_allclose(found.xyz, expected.xyz, atol=1e-5)
-    np.testing.assert_allclose(found.log_scale, expected.log_scale + np.log(1.5), atol=1e-3)
-    np.testing.assert_allclose(found.sh[:, : expected.sh.shape[1]], expected.sh, atol=1e-4)
-    np.testing.assert_allclose(found.opacity, expected.opacity, atol=1e-3)
+    assert_allclose(found.xyz, expected.xyz, atol=1e-5)
+    assert_allclose(found.log_scale, expected.log_scale + np.log(1.5), atol=1e-3)
+    assert_allclose(found.sh[:, : expected.sh.shape[1]], expected.sh, atol=1e-4)
+    assert_allclose(found.opacity, expected.opacity, atol=1e-3)
     base = np.column_stack([avatar.splats.sh[:, 0] * 0.5, avatar.splats.opacity - 1])
     fitted = replace(avatar, linear_base=base.astype(np.float32))
     extension.stga_addon.scene.display.splat_object.store_linear_base(splats, fitted)
     bpy.ops.stga.export_splats(filepath=str(tmp_path / "b.ply"), format="ply", up="Y")
-    np.testing.assert_array_equal(read_ply(tmp_path / "b.ply").sh, found.sh)
+    assert_array_equal(read_ply(tmp_path / "b.ply").sh, found.sh)
     splats.hide_render = True
     with pytest.raises(RuntimeError, match="shows no splats in frame 3"):
         bpy.ops.stga.export_splats(filepath=str(tmp_path / "c.ply"), format="ply")
@@ -264,7 +263,7 @@ def test_avatars_are_exported_as_they_are_posed(extension, head, tmp_path, displ
     bpy.ops.stga.export_splats(filepath=str(tmp_path / "a.usdc"), format="usd")
     stage = usd.Stage.Open(str(tmp_path / "a.usdc"))
     opacity = stage.GetPrimAtPath("/Avatar/Splats").GetAttribute("opacities").Get(3)
-    np.testing.assert_allclose(opacity, 1 / (1 + np.exp(1 - expected.opacity)), atol=1e-5)
+    assert_allclose(opacity, 1 / (1 + np.exp(1 - expected.opacity)), atol=1e-5)
 
 
 UNWRITABLE = {
@@ -280,7 +279,7 @@ UNWRITABLE = {
 
 
 @pytest.mark.parametrize("case", UNWRITABLE)
-def test_what_cannot_be_written_is_one_sentence(extension, tmp_path, case) -> None:
+def test_what_cannot_be_written_is_one_sentence(extension, tmp_path, case):
     """Catches tracebacks, and files beside the folder that was named."""
     name, format, sentence = UNWRITABLE[case]
     extension.stga_addon.scene.display.splat_object.show_world_splats(some_splats(), "room")
@@ -288,7 +287,7 @@ def test_what_cannot_be_written_is_one_sentence(extension, tmp_path, case) -> No
     (tmp_path / "file").write_text("")
     place = f"{tmp_path / name}/" if name.endswith("/") else str(tmp_path / name)
 
-    def export() -> None:
+    def export():
         bpy.ops.stga.export_splats(filepath=place if name else "", format=format)
 
     if not sentence:
@@ -303,7 +302,7 @@ def test_what_cannot_be_written_is_one_sentence(extension, tmp_path, case) -> No
 
 
 @needs_native
-def test_modifiers_after_ours_count(extension, head, tmp_path) -> None:
+def test_modifiers_after_ours_count(extension, head, tmp_path):
     """Catches an avatar that is exported without what other modifiers make of its native splats,
     or twice, and no sentence where it is not shown as native splats."""
     write_ball_avatar(tmp_path / "avatar.npz")
@@ -323,11 +322,11 @@ def test_modifiers_after_ours_count(extension, head, tmp_path) -> None:
     bpy.ops.stga.export_splats(filepath=str(tmp_path / "b.ply"), format="ply")
     found = read_ply(tmp_path / "b.ply")
     offset = np.array(splats.matrix_world)[:3, :3] @ (1, 2, 3)
-    np.testing.assert_allclose(found.xyz, plain.xyz + offset, atol=1e-5)
-    np.testing.assert_allclose(found.sh[:, : plain.sh.shape[1]], plain.sh, atol=1e-4)
+    assert_allclose(found.xyz, plain.xyz + offset, atol=1e-5)
+    assert_allclose(found.sh[:, : plain.sh.shape[1]], plain.sh, atol=1e-4)
     bpy.ops.stga.choose_display(display="As Trained")
     bpy.ops.stga.export_splats(filepath=str(tmp_path / "c.ply"), format="ply")
-    np.testing.assert_array_equal(read_ply(tmp_path / "c.ply").xyz, plain.xyz)
+    assert_array_equal(read_ply(tmp_path / "c.ply").xyz, plain.xyz)
     message = bpy.context.window_manager.stga_message
     sentence = "exported without move; Native Splats are exported with it"
     assert message == f"{splats.name}: {sentence}"

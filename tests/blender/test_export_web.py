@@ -1,13 +1,12 @@
 """Web pages of a FLAME head exported from Blender: sliders, motion and camera."""
 
-from pathlib import Path
-
 import bpy
 import numpy as np
 import pytest
 from capture.factory import write_flame_capture
 from export.web.web_data import posed_mesh, read_web_data
 from flame.small_head import small_head, write_flame
+from numpy.testing import assert_allclose, assert_array_equal
 
 from stga_addon.avatar.file import Avatar, read_avatar, write_avatar
 from stga_addon.avatar.lattice import lattice_splats
@@ -21,7 +20,7 @@ BLENDER_TOLERANCE_M = 2e-4
 """What the file's blend shapes leave out, times their weights."""
 
 
-def demo_head(tmp_path: Path):
+def demo_head(tmp_path):
     """The small FLAME head in the scene with an avatar; the capture it was imported from."""
     folder, _ = write_flame_capture(tmp_path / "capture", timesteps=(0, 1, 2))
     model = folder / "demo.npz"
@@ -39,13 +38,13 @@ def demo_head(tmp_path: Path):
     return capture
 
 
-def exported(folder: Path, **options) -> tuple[dict, dict[str, np.ndarray]]:
+def exported(folder, **options):
     path = folder / "anna.glb"
     bpy.ops.stga.export_avatar(filepath=str(path), format="web", **options)
     return read_web_data(path.read_bytes())
 
 
-def assert_plays(header: dict, arrays: dict[str, np.ndarray]) -> None:
+def assert_plays(header, arrays):
     """The page's mesh is that of the scene's head at each frame."""
     scene = bpy.context.scene
     for index, frame in enumerate(range(scene.frame_start, scene.frame_end + 1)):
@@ -89,7 +88,7 @@ def test_sliders_motion_and_camera(extension, tmp_path):
     assert np.ptp(arrays["pose"][:, JOINTS.index("jaw"), 0]) > 0.2
     camera = np.reshape(header["views"][0]["world_to_camera"], (4, 4))
     head_to_camera = np.array(scene.camera.matrix_world.inverted() @ head.matrix_world)
-    np.testing.assert_allclose(camera, np.diag([1, -1, -1, 1]) @ head_to_camera, atol=1e-5)
+    assert_allclose(camera, np.diag([1, -1, -1, 1]) @ head_to_camera, atol=1e-5)
 
 
 def test_an_avatar_comes_back(extension, tmp_path):
@@ -119,7 +118,7 @@ def test_an_avatar_comes_back(extension, tmp_path):
     assert np.abs(meshes() - before).max() < BLENDER_TOLERANCE_M
     found = read_avatar(tmp_path / "anna_avatar" / "avatar.npz").splats
     order = np.argsort(splats.face, kind="stable")
-    np.testing.assert_array_equal(found.face, splats.face[order])
+    assert_array_equal(found.face, splats.face[order])
     assert np.abs(found.xyz - splats.xyz[order]).max() < 3e-5
     assert len(scene.stga.splats.data.vertices) == len(found)
     assert scene.stga.avatar == str(tmp_path / "anna_avatar" / "avatar.npz")

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 from capture.factory import write_flame_capture, write_mesh_capture
 from mathutils import Vector
+from numpy.testing import assert_allclose, assert_array_equal
 from PIL import Image
 
 from stga_addon.development.demo.capture import unpack_capture
@@ -27,7 +28,7 @@ def head(extension, tmp_path):
     return bpy.context.scene.stga.head
 
 
-def viewports() -> list:
+def viewports():
     areas = [area for screen in bpy.data.screens for area in screen.areas]
     return [area.spaces.active for area in areas if area.type == "VIEW_3D"]
 
@@ -43,7 +44,7 @@ def test_viewports_look_at_the_head(head):
         assert (region.view_location - center).length < 0.3 * size
         assert 0.5 * size < region.view_distance < 5 * size
         expected = np.array(bpy.context.scene.camera.matrix_world.to_3x3().normalized())
-        np.testing.assert_allclose(np.array(region.view_rotation.to_matrix()), expected, atol=1e-5)
+        assert_allclose(np.array(region.view_rotation.to_matrix()), expected, atol=1e-5)
 
 
 def test_a_world_is_hidden_until_it_is_wanted(extension, tmp_path):
@@ -59,7 +60,7 @@ def test_a_world_is_hidden_until_it_is_wanted(extension, tmp_path):
     assert world.hide_get()
     assert world.hide_render
     assert bpy.context.scene.stga.splats is not world
-    np.testing.assert_allclose(np.array(world.matrix_world), np.array(head.matrix_world), atol=1e-6)
+    assert_allclose(np.array(world.matrix_world), np.array(head.matrix_world), atol=1e-6)
     assert len(world.data.vertices) == len(avatar.splats)
 
 
@@ -120,7 +121,7 @@ def test_images_by_other_engines(extension, tmp_path):
         bpy.ops.render.render(write_still=True)
         images[mode] = np.asarray(Image.open(path)).astype(int)
     assert images[QUADS][..., :3].max() > 50
-    np.testing.assert_array_equal(images[AS_TRAINED], images[QUADS])
+    assert_array_equal(images[AS_TRAINED], images[QUADS])
     assert np.abs(images[AS_TRAINED] - images[POINTS]).max() > 20
     scene = bpy.context.scene
     cycles = bpy.context.scene.cycles

@@ -1,16 +1,16 @@
 """The FLAME rig against FLAME's own forward pass in float64."""
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import bpy
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
-from stga_addon.flame.forward import FlameFrame, flame_forward
+from stga_addon.flame.forward import flame_forward
 from stga_addon.flame.model import JOINTS
 from stga_addon.flame.parts import flame_model as bundled_model
-from stga_addon.flame.sequence import FlameSequence, sequence_mesh
+from stga_addon.flame.sequence import sequence_mesh
 from stga_addon.flame.teeth import with_teeth
 from stga_addon.scene import tags
 from stga_addon.scene.arrays import evaluated_vertices
@@ -28,23 +28,23 @@ def source(tmp_path):
     return tmp_path / "motion.npz"
 
 
-def assert_parity(head, sequence: FlameSequence, atol: float = TOLERANCE) -> None:
+def assert_parity(head, sequence, atol=TOLERANCE):
     for timestep in sequence.timesteps:
         expected = sequence_mesh(sequence, timestep)
-        np.testing.assert_allclose(at_frame(head, timestep), expected, atol=atol)
+        assert_allclose(at_frame(head, timestep), expected, atol=atol)
 
 
-def changed(sequence: FlameSequence, change: Callable[[FlameFrame], dict]) -> FlameSequence:
+def changed(sequence, change):
     """The sequence with other values in its frames."""
 
-    def frame(timestep: int) -> FlameFrame:
+    def frame(timestep):
         whole = sequence.frame(timestep)
         return replace(whole, **change(whole))
 
     return replace(sequence, frame=frame)
 
 
-def quaternion(axis_angle: np.ndarray) -> np.ndarray:
+def quaternion(axis_angle):
     angle = np.linalg.norm(axis_angle)
     return np.array([np.cos(angle / 2), *(np.sin(angle / 2) / angle * axis_angle)])
 
@@ -64,7 +64,7 @@ def test_poses_set_by_hand_equal_the_forward_pass(source):
         keys.key_blocks[f"expr_{component:03d}"].value = value
     bpy.context.view_layer.update()
     expected = flame_forward(sequence.model, sequence.shape, wanted, sequence.static_offset)
-    np.testing.assert_allclose(evaluated_vertices(head), expected, atol=TOLERANCE)
+    assert_allclose(evaluated_vertices(head), expected, atol=TOLERANCE)
 
 
 def test_small_rotations_and_offsets_do_not_snap(source):
@@ -110,7 +110,7 @@ def test_between_frames_the_head_turns_and_does_not_shrink(source):
     model = flame_model()
     sequence = flame_sequence(model, timesteps=range(12))
 
-    def frame(timestep: int):
+    def frame(timestep):
         still = replace(sequence.frame(0), expr=np.zeros(model.n_expression))
         # as trackers write it: jumps from π to -π
         wrapped = (0.6 * timestep + np.pi) % (2 * np.pi) - np.pi
@@ -121,7 +121,7 @@ def test_between_frames_the_head_turns_and_does_not_shrink(source):
     for timestep in range(11):
         halfway = replace(turning.frame(0), rotation=np.array([0, 0.6 * (timestep + 0.5), 0]))
         expected = flame_forward(model, turning.shape, halfway, turning.static_offset)
-        np.testing.assert_allclose(at_frame(head, timestep + 0.5), expected, atol=TOLERANCE)
+        assert_allclose(at_frame(head, timestep + 0.5), expected, atol=TOLERANCE)
 
 
 def test_all_components_have_sliders(source):
@@ -244,7 +244,7 @@ def test_the_bundled_head_has_arkits_sliders(source):
     for number, timestep in enumerate(sequence.timesteps):
         found = sampled.frame(number).expr
         tracked = sequence.frame(timestep).expr
-        np.testing.assert_allclose(found, tracked, atol=1e-5)
+        assert_allclose(found, tracked, atol=1e-5)
     key = head.data.shape_keys.key_blocks["jawOpen"]
     assert is_of_parts(key.path_from_id("value"), ["expression"])
     assert not is_of_parts(key.path_from_id("value"), ["head", "jaw"])

@@ -1,10 +1,9 @@
 """The GPU display without a window: what it draws, from where, and what it leaves."""
 
-from pathlib import Path
-
 import bpy
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 from stga_addon.avatar.embedding import WORLD, to_world
 from stga_addon.capture.camera import look_at
@@ -34,7 +33,7 @@ from .test_splat_object import FRAMES, animated_head, avatar_of, random_splats
 class Region:
     """A RegionView3D one meter before the origin, looking along −z."""
 
-    def __init__(self, is_perspective: bool) -> None:
+    def __init__(self, is_perspective):
         from mathutils import Matrix
 
         near = 0.1
@@ -93,7 +92,7 @@ def test_cache_follows_new_splats_and_shapes():
     shown = show_avatar(avatar, head)
     cache = SplatCache()
 
-    def layer(frame: int) -> SceneLayer:
+    def layer(frame):
         bpy.context.scene.frame_set(frame)
         return visible_layers(bpy.context.evaluated_depsgraph_get(), cache)[0]
 
@@ -113,7 +112,7 @@ def test_an_error_ends_the_display(monkeypatch, capsys):
     """Catches points over the GPU's picture, an error in every redraw, and splats gone for good."""
     shown = show_world_splats(random_splats(1, 10), "scan")
 
-    def kinds() -> set[str]:
+    def kinds():
         depsgraph = bpy.context.evaluated_depsgraph_get()
         return {instance.object.type for instance in depsgraph.object_instances}
 
@@ -131,13 +130,13 @@ def test_an_error_ends_the_display(monkeypatch, capsys):
     bpy.app.timers.unregister(viewport_display.show_points)
 
 
-def positions(layer: SceneLayer) -> np.ndarray:
+def positions(layer):
     """(N, 3) world positions of the layer's splats."""
     local = to_world(layer.splats, layer.frames).xyz
     return local @ layer.to_world[:3, :3].T + layer.to_world[:3, 3]
 
 
-def shown_at(frame: int, cache: SplatCache) -> np.ndarray:
+def shown_at(frame, cache):
     """World positions of the one visible layer."""
     bpy.context.scene.frame_set(frame)
     (layer,) = visible_layers(bpy.context.evaluated_depsgraph_get(), cache)
@@ -145,7 +144,7 @@ def shown_at(frame: int, cache: SplatCache) -> np.ndarray:
 
 
 @pytest.fixture
-def library(tmp_path: Path) -> tuple[Path, list[np.ndarray]]:
+def library(tmp_path):
     """A .blend file with a moving head and splats in "anna", and their places at FRAMES."""
     avatar = avatar_of("stga", 300)
     head = animated_head(avatar.neutral, avatar.faces)
@@ -162,7 +161,7 @@ def library(tmp_path: Path) -> tuple[Path, list[np.ndarray]]:
     return tmp_path / "library.blend", expected
 
 
-def linked_collection(path: Path):
+def linked_collection(path):
     with bpy.data.libraries.load(str(path), link=True) as (_, target):
         target.collections = ["anna"]
     return target.collections[0]
@@ -186,7 +185,7 @@ def test_linked_heads_are_followed(library, is_instance):
         scene.collection.children.link(linked)
     for frame, there in zip(FRAMES, expected, strict=True):
         placed = 2 * there + [1, 2, 3] if is_instance else there
-        np.testing.assert_allclose(shown_at(frame, cache), placed, atol=1e-5)
+        assert_allclose(shown_at(frame, cache), placed, atol=1e-5)
 
 
 def test_overridden_heads_are_followed(library):
@@ -203,9 +202,9 @@ def test_overridden_heads_are_followed(library):
     assert set(own) == {"root", "head", "head splats"}
     cache = SplatCache()
     for frame, positions_there in zip(FRAMES, expected, strict=True):
-        np.testing.assert_allclose(shown_at(frame, cache), positions_there, atol=1e-6)
+        assert_allclose(shown_at(frame, cache), positions_there, atol=1e-6)
     own["root"].location = (0.5, 0, 0)
-    np.testing.assert_allclose(shown_at(FRAMES[0], cache), expected[0] + [0.5, 0, 0], atol=1e-6)
+    assert_allclose(shown_at(FRAMES[0], cache), expected[0] + [0.5, 0, 0], atol=1e-6)
     own["head"].scale = (2, 2, 2)  # and its splats, which stay where they are, follow its surface
     there = shown_at(FRAMES[0], cache) - [0.5, 0, 0]
-    np.testing.assert_allclose(np.ptp(there, axis=0), 2 * np.ptp(expected[0], axis=0), rtol=0.01)
+    assert_allclose(np.ptp(there, axis=0), 2 * np.ptp(expected[0], axis=0), rtol=0.01)

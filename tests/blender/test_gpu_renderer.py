@@ -1,7 +1,6 @@
 """The picture of the GPU renderer against that of the CPU rasterizer, in the module bpy."""
 
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -14,8 +13,7 @@ from stga_addon.avatar.embedding import WORLD, to_world
 from stga_addon.avatar.file import Avatar
 from stga_addon.avatar.lattice import lattice_splats
 from stga_addon.avatar.offsets import OFFSETS, POSITION
-from stga_addon.avatar.splats import Splats
-from stga_addon.capture.camera import Camera, look_at
+from stga_addon.capture.camera import look_at
 from stga_addon.light.harmonics import uniform
 from stga_addon.light.lamps import MAP_SIZE, ShadowMap
 from stga_addon.light.relight import Relighter
@@ -41,7 +39,7 @@ TURNED = np.array(
 ) @ np.diag([1.3, 0.8, 1, 1])
 
 
-def avatar(degree: int, *driven: str) -> Avatar:
+def avatar(degree, *driven):
     """Splats of every size, opacity and color on a ball, with driven offsets of these names."""
     vertices, faces = ball()
     rng = np.random.default_rng(degree)
@@ -58,7 +56,7 @@ def avatar(degree: int, *driven: str) -> Avatar:
     return with_driven(Avatar(splats, "stga", vertices.astype(np.float32), faces), *driven)
 
 
-def with_driven(of: Avatar, *names: str) -> Avatar:
+def with_driven(of, *names):
     """With these driven offsets, and ranges of normals that clip small turns."""
     rng = np.random.default_rng(9)
     count = len(of.faces)
@@ -70,21 +68,19 @@ def with_driven(of: Avatar, *names: str) -> Avatar:
     return replace(of, strain_range=limits, driven_offsets=offsets)
 
 
-def layer(
-    of: Avatar, pose: np.ndarray | None = None, antialiased: bool = False, **more: Any
-) -> SceneLayer:
+def layer(of, pose=None, antialiased=False, **more):
     mesh = of.neutral * [1.1, 0.9, 1.05]
     return SceneLayer(
         of.splats, of.frames(mesh), np.eye(4) if pose is None else pose, antialiased, **more
     )
 
 
-def unembedded(of: Avatar) -> SceneLayer:
-    world: Splats = to_world(of.splats, of.frames(of.neutral))
+def unembedded(of):
+    world = to_world(of.splats, of.frames(of.neutral))
     return SceneLayer(world, WORLD, TURNED)
 
 
-def cases() -> dict[str, tuple[list[SceneLayer], Camera]]:
+def cases():
     size = float(np.ptp(avatar(0).neutral))
     near = look_at((0.3 * size, 0.2 * size, 1.5 * size), (0, 0, 0), 160, 200, 220)
     far = look_at((0, 100 * size, 1500 * size), (0, 0, 0), 60, 80, 90_000)
@@ -107,7 +103,7 @@ def cases() -> dict[str, tuple[list[SceneLayer], Camera]]:
     }
 
 
-def render(layers: list[SceneLayer], camera: Camera, exact: bool) -> ComposedImage:
+def render(layers, camera, exact):
     """By the CPU rasterizer, or for one untransformed layer by the reference in float64.
 
     Far from the camera the former sorts by depths that float32 has rounded.
@@ -122,11 +118,11 @@ def render(layers: list[SceneLayer], camera: Camera, exact: bool) -> ComposedIma
     return ComposedImage(rgb, alpha, depth / np.maximum(alpha, 1e-12))
 
 
-def psnr_db(found: np.ndarray, expected: np.ndarray) -> float:
+def psnr_db(found, expected):
     return float(-10 * np.log10(max(np.mean((found - expected) ** 2), 1e-12)))
 
 
-def check(found: ComposedImage, layers: list[SceneLayer], camera: Camera, exact: bool) -> None:
+def check(found, layers, camera, exact):
     expected = render(layers, camera, exact)
     print(f"{psnr_db(found.rgb, expected.rgb):.1f} dB")
     assert psnr_db(found.rgb, expected.rgb) >= MIN_PSNR_DB
@@ -137,11 +133,11 @@ def check(found: ComposedImage, layers: list[SceneLayer], camera: Camera, exact:
     assert np.sqrt(np.mean(error**2)) < 1e-3 * np.ptp(expected.depth[opaque])
 
 
-def drawn(pictures: list[tuple[list[SceneLayer], View]], *options: Any) -> list[ComposedImage]:
+def drawn(pictures, *options):
     """Pictures of layers from views, drawn by one renderer."""
-    found: list[ComposedImage] = []
+    found = []
 
-    def draw() -> None:
+    def draw():
         renderer = SplatRenderer(*options)
         for layers, view in pictures:
             renderer.draw(layers, view)
@@ -153,14 +149,14 @@ def drawn(pictures: list[tuple[list[SceneLayer], View]], *options: Any) -> list[
 
 @needs_gpu
 @pytest.mark.parametrize("name", cases())
-def test_picture_equals_the_rasterizers(name: str) -> None:
+def test_picture_equals_the_rasterizers(name):
     """Catches another projection, order, color, filter, pose or setting than the CPU's."""
     layers, camera = cases()[name]
     check(drawn([(layers, View(camera))])[0], layers, camera, exact=name == "orthographic")
 
 
 @needs_gpu
-def test_clip_planes() -> None:
+def test_clip_planes():
     """Catches splats outside a clipping region, and planes of another space."""
     camera = cases()["sh 0"][1]
     of = avatar(0)
@@ -175,7 +171,7 @@ def test_clip_planes() -> None:
 
 
 @needs_gpu
-def test_other_splats_in_the_compact_format() -> None:
+def test_other_splats_in_the_compact_format():
     """Catches splats of an earlier picture, and wrong targets of viewports on a card."""
     pictures = [cases()[name] for name in ("two and world", "sh 0", "two and world")]
     found = drawn([(layers, View(camera)) for layers, camera in pictures], COMPACT)
@@ -184,7 +180,7 @@ def test_other_splats_in_the_compact_format() -> None:
         assert psnr_db(image.rgb, expected.rgb) >= MIN_COMPACT_PSNR_DB
 
 
-def relit_layers(mode: str) -> list[SceneLayer]:
+def relit_layers(mode):
     """A ball and a plate under four lights, a world and a caster; beside it one as recorded."""
     avatar = with_driven(lit_avatar(degree=1), *OFFSETS)
     mesh = avatar.neutral.astype(np.float64) * [1.05, 0.97, 1.0]
@@ -227,7 +223,7 @@ def test_light_of_the_scene(mode):
     assert psnr_db(image.rgb, plain.rgb) < 28, "nothing is lit"
 
 
-def check_shadow_map(atlas: np.ndarray, index: int, expected: np.ndarray) -> None:
+def check_shadow_map(atlas, index, expected):
     """A map of the atlas against the depth map (MAP_SIZE, MAP_SIZE) of the CPU, texel by texel."""
     found = atlas[:, MAP_SIZE * index : MAP_SIZE * (index + 1)]
     hit = np.isfinite(expected)
@@ -239,21 +235,19 @@ def check_shadow_map(atlas: np.ndarray, index: int, expected: np.ndarray) -> Non
 
 
 @needs_gpu
-def test_shadow_maps() -> None:
+def test_shadow_maps():
     """Catches surfaces that hide what is nearer to a light, and depth bent over large triangles."""
     shown = relit_layers("scene")[1]
     relit = shown.relit
     far = Light("point", np.ones(3), (30, 50, 20))
-    assert relit is not None
     lighting = replace(relit.lighting, lights=(*relit.lighting.lights[:3], far))
     relit = replace(relit, lighting=lighting)
-    atlas: list[np.ndarray] = []
+    atlas = []
 
-    def draw() -> None:
+    def draw():
         renderer = SplatRenderer()
         camera = look_at((0.3, 0.2, 0.7), (0, 0, 0), 16, 20, 30)
         renderer.draw([replace(shown, relit=relit)], View(camera))
-        assert renderer._relit is not None
         atlas.append(read_pixels(renderer._relit[0].textures["shadows"], 1)[..., 0])
 
     run_with_gpu(draw)

@@ -37,7 +37,7 @@ def _first_picture(monkeypatch):
     monkeypatch.setattr(engine, "_told", set())
 
 
-def break_shader(monkeypatch, name: str) -> None:
+def break_shader(monkeypatch, name):
     part, old, new = BROKEN[name]
     assert old in getattr(shaders, part)
     monkeypatch.setattr(shaders, part, getattr(shaders, part).replace(old, new))
@@ -64,7 +64,7 @@ def test_working_shaders_pass_once(monkeypatch, color_format):
         trial, "check", lambda *given, **named: checked.append(check(*given, **named))
     )
 
-    def work() -> None:
+    def work():
         for _ in range(3):
             SplatRenderer(color_format)
 
@@ -96,7 +96,7 @@ def test_viewports_fall_back_to_points(monkeypatch, capsys, is_engine):
     monkeypatch.setattr(engine, "all_layers", lambda *_: [trial._layer(0)])
     viewport = engine.EngineViewport()
 
-    def draw() -> None:
+    def draw():
         for _ in range(2 if is_engine else 1):  # the display's handler is removed
             viewport.draw(bpy.context, bpy.context.evaluated_depsgraph_get())
 
@@ -126,10 +126,10 @@ def test_points_are_shown_in_material_preview(monkeypatch):
 def test_images_fall_back_to_the_rasterizer(monkeypatch):
     """Catches F12 and videos of garbage, and a warning for each frame."""
     break_shader(monkeypatch, "one texture for all")
-    told: list[str] = []
-    images: list[object] = []
+    told = []
+    images = []
 
-    def work() -> None:
+    def work():
         for _ in range(2):
             images.append(engine.draw_image([trial._layer(0)], trial.CAMERA, told.append))
 

@@ -5,6 +5,7 @@ from dataclasses import replace
 import bpy
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 from stga_addon.errors import StgaError
 from stga_addon.scene import tags
@@ -14,7 +15,7 @@ from stga_addon.scene.rig.head import import_head
 from .captures import at_frame, flame_model, flame_sequence, mesh_capture, motion_capture
 
 
-def block_counts() -> dict[str, int]:
+def block_counts():
     kinds = ("objects", "meshes", "shape_keys", "actions", "armatures", "collections")
     return {kind: len(getattr(bpy.data, kind)) for kind in kinds}
 
@@ -34,7 +35,7 @@ def test_each_frame_evaluates_to_its_timestep(tmp_path):
     expected = {timestep: mesh(timestep) for timestep in capture.timesteps}
     expected |= {6: mesh(3) / 4 + mesh(7) * 3 / 4, 2.5: (mesh(2) + mesh(3)) / 2}
     for frame, vertices in (expected | {-5: mesh(2), 30: mesh(8)}).items():
-        np.testing.assert_allclose(at_frame(head, frame), vertices, atol=1e-7)
+        assert_allclose(at_frame(head, frame), vertices, atol=1e-7)
 
 
 def test_axes_faces_and_regions(tmp_path):
@@ -45,8 +46,8 @@ def test_axes_faces_and_regions(tmp_path):
     head = import_head(capture)
     bpy.context.view_layer.update()
     turned = np.array(head.matrix_world)[:3, :3]
-    np.testing.assert_allclose(turned @ [0, 1, 0], [0, 0, 1], atol=1e-6)
-    np.testing.assert_allclose(turned @ [1, 0, 0], [1, 0, 0], atol=1e-6)
+    assert_allclose(turned @ [0, 1, 0], [0, 0, 1], atol=1e-6)
+    assert_allclose(turned @ [1, 0, 0], [1, 0, 0], atol=1e-6)
     assert np.linalg.det(turned) == pytest.approx(1)
     assert head.parent.name == "anna"
     assert "anna" in bpy.data.collections
@@ -58,7 +59,7 @@ def test_axes_faces_and_regions(tmp_path):
     assert other != head
     assert other.parent != head.parent
     for frame in (0, 5, 9):
-        np.testing.assert_allclose(at_frame(head, frame), capture.mesh(5), atol=1e-7)
+        assert_allclose(at_frame(head, frame), capture.mesh(5), atol=1e-7)
 
 
 def test_second_import_replaces_the_first(tmp_path):
@@ -71,16 +72,14 @@ def test_second_import_replaces_the_first(tmp_path):
     bpy.context.view_layer.objects.active = first
     bpy.ops.object.mode_set(mode="EDIT")
     same_triangles = mesh_capture(tmp_path, seed=4)
-    np.testing.assert_allclose(
-        at_frame(import_head(same_triangles), 3), same_triangles.mesh(3), atol=1e-7
-    )
+    assert_allclose(at_frame(import_head(same_triangles), 3), same_triangles.mesh(3), atol=1e-7)
     assert first.mode == "OBJECT"
     changed = mesh_capture(tmp_path, timesteps=(1, 2), vertices=70, seed=3)
     second = import_head(changed)
     assert second == first == follower.parent
     assert block_counts() == counts
     assert [modifier.name for modifier in second.modifiers] == ["artist's own"]
-    np.testing.assert_allclose(at_frame(second, 2), changed.mesh(2), atol=1e-7)
+    assert_allclose(at_frame(second, 2), changed.mesh(2), atol=1e-7)
     assert list(second[tags.TIMESTEPS]) == [1, 2]
     source = tmp_path / "capture"
     import_head(motion_capture(flame_sequence(flame_model()), source))
@@ -88,14 +87,14 @@ def test_second_import_replaces_the_first(tmp_path):
     head = import_head(capture)
     assert not bpy.data.armatures
     assert not head.modifiers
-    np.testing.assert_allclose(at_frame(head, 3), capture.mesh(3), atol=1e-7)
+    assert_allclose(at_frame(head, 3), capture.mesh(3), atol=1e-7)
 
 
 def test_unreadable_timestep_leaves_the_scene_unchanged(tmp_path):
     """Fails when a mesh that cannot be read leaves a partly imported head in the scene."""
     capture = mesh_capture(tmp_path)
 
-    def mesh(timestep: int) -> np.ndarray:
+    def mesh(timestep):
         if timestep == 7:
             raise StgaError("00007.obj: is truncated")
         return capture.mesh(timestep)

@@ -1,7 +1,6 @@
 """Importing heads without a capture, and importing again."""
 
 from functools import partial
-from pathlib import Path
 from types import SimpleNamespace
 
 import bpy
@@ -16,6 +15,7 @@ from capture.factory import (
     write_mesh,
     write_mesh_capture,
 )
+from numpy.testing import assert_allclose
 
 from stga_addon.capture.open import open_capture
 from stga_addon.scene.arrays import evaluated_vertices
@@ -27,11 +27,11 @@ pytestmark = pytest.mark.usefixtures("extension")
 
 
 @pytest.fixture
-def model(tmp_path) -> Path:
+def model(tmp_path):
     return write_flame_model(tmp_path / "model.npz")
 
 
-def write_motion(path: Path, timesteps: int = 4) -> Path:
+def write_motion(path, timesteps=4):
     """All timesteps in one file, as VHAP's tracker leaves it."""
     frames = [flame_parameters(timestep) for timestep in range(timesteps)]
     names = [name for name, value in frames[0].items() if value.ndim == 2]
@@ -40,7 +40,7 @@ def write_motion(path: Path, timesteps: int = 4) -> Path:
     return path
 
 
-def write_meshes(folder: Path, timesteps: int = 3) -> Path:
+def write_meshes(folder, timesteps=3):
     folder.mkdir()
     vertices, faces = ball()
     for timestep in range(timesteps):
@@ -48,7 +48,7 @@ def write_meshes(folder: Path, timesteps: int = 3) -> Path:
     return folder / "001.obj"
 
 
-def state_of_file() -> dict[str, list[str]]:
+def state_of_file():
     kinds = "objects meshes actions armatures collections node_groups materials cameras images"
     return {kind: sorted(block.name for block in getattr(bpy.data, kind)) for kind in kinds.split()}
 
@@ -84,7 +84,7 @@ def test_importing_again_doubles_nothing(tmp_path, model, kind):
     assert (scene.frame_start, scene.frame_end) == (0, max(meshes))
     for timestep, mesh in meshes.items():
         scene.frame_set(timestep)
-        np.testing.assert_allclose(evaluated_vertices(scene.stga.head), mesh, atol=2e-6)
+        assert_allclose(evaluated_vertices(scene.stga.head), mesh, atol=2e-6)
     ops.select(threshold=0.001)
 
 
@@ -102,7 +102,7 @@ def test_importing_again_keeps_what_an_artist_painted(tmp_path):
     assert head.vertex_groups["stga_3"].weight(7) == pytest.approx(0.7)
     assert [material.name for material in head.data.materials] == ["skin"]
     bpy.context.scene.frame_set(3)
-    np.testing.assert_allclose(evaluated_vertices(head), moved(3, ball()[0]), atol=1e-6)
+    assert_allclose(evaluated_vertices(head), moved(3, ball()[0]), atol=1e-6)
     mesh = bpy.data.meshes.new("other")
     other = bpy.data.objects.new("other", mesh)
     bpy.context.scene.collection.objects.link(other)

@@ -18,7 +18,7 @@ from .zips import output_of
 ROOT = Path(__file__).resolve().parents[2]
 
 
-def blender_ext(*arguments: object, home: Path) -> str:
+def blender_ext(*arguments, home):
     """Output of Blender's own extension tool, in a Python with bpy and an empty Blender profile."""
     script = (
         "import bpy, runpy, sys; from pathlib import Path\n"

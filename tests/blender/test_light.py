@@ -8,6 +8,7 @@ import pytest
 from capture.factory import write_mesh_capture
 from light.scenes import lit_avatar
 from mathutils import Matrix, Vector
+from numpy.testing import assert_allclose, assert_array_equal
 
 from stga_addon.avatar.file import read_avatar, write_avatar
 from stga_addon.capture.mesh_geometry import vertex_normals
@@ -17,7 +18,6 @@ from stga_addon.scene.compat import enable_nodes
 from stga_addon.scene.display.splat_attributes import LINEAR_SH, read_attribute
 from stga_addon.scene.display.splat_nodes import PERCENTAGE
 from stga_addon.scene.display.splat_object import hide_object, set_input, show_avatar, stored_avatar
-from stga_addon.scene.layers import Relit
 from stga_addon.scene.light import throw_shadow, throws_shadow
 from stga_addon.scene.render.scene_splats import SplatCache, visible_layers
 
@@ -55,7 +55,7 @@ def background(world):
     return enable_nodes(world).nodes["Background"].inputs
 
 
-def lamp(kind: str, location: tuple[float, ...], energy: float, **properties: object):
+def lamp(kind, location, energy, **properties):
     """A light that shines at PLACE's head."""
     light = bpy.data.lights.new(kind, kind)
     light.energy = energy
@@ -70,13 +70,13 @@ def lamp(kind: str, location: tuple[float, ...], energy: float, **properties: ob
     return placed
 
 
-def relit() -> Relit | None:
+def relit():
     bpy.context.view_layer.update()
     (layer,) = visible_layers(bpy.context.evaluated_depsgraph_get(), SplatCache())
     return layer.relit
 
 
-def light_irradiance(found: Relit) -> np.ndarray:
+def light_irradiance(found):
     """(BALL, 3) that arrives at the ball's vertices."""
     normals = vertex_normals(found.mesh, found.relighter.avatar.faces)
     lamps = Lamps(found.lighting, found.mesh, found.relighter.avatar.faces, found.casters)
@@ -85,7 +85,7 @@ def light_irradiance(found: Relit) -> np.ndarray:
     return (lamps.irradiance(found.mesh + LIFT_M * normals, normals) + arriving)[:BALL]
 
 
-def baked_irradiance(shown, head) -> np.ndarray:
+def baked_irradiance(shown, head):
     """(BALL, 3) by Cycles: direct light on white, diffuse vertices."""
     shown.hide_render = True  # splats shine themselves
     scene = bpy.context.scene
@@ -125,7 +125,7 @@ LAMPS = {
 }
 
 
-def check_irradiance(shown, head, limit: float) -> None:
+def check_irradiance(shown, head, limit):
     arriving = light_irradiance(relit())
     expected = baked_irradiance(shown, head)
     assert arriving.mean(0) == pytest.approx(expected.mean(0), rel=0.05)
@@ -147,7 +147,7 @@ def test_irradiance_is_that_of_cycles(name):
     check_irradiance(shown, head, 0.1)
 
 
-def sky(size: tuple[int, int] = (64, 32)):
+def sky(size=(64, 32)):
     """A float image: blue above, and a warm glow to one side."""
     image = bpy.data.images.new("sky", *size, float_buffer=True)
     u, v = np.meshgrid(*((np.arange(pixels) + 0.5) / pixels for pixels in size))
@@ -157,7 +157,7 @@ def sky(size: tuple[int, int] = (64, 32)):
     return image
 
 
-def use_texture(world, image, kind: str | None) -> None:
+def use_texture(world, image, kind):
     nodes = world.node_tree.nodes
     links = world.node_tree.links
     texture = nodes.new("ShaderNodeTexEnvironment")
@@ -193,7 +193,7 @@ def test_lights_that_do_not_count():
     kinds = [lamp(kind, (1.0, -0.5, 2.0), 3.0) for kind in ("SUN", "POINT", "SPOT")]
     background(bpy.context.scene.world)["Strength"].default_value = 1.0
 
-    def found() -> list[str]:
+    def found():
         return [light.kind for light in relit().lighting.lights]
 
     assert found() == ["sun", "point", "spot"]
@@ -229,7 +229,7 @@ def test_nothing_is_made_anew_while_nothing_moves():
     cube = bpy.context.object
     cache = SplatCache()
 
-    def again() -> Relit:
+    def again():
         bpy.context.view_layer.update()
         (layer,) = visible_layers(bpy.context.evaluated_depsgraph_get(), cache)
         return layer.relit
@@ -267,7 +267,7 @@ def test_shadow_onto_the_scene(engine, tmp_path):
     scene.view_settings.view_transform = "Raw"
     set_input(shown, PERCENTAGE, 0.0)
 
-    def middle() -> float:
+    def middle():
         scene.render.filepath = str(tmp_path / "image.png")
         bpy.ops.render.render(write_still=True)
         image = bpy.data.images.load(str(tmp_path / "image.png"))
@@ -303,18 +303,16 @@ def test_estimate_light(extension, tmp_path):
     bpy.ops.stga.estimate_light()
     found = stored_avatar(shown).light
     for name in vars(found).keys() - {"source"}:
-        np.testing.assert_allclose(
-            getattr(found, name), getattr(trained.light, name), atol=1e-6, err_msg=name
-        )
+        assert_allclose(getattr(found, name), getattr(trained.light, name), atol=1e-6, err_msg=name)
     assert found.source == "estimated"
     assert read_avatar(run / "avatar.npz").light.source == "estimated"
 
     bpy.ops.stga.make_exact()
     fitted = read_avatar(run / "avatar.npz")
     assert fitted.light is not None
-    np.testing.assert_array_equal(fitted.splats.sh, trained.splats.sh)
+    assert_array_equal(fitted.splats.sh, trained.splats.sh)
     kept = read_attribute(shown.data, LINEAR_SH)
-    np.testing.assert_array_equal(kept, fitted.linear_base[:, :3])
+    assert_array_equal(kept, fitted.linear_base[:, :3])
     assert np.abs(kept - trained.splats.sh[:, 0]).max() > 0.01
     assert [light.kind for light in relit().lighting.lights] == ["sun"]
 

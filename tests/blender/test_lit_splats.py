@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from light.scenes import RADIUS, lit_avatar
 from mathutils import Vector
+from numpy.testing import assert_allclose, assert_array_equal
 from PIL import Image
 
 from stga_addon.capture.mesh_geometry import vertex_normals
@@ -43,7 +44,7 @@ def native_head():
     return shown, head
 
 
-def parts_of(shown) -> dict[str, dict[str, np.ndarray]]:
+def parts_of(shown):
     """Kind of data -> attributes of what a splat object is evaluated to, and its materials."""
     bpy.context.view_layer.update()
     found = {}
@@ -60,7 +61,7 @@ def parts_of(shown) -> dict[str, dict[str, np.ndarray]]:
     return found
 
 
-def test_lit_splats_have_albedo_and_normals_and_a_mesh_throws_shadows() -> None:
+def test_lit_splats_have_albedo_and_normals_and_a_mesh_throws_shadows():
     """Catches recorded colors that are lit again, roughness of none, normals that do not follow
     the head, a mesh in whose shadow its own splats lie, and light that is estimated later."""
     shown, head = native_head()
@@ -72,17 +73,17 @@ def test_lit_splats_have_albedo_and_normals_and_a_mesh_throws_shadows() -> None:
     set_input(shown, NATIVE_LIGHT, SCENE_LIGHT)
     parts = parts_of(shown)
     cloud = parts["POINTCLOUD"]
-    np.testing.assert_allclose(cloud[ALBEDO][:, :3], Relighter(avatar).albedo, atol=1e-5)
-    np.testing.assert_allclose(cloud[ALBEDO][:, 3], SKIN_ROUGHNESS)
+    assert_allclose(cloud[ALBEDO][:, :3], Relighter(avatar).albedo, atol=1e-5)
+    assert_allclose(cloud[ALBEDO][:, 3], SKIN_ROUGHNESS)
     normals = vertex_normals(plate.astype(np.float64), avatar.faces)[avatar.faces].mean(1)
     on_ball = avatar.faces.max(1) < BALL  # elsewhere the weights of faces at a corner matter
-    np.testing.assert_allclose(cloud[NORMAL][on_ball], normals[on_ball], atol=6e-3)
+    assert_allclose(cloud[NORMAL][on_ball], normals[on_ball], atol=6e-3)
     assert not [name for name in cloud if name.startswith("stga")]
     assert cloud["material"] == ["STGA Lit Splats"]
     caster = parts["MESH"]["position"]
     radius = np.linalg.norm(caster, axis=1)
     on_ball = caster[radius < RADIUS]
-    np.testing.assert_allclose(np.linalg.norm(on_ball, axis=1), RADIUS - SHRINKAGE_M, atol=2e-4)
+    assert_allclose(np.linalg.norm(on_ball, axis=1), RADIUS - SHRINKAGE_M, atol=2e-4)
     down = on_ball / np.linalg.norm(on_ball, axis=1, keepdims=True)
     below = plate[BALL:].mean(0) / np.linalg.norm(plate[BALL:].mean(0))
     assert (down @ below).max() < 0.99  # near skin throws none onto other
@@ -91,10 +92,10 @@ def test_lit_splats_have_albedo_and_normals_and_a_mesh_throws_shadows() -> None:
     assert store_light(shown, replace(avatar, light=brighter))
     expected = Relighter(replace(avatar, light=brighter)).albedo
     found = parts_of(shown)["POINTCLOUD"][ALBEDO][:, :3]
-    np.testing.assert_allclose(found, expected, atol=1e-5)
+    assert_allclose(found, expected, atol=1e-5)
 
 
-def test_nothing_is_left_of_the_scenes_light(tmp_path) -> None:
+def test_nothing_is_left_of_the_scenes_light(tmp_path):
     """Catches attributes, materials, objects or settings that stay when colors are recorded again
     or the avatar is removed, and duplicates or appended avatars that are lit in another way."""
     shown, _ = native_head()
@@ -125,10 +126,10 @@ def test_nothing_is_left_of_the_scenes_light(tmp_path) -> None:
         again = parts_of(each)
         assert again.keys() == before.keys()
         for name, values in before["POINTCLOUD"].items():
-            np.testing.assert_array_equal(again["POINTCLOUD"][name], values)
+            assert_array_equal(again["POINTCLOUD"][name], values)
 
 
-def test_the_panel_offers_the_light_of_native_splats(extension) -> None:
+def test_the_panel_offers_the_light_of_native_splats(extension):
     """Catches a choice that is not offered, or offered for other displays, and a hint that images
     do not show the scene's light where they do."""
     shown, _ = native_head()
@@ -144,7 +145,7 @@ def test_the_panel_offers_the_light_of_native_splats(extension) -> None:
 
 
 @pytest.mark.parametrize("engine", [pytest.param(EEVEE, marks=EEVEE_MARKS), "CYCLES"])
-def test_lamps_shine_on_native_splats(engine, tmp_path) -> None:
+def test_lamps_shine_on_native_splats(engine, tmp_path):
     """Catches splats that shine themselves, darken themselves, throw no shadow onto meshes, or get
     none from them, and recorded ones that a lamp changes."""
     shown, head = native_head()
@@ -170,7 +171,7 @@ def test_lamps_shine_on_native_splats(engine, tmp_path) -> None:
     else:
         scene.eevee.taa_render_samples = 8
 
-    def image() -> np.ndarray:
+    def image():
         bpy.ops.render.render(write_still=True)
         return np.asarray(Image.open(tmp_path / "image.png").convert("L"), np.float32) / 255
 
@@ -192,4 +193,4 @@ def test_lamps_shine_on_native_splats(engine, tmp_path) -> None:
     bpy.data.objects.remove(bpy.context.object)
     bpy.data.objects.remove(sun)
     set_input(shown, NATIVE_LIGHT, RECORDED)
-    np.testing.assert_allclose(image(), recorded, atol=0.01)
+    assert_allclose(image(), recorded, atol=0.01)

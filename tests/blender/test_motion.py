@@ -6,10 +6,11 @@ from dataclasses import replace
 import bpy
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 from stga_addon.errors import StgaError
 from stga_addon.flame.forward import flame_forward
-from stga_addon.flame.sequence import PARTS, FlameSequence, retimed, sequence_mesh
+from stga_addon.flame.sequence import PARTS, retimed, sequence_mesh
 from stga_addon.scene import compat
 from stga_addon.scene.arrays import evaluated_vertices
 from stga_addon.scene.compat import SLOTTED_ACTIONS
@@ -25,7 +26,7 @@ FIELDS = ("expr", "rotation", "neck_pose", "jaw_pose", "eyes_pose", "translation
 
 
 @pytest.fixture
-def own() -> FlameSequence:
+def own():
     return flame_sequence(flame_model(), timesteps=range(1, 7), seed=1)
 
 
@@ -35,19 +36,19 @@ def head(own, tmp_path):
 
 
 @pytest.fixture
-def other(own) -> FlameSequence:
+def other(own):
     return flame_sequence(own.model, timesteps=range(4), seed=2)
 
 
-def mesh(own: FlameSequence, frame) -> np.ndarray:
+def mesh(own, frame):
     return flame_forward(own.model, own.shape, frame, own.static_offset)
 
 
-def owners(head) -> list:
+def owners(head):
     return [rig_of(head), head.data.shape_keys]
 
 
-def curves_of(owner, action) -> dict:
+def curves_of(owner, action):
     """(path, index) -> keyframes of an action, wherever this Blender keeps them."""
     if not SLOTTED_ACTIONS:
         found = action.fcurves
@@ -64,7 +65,7 @@ def test_applying_one_part_keeps_the_other_parts(head, own, other, part, as_stri
     for index in range(4):
         theirs = {name: getattr(other.frame(index), name) for name in PARTS[part]}
         frame = replace(own.frame(2 + index), **theirs)
-        np.testing.assert_allclose(at_frame(head, 2 + index), mesh(own, frame), atol=TOLERANCE)
+        assert_allclose(at_frame(head, 2 + index), mesh(own, frame), atol=TOLERANCE)
 
 
 def test_the_old_action_is_unchanged(head, own, other, tmp_path):
@@ -82,7 +83,7 @@ def test_the_old_action_is_unchanged(head, own, other, tmp_path):
         owner.animation_data.action = bpy.data.actions[title]
         if SLOTTED_ACTIONS:
             owner.animation_data.action_slot = bpy.data.actions[title].slots[0]
-    np.testing.assert_allclose(at_frame(head, 4), sequence_mesh(own, 4), atol=TOLERANCE)
+    assert_allclose(at_frame(head, 4), sequence_mesh(own, 4), atol=TOLERANCE)
 
 
 def test_strips_override_only_their_frames(head, own, other):
@@ -91,7 +92,7 @@ def test_strips_override_only_their_frames(head, own, other):
     apply_motion(head, retimed(other), Placement(4, "twice", as_strip=True))
     seen = {1: own.frame(1), 2: other.frame(0), 4: other.frame(0), 7: other.frame(3)}
     for frame, expected in seen.items():
-        np.testing.assert_allclose(at_frame(head, frame), mesh(own, expected), atol=TOLERANCE)
+        assert_allclose(at_frame(head, frame), mesh(own, expected), atol=TOLERANCE)
     for owner in owners(head):
         assert [len(track.strips) for track in owner.animation_data.nla_tracks] == [1, 1, 1]
         assert owner.animation_data.action is None
@@ -112,7 +113,7 @@ def test_a_strip_keeps_the_animation_below_where_it_is(head, own, other):
     before = [at_frame(head, time) for time in times]
     apply_motion(head, retimed(other), Placement(40, "other", ("jaw",), as_strip=True))
     for time, expected in zip(times, before, strict=True):
-        np.testing.assert_allclose(at_frame(head, time), expected, atol=TOLERANCE)
+        assert_allclose(at_frame(head, time), expected, atol=TOLERANCE)
 
 
 def test_moved_and_removed_sliders(head, own, other):
@@ -127,13 +128,13 @@ def test_moved_and_removed_sliders(head, own, other):
             bpy.ops.object.shape_key_move(type=way)
     apply_motion(head, frames, Placement(20, "other"))
     for index, frame in enumerate(frames):
-        np.testing.assert_allclose(at_frame(head, 20 + index), mesh(own, frame), atol=TOLERANCE)
+        assert_allclose(at_frame(head, 20 + index), mesh(own, frame), atol=TOLERANCE)
     keyframes.write_curves(head.data.shape_keys, 'key_blocks["expr_004"].value', [1, 9], [1, 2])
     bpy.context.view_layer.update()
     keys["expr_029"].value += 0.5
     posed = evaluated_vertices(head)
     keyframes.key_current_pose(head, rig_of(head), 23)
-    np.testing.assert_allclose(at_frame(head, 23), posed, atol=1e-5)
+    assert_allclose(at_frame(head, 23), posed, atol=1e-5)
     assert np.abs(posed - mesh(own, frames[3])).max() > 1e-3
 
 
@@ -144,7 +145,7 @@ def test_applying_to_a_head_without_animation(head, own, other):
     apply_motion(head, retimed(other), Placement(3, "other"))
     for index in range(4):
         expected = mesh(own, other.frame(index))
-        np.testing.assert_allclose(at_frame(head, 3 + index), expected, atol=TOLERANCE)
+        assert_allclose(at_frame(head, 3 + index), expected, atol=TOLERANCE)
     assert np.abs(expected - sequence_mesh(other, 3)).max() > 1e-3
     keys = head.data.shape_keys.animation_data
     action = keys.action
@@ -192,8 +193,8 @@ def test_sampled_motion_equals_the_keyframes(head, own):
         for name in FIELDS:
             found = getattr(read.frame(index), name)
             wanted = getattr(frame, name)
-            np.testing.assert_allclose(found, wanted, atol=2e-6)
-    np.testing.assert_allclose(read.shape, own.shape)
+            assert_allclose(found, wanted, atol=2e-6)
+    assert_allclose(read.shape, own.shape)
     assert said == []
     assert bpy.context.scene.frame_current == 3
     key = head.shape_key_add(name="sculpted", from_mix=False)
@@ -227,7 +228,7 @@ def test_sampled_motion_includes_edits_by_hand(head, own):
     for key in keys_off:
         key.mute = True
     expected = flame_forward(flat, read.shape, read.frame(0), own.static_offset)
-    np.testing.assert_allclose(at_frame(head, 1), expected, atol=1e-5)
+    assert_allclose(at_frame(head, 1), expected, atol=1e-5)
 
 
 def test_tracked_offsets(own, other, tmp_path):
@@ -238,8 +239,8 @@ def test_tracked_offsets(own, other, tmp_path):
     read = sample_motion(head, tracked, range(1, 5), warn=said.append)
     for index, timestep in enumerate(tracked.timesteps):
         expected = sequence_mesh(tracked, timestep)
-        np.testing.assert_allclose(sequence_mesh(read, index), expected, atol=1e-5)
+        assert_allclose(sequence_mesh(read, index), expected, atol=1e-5)
     assert said == []
     for as_strip in (False, True):
         apply_motion(head, retimed(other), Placement(2, "other", as_strip=as_strip))
-        np.testing.assert_allclose(at_frame(head, 3), mesh(tracked, other.frame(1)), atol=TOLERANCE)
+        assert_allclose(at_frame(head, 3), mesh(tracked, other.frame(1)), atol=TOLERANCE)

@@ -3,18 +3,17 @@ between Blenders with and without them."""
 
 import shutil
 import sys
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from types import ModuleType
 
 import bpy
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 from stga_addon.avatar.embedding import to_world
 from stga_addon.avatar.file import write_avatar
-from stga_addon.avatar.splats import SH_C0, Splats
+from stga_addon.avatar.splats import SH_C0
 from stga_addon.capture.color import linear_to_srgb
 from stga_addon.flame.quaternions import to_matrices
 from stga_addon.flame.sequence import neutral_mesh
@@ -40,7 +39,7 @@ COMMANDS = [[sys.executable], *([*command, *OPTIONS] for command in BLENDERS)]
 
 
 @pytest.mark.parametrize("command", COMMANDS, ids=lambda command: Path(command[0]).name)
-def test_native_splats_are_those_of_the_posed_avatar(command: list[str], tmp_path: Path) -> None:
+def test_native_splats_are_those_of_the_posed_avatar(command, tmp_path):
     """Catches an attribute that is missing, or named or activated in another way than Blender reads
     it: sizes as logarithms or without their factor, opacities as logits or dropped, splats that do
     not move with the mesh, harmonics in another order or turned with triangles, and colors without
@@ -60,9 +59,9 @@ def test_native_splats_are_those_of_the_posed_avatar(command: list[str], tmp_pat
     left = {name for name in found if name.startswith("recorded/stga")}
     assert not left or found["recorded/type"] == ""
     wanted = to_world(splats, avatar.frames(posed))
-    np.testing.assert_allclose(found["recorded/position"], wanted.xyz, atol=1e-5)
+    assert_allclose(found["recorded/position"], wanted.xyz, atol=1e-5)
     assert same_rotation(found["recorded/rotation"], wanted.rotation) < 1e-3
-    np.testing.assert_allclose(found["recorded/scale"], 1.5 * np.exp(wanted.log_scale), rtol=1e-3)
+    assert_allclose(found["recorded/scale"], 1.5 * np.exp(wanted.log_scale), rtol=1e-3)
     fitted = np.random.default_rng(1).uniform(-1, 1, (400, 4))
     opacity = 1 / (1 + np.exp(-np.stack([splats.opacity.astype(np.float64), fitted[:, 3]])))
     driven = wanted.sh[:, 0] - splats.sh[:, 0]  # by the deformation
@@ -74,19 +73,19 @@ def test_native_splats_are_those_of_the_posed_avatar(command: list[str], tmp_pat
     for case, base in bases.items():
         # from black to a little above white
         expected = np.clip(np.broadcast_to(base, (400, 3)), -0.5 / SH_C0, 0.62 / SH_C0)
-        np.testing.assert_allclose(found[f"{case}/radiance:base"][:, :3], expected, atol=5e-5)
+        assert_allclose(found[f"{case}/radiance:base"][:, :3], expected, atol=5e-5)
         alpha = opacity[int(case in ("fitted", "relit"))]  # which comes after it
-        np.testing.assert_allclose(found[f"{case}/radiance:base"][:, 3], alpha, atol=1e-6)
+        assert_allclose(found[f"{case}/radiance:base"][:, 3], alpha, atol=1e-6)
         names = [name for name in found if name.startswith(f"{case}/radiance:sh_")]
         assert sorted(names) == sorted(f"{case}/radiance:sh_{index}" for index in range(15))
         for index in range(15):
             coefficient = (
                 wanted.sh[:, index + 1] if case in ("recorded", "fitted") else 0 * wanted.sh[:, 0]
             )
-            np.testing.assert_allclose(found[f"{case}/radiance:sh_{index}"], coefficient, atol=1e-6)
+            assert_allclose(found[f"{case}/radiance:sh_{index}"], coefficient, atol=1e-6)
 
 
-def covariance(splats: Splats) -> np.ndarray:
+def covariance(splats):
     """(N, 3, 3), which does not tell one order and sign of the axes from another."""
     axes = to_matrices(splats.rotation.astype(np.float64))
     axes = axes * np.exp(splats.log_scale.astype(np.float64))[:, None]
@@ -94,7 +93,7 @@ def covariance(splats: Splats) -> np.ndarray:
 
 
 @pytest.mark.skipif(not compat.NATIVE_SPLATS, reason="Blender before 5.3 has no native splats")
-def test_native_splats_follow_bones_shape_keys_and_strain(tmp_path: Path) -> None:
+def test_native_splats_follow_bones_shape_keys_and_strain(tmp_path):
     """Catches nodes that are exact on a mesh given as such, and not on an evaluated rig."""
     sequence = flame_sequence(flame_model(300))
     head = import_head(motion_capture(sequence, tmp_path / "motion.npz"))
@@ -132,23 +131,23 @@ def test_native_splats_follow_bones_shape_keys_and_strain(tmp_path: Path) -> Non
             for each in bpy.context.evaluated_depsgraph_get().object_instances
             if each.object.type == "POINTCLOUD"
         ]
-        np.testing.assert_allclose(cloud.xyz, wanted.xyz, atol=1e-5)
+        assert_allclose(cloud.xyz, wanted.xyz, atol=1e-5)
         size = np.exp(wanted.log_scale).max(1)[:, None, None]
         found, expected = (covariance(each) / size**2 for each in (cloud, wanted))
-        np.testing.assert_allclose(found, expected, atol=1e-5)
-        np.testing.assert_allclose(cloud.log_scale, wanted.log_scale, atol=1e-5)
+        assert_allclose(found, expected, atol=1e-5)
+        assert_allclose(cloud.log_scale, wanted.log_scale, atol=1e-5)
         base = np.clip(wanted.sh[:, 0], MIN_BASE, MAX_BASE)
-        np.testing.assert_allclose(SH_C0 * cloud.sh[:, 0], SH_C0 * base, atol=1e-5)
-        np.testing.assert_allclose(cloud.opacities(), wanted.opacities(), atol=1e-5)
+        assert_allclose(SH_C0 * cloud.sh[:, 0], SH_C0 * base, atol=1e-5)
+        assert_allclose(cloud.opacities(), wanted.opacities(), atol=1e-5)
 
 
 @pytest.fixture
-def pretend(extension: ModuleType, monkeypatch: pytest.MonkeyPatch) -> Callable[[bool], None]:
+def pretend(extension, monkeypatch):
     """Makes this Blender one that has native splats, which stay points where it has none, or one
     that has not."""
     known = extension.stga_addon.scene.compat
 
-    def change(is_native: bool) -> None:
+    def change(is_native):
         monkeypatch.setattr(known, "NATIVE_SPLATS", is_native)
         if not compat.NATIVE_SPLATS:
             monkeypatch.setattr(known, "native_splats", lambda tree, points, left_out: points)
@@ -159,7 +158,7 @@ def pretend(extension: ModuleType, monkeypatch: pytest.MonkeyPatch) -> Callable[
 @pytest.mark.parametrize("shows_again", [False, True])
 def test_a_file_from_before_native_splats_can_show_them(
     extension, head, pretend, tmp_path, shows_again
-) -> None:
+):
     """Catches a menu that lacks the mode that the panel offers, also after Show Avatar, and
     settings lost with the old node tree."""
     splat_object = extension.stga_addon.scene.display.splat_object
@@ -187,7 +186,7 @@ def test_a_file_from_before_native_splats_can_show_them(
     assert not compat.NATIVE_SPLATS or data.type == "GAUSSIAN_SPLAT"
 
 
-def test_world_splats_of_an_older_file_can_be_native(extension, pretend, tmp_path) -> None:
+def test_world_splats_of_an_older_file_can_be_native(extension, pretend, tmp_path):
     """Catches splats without a head that keep a tree without native splats."""
     splat_object = extension.stga_addon.scene.display.splat_object
     splats = driven_avatar("stga", count=20).splats
@@ -198,9 +197,7 @@ def test_world_splats_of_an_older_file_can_be_native(extension, pretend, tmp_pat
     assert splat_object.display_mode(shown) == NATIVE
 
 
-def test_native_splats_become_quads_in_an_older_blender(
-    extension, head, pretend, tmp_path, capsys
-) -> None:
+def test_native_splats_become_quads_in_an_older_blender(extension, head, pretend, tmp_path, capsys):
     """Catches a file from a newer Blender that shows nothing, and no sentence that says why."""
     splat_object = extension.stga_addon.scene.display.splat_object
     write_ball_avatar(tmp_path / "a.npz")
@@ -228,9 +225,7 @@ def test_native_splats_become_quads_in_an_older_blender(
 
 
 @pytest.mark.parametrize("is_written_by_newer", [False, True])
-def test_files_between_blenders_with_and_without_native_splats(
-    tmp_path: Path, is_written_by_newer: bool
-) -> None:
+def test_files_between_blenders_with_and_without_native_splats(tmp_path, is_written_by_newer):
     """Catches what other versions store of modifiers and nodes in another way than is simulated
     above."""
     others = ("5.2", "this") if compat.NATIVE_SPLATS else ("this", "5.3")

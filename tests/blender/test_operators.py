@@ -6,19 +6,17 @@ import time
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
 
 import bpy
 import numpy as np
 import pytest
 from capture.factory import ball, write_flame_capture, write_mesh_capture
 from export.web.web_data import read_web_data
+from numpy.testing import assert_allclose, assert_array_equal
 
 from stga_addon.avatar.embedding import to_world
 from stga_addon.avatar.file import Avatar, write_avatar
 from stga_addon.avatar.lattice import lattice_splats
-from stga_addon.avatar.splats import Splats
-from stga_addon.capture.model import Capture
 from stga_addon.capture.open import open_capture
 from stga_addon.export.formats import export_avatar
 from stga_addon.export.ply import read_ply, write_ply
@@ -51,12 +49,12 @@ dialog."""
 
 
 @pytest.fixture
-def mesh_capture(tmp_path) -> Path:
+def mesh_capture(tmp_path):
     return write_mesh_capture(tmp_path / "capture")
 
 
 @pytest.fixture
-def shown(mesh_capture, tmp_path) -> tuple[Capture, Avatar]:
+def shown(mesh_capture, tmp_path):
     """A mesh capture whose head is in the scene with the avatar of avatar.npz."""
     bpy.ops.stga.import_capture(directory=str(mesh_capture))
     avatar = write_ball_avatar(tmp_path / "avatar.npz")
@@ -64,7 +62,7 @@ def shown(mesh_capture, tmp_path) -> tuple[Capture, Avatar]:
     return open_capture(mesh_capture), avatar
 
 
-def write_ball_avatar(path: Path, neutral: np.ndarray | None = None, **options: Any) -> Avatar:
+def write_ball_avatar(path, neutral=None, **options):
     """An avatar of the captures' ball, or of a mesh of its triangles, off the lattice."""
     vertices, faces = ball()
     vertices = vertices if neutral is None else neutral
@@ -77,11 +75,11 @@ def write_ball_avatar(path: Path, neutral: np.ndarray | None = None, **options: 
     return avatar
 
 
-def expected_world(avatar: Avatar, vertices: np.ndarray) -> Splats:
+def expected_world(avatar, vertices):
     return to_world(avatar.splats, avatar.frames(vertices))
 
 
-def operators() -> set[str]:
+def operators():
     # bpy.ops answers for any name; only a registered operator has a type
     return {name for name in dir(bpy.types) if name.startswith("STGA_OT_")}
 
@@ -159,7 +157,7 @@ def test_from_import_to_show(tmp_path, layout):
     assert not rule[1].any() or layout == "flame"
     for timestep, selected in rule.items():
         expected = closure(selected, capture.faces) & selected.any()
-        np.testing.assert_array_equal(written[timestep], expected)
+        assert_array_equal(written[timestep], expected)
     avatar = write_ball_avatar(tmp_path / "avatar.npz")
     bpy.ops.stga.show_avatar(filepath=str(tmp_path / "avatar.npz"))
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "head.blend"))
@@ -170,9 +168,9 @@ def test_from_import_to_show(tmp_path, layout):
     for timestep in (3, 0, 1):
         scene.frame_set(timestep)
         mesh = capture.mesh(timestep)
-        np.testing.assert_allclose(evaluated_vertices(scene.stga.head), mesh, atol=2e-6)
+        assert_allclose(evaluated_vertices(scene.stga.head), mesh, atol=2e-6)
         xyz, _, _ = evaluated_splats(scene.stga.splats)
-        np.testing.assert_allclose(xyz, expected_world(avatar, mesh).xyz, atol=1e-5)
+        assert_allclose(xyz, expected_world(avatar, mesh).xyz, atol=1e-5)
 
 
 def test_exports(shown, tmp_path):
@@ -198,10 +196,10 @@ def test_exports(shown, tmp_path):
     assert positions.GetTimeSamples() == [0, 1, 2, 3]
     for frame in capture.timesteps:
         expected = expected_world(avatar, capture.mesh(frame)).xyz
-        np.testing.assert_allclose(positions.Get(frame), expected, atol=1e-5)
+        assert_allclose(positions.Get(frame), expected, atol=1e-5)
         many = read_ply(tmp_path / f"many/{frame:05d}.ply").xyz
-        np.testing.assert_allclose(many, expected, atol=1e-5)
-    np.testing.assert_array_equal(read_ply(tmp_path / "one.ply").xyz, many)
+        assert_allclose(many, expected, atol=1e-5)
+    assert_array_equal(read_ply(tmp_path / "one.ply").xyz, many)
     with pytest.raises(RuntimeError, match="not tracked with FLAME"):
         bpy.ops.stga.export_avatar(filepath=str(tmp_path / "pair"), format="gaussian-avatars")
     bpy.context.scene.frame_start = 1
@@ -209,15 +207,15 @@ def test_exports(shown, tmp_path):
     header, arrays = read_web_data((tmp_path / "a.glb").read_bytes())
     assert len(arrays["translation"]) == 3
     centers = [capture.mesh(timestep).mean(0) for timestep in (1, 3)]
-    np.testing.assert_allclose(arrays["translation"][[0, 2]], centers, atol=1e-5)
+    assert_allclose(arrays["translation"][[0, 2]], centers, atol=1e-5)
     up = np.array(bpy.context.scene.stga.head.matrix_world.to_3x3()) @ header["up"]
-    np.testing.assert_allclose(up, [0, 0, 1], atol=1e-5)
+    assert_allclose(up, [0, 0, 1], atol=1e-5)
 
 
 class RangeExport:
     """A range that is exported as the dialog does, event by event."""
 
-    def __init__(self, extension, write, frames: range) -> None:
+    def __init__(self, extension, write, frames):
         operator = extension.operators.export.ExportAvatar
         objects = extension.stga_addon.scene.objects
         view = objects.SceneView(bpy.context)
@@ -227,20 +225,20 @@ class RangeExport:
         self.dialog.report = self.dialog.tell = lambda kind, text: self.said.append(text)
         self._modal = operator.modal
 
-        def read() -> np.ndarray:
+        def read():
             return extension.operators.export.evaluated_vertices(head.get())
 
         steps = operator.export(self.dialog, view, read, Path(), frames, write)
         self.dialog._steps = extension.operators.common.Steps(steps, 1.0)
 
-    def event(self, kind: str = "TIMER") -> str:
+    def event(self, kind="TIMER"):
         value = "PRESS" if kind == "ESC" else "NOTHING"
         event = SimpleNamespace(type=kind, value=value)
         (result,) = self._modal(self.dialog, bpy.context, event)
         time.sleep(0.001)
         return result
 
-    def until(self, is_over=lambda: False) -> str:
+    def until(self, is_over=lambda: False):
         """Timer events until the export ends, or `is_over`."""
         result = "RUNNING_MODAL"
         while result == "RUNNING_MODAL" and not is_over():
@@ -248,11 +246,11 @@ class RangeExport:
         return result
 
 
-def export_threads() -> list[threading.Thread]:
+def export_threads():
     return [each for each in threading.enumerate() if each.name.startswith("stga export")]
 
 
-def wait_for_threads() -> None:
+def wait_for_threads():
     """Threads of exports end by themselves, soon."""
     deadline = time.monotonic() + 20
     while export_threads() and time.monotonic() < deadline:
@@ -260,7 +258,7 @@ def wait_for_threads() -> None:
     assert not export_threads()
 
 
-def frames_to(folder: Path, avatar: Avatar, events: list[str] | None = None):
+def frames_to(folder, avatar, events=None):
     """A write of a sequence into a folder, which notes the frames that it has been given."""
 
     def write(meshes):
@@ -289,8 +287,8 @@ def test_a_range_is_exported_step_by_step(extension, shown, tmp_path):
     files = sorted((tmp_path / "whole").glob("*.ply"))
     assert [path.name for path in files] == [f"{frame:05d}.ply" for frame in range(4)]
     expected = expected_world(avatar, capture.mesh(3)).xyz
-    np.testing.assert_allclose(read_ply(files[3]).xyz, expected, atol=1e-5)
-    given: list[str] = []
+    assert_allclose(read_ply(files[3]).xyz, expected, atol=1e-5)
+    given = []
     cut = RangeExport(extension, frames_to(tmp_path / "cut", avatar, given), range(40))
     assert cut.until(lambda: "frame 2" in given) == "RUNNING_MODAL"
     result = cut.event("ESC")
@@ -308,7 +306,7 @@ def test_an_export_always_ends(extension, shown, tmp_path, monkeypatch, end):
     """Catches a thread that keeps Blender from quitting, and partial files, where an export ends
     early: its head is deleted, in another window too, an unexpected error, a file that is opened,
     or the extension disabled; and an error told as a traceback."""
-    given: list[str] = []
+    given = []
     running = RangeExport(extension, frames_to(tmp_path / "out", shown[1], given), range(40))
     assert running.until(lambda: "frame 2" in given) == "RUNNING_MODAL"
     if end == "no head":
@@ -345,7 +343,7 @@ def test_undo_and_new_names_do_not_end_an_export(extension, shown, tmp_path):
     bpy.context.scene.stga.head.name = "Anna"
     assert (running.until(), running.said) == ("FINISHED", ["Exported to ."])
     expected = expected_world(avatar, capture.mesh(3)).xyz
-    np.testing.assert_allclose(read_ply(tmp_path / "out/00003.ply").xyz, expected, atol=1e-5)
+    assert_allclose(read_ply(tmp_path / "out/00003.ply").xyz, expected, atol=1e-5)
 
 
 @pytest.mark.parametrize("is_named", [False, True])
@@ -390,7 +388,7 @@ def test_import_ply(tmp_path):
         shown = bpy.context.scene.stga.splats
         bpy.context.view_layer.update()
         turned = np.array(shown.matrix_world)[:3, :3] @ axis
-        np.testing.assert_allclose(turned, (0, 0, 1), atol=1e-6)
+        assert_allclose(turned, (0, 0, 1), atol=1e-6)
         assert len(evaluated_splats(shown)[0]) == len(splats)
 
 

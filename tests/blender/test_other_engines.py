@@ -1,16 +1,15 @@
 """Images of splats by EEVEE and Cycles, against the CPU rasterizer's."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import bpy
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 from PIL import Image
 
 from stga_addon.avatar.embedding import WORLD
 from stga_addon.avatar.splats import SH_C0, Splats
-from stga_addon.capture.camera import Camera
 from stga_addon.capture.color import linear_to_srgb, srgb_to_linear
 from stga_addon.errors import StgaError
 from stga_addon.light.relight import Relighter
@@ -43,7 +42,7 @@ EEVEE_MARKS = (
 )
 
 
-def overlapping_splats() -> Splats:
+def overlapping_splats():
     """Translucent splats of two colors, which tell the order in which they are blended."""
     rng = np.random.default_rng(0)
     count = 400
@@ -61,7 +60,7 @@ def overlapping_splats() -> Splats:
     )
 
 
-def blended_in_linear_light(splats: Splats, view: Camera) -> np.ndarray:
+def blended_in_linear_light(splats, view):
     """(3, H, W) sRGB over black as both engines blend: rasterized with linear colors."""
     linear = srgb_to_linear(np.clip(0.5 + SH_C0 * splats.sh.astype(np.float64), 0, 1))
     splats = replace(splats, sh=((linear - 0.5) / SH_C0).astype(np.float32))
@@ -70,7 +69,7 @@ def blended_in_linear_light(splats: Splats, view: Camera) -> np.ndarray:
 
 
 @pytest.mark.parametrize("engine", [pytest.param(EEVEE, marks=EEVEE_MARKS), "CYCLES"])
-def test_images_without_noise(engine: str, tmp_path: Path) -> None:
+def test_images_without_noise(engine, tmp_path):
     """Catches splats out of order, black holes behind the eighth, and noisy transparency."""
     scene = bpy.context.scene
     splats = overlapping_splats()
@@ -117,7 +116,7 @@ def test_images_of_recorded_light_say_so(extension, tmp_path, capsys):
     scene.frame_start = 5
     scene.frame_end = 7
 
-    def said(**how: bool) -> str:
+    def said(**how):
         bpy.ops.render.render(**how)
         return capsys.readouterr().out
 
@@ -141,7 +140,7 @@ def test_images_of_recorded_light_say_so(extension, tmp_path, capsys):
     assert cast not in said()
 
 
-def test_relit_color_of_a_frame(lighting) -> None:
+def test_relit_color_of_a_frame(lighting):
     """Catches relit colors that do not reach the nodes, or stay when taken back."""
     avatar = with_light(textured(avatar_of("stga")))
     shown, _ = show(avatar)
@@ -155,7 +154,7 @@ def test_relit_color_of_a_frame(lighting) -> None:
     (layer,) = visible_layers(bpy.context.evaluated_depsgraph_get(), SplatCache())
     eye = layer.eye_in_avatar(np.array(camera.matrix_world)[:3, 3])
     relit = Relighter(avatar).radiance(layer.relit.mesh, eye, layer.relit.lighting)
-    np.testing.assert_allclose(displayed_colors(shown), np.maximum(relit, 0), atol=2e-3)
+    assert_allclose(displayed_colors(shown), np.maximum(relit, 0), atol=2e-3)
     assert np.abs(displayed_colors(shown) - before).mean() > 0.05
     assert forget_frame(shown)
-    np.testing.assert_array_equal(displayed_colors(shown), before)
+    assert_array_equal(displayed_colors(shown), before)

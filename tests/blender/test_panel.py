@@ -45,7 +45,7 @@ def trained(extension, head, tmp_path, monkeypatch):
     return run
 
 
-def draw(extension, name: str = "") -> list[str]:
+def draw(extension, name=""):
     """Draw the panels with `name` in their identifiers; the texts on them."""
     context = SimpleNamespace(
         scene=bpy.context.scene,
@@ -145,8 +145,8 @@ AHEAD = {"seconds": 100.0, "psnr": 34.0, "error": 0.5, "ahead": 20.0, "gain": 0.
 OTHERS = {"ssim": 0.9, "splats": 1, "evaluation_s": 1.0, "wall_s": 1.0}
 
 
-def lines(count: int = 6, forecast: bool = True) -> list[dict[str, object]]:
-    made: list[dict[str, object]] = [
+def lines(count=6, forecast=True):
+    made = [
         {"iteration": 10 * row, "seconds": float(SECONDS[row]), "psnr": float(PSNR[row]), **OTHERS}
         for row in range(count)
     ]
@@ -202,7 +202,7 @@ def test_preview_follows_the_evaluations(extension, tmp_path):
         )
     )
 
-    def draw() -> list[str]:
+    def draw():
         """Read evaluations as the training monitor does, and draw; the texts below."""
         drawn.clear()
         monitor.curves[tmp_path] = monitor._read_curve(tmp_path, None)

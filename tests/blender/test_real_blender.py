@@ -10,7 +10,6 @@ import time
 import tomllib
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -41,7 +40,7 @@ MAX_DIFFERENCE_DB = 0.3
 TIMEOUT_S = 1800.0
 
 
-def offline() -> list[str]:
+def offline():
     """A prefix of commands that leaves them no network but the machine itself."""
     inside = ["sh", "-c", 'ip link set lo up; exec "$@"', "sh"]
     prefixes = (["unshare", "-n", *inside], ["unshare", "-rn", *inside], [])
@@ -52,7 +51,7 @@ def offline() -> list[str]:
     )
 
 
-def complete_zip(command: list[str], out: Path, demo: Path) -> Path:
+def complete_zip(command, out, demo):
     """The complete edition for a Blender, in `out`; skips where wheels cannot be had."""
     target = replace(target_of(command), cuda=True)
     try:
@@ -63,9 +62,7 @@ def complete_zip(command: list[str], out: Path, demo: Path) -> Path:
     return build_zip(out, edition=complete(target), demo=demo, kernels=kernels)
 
 
-def blender(
-    command: list[str], home: Path, *arguments: object, background: bool = True, **variables: str
-) -> None:
+def blender(command, home, *arguments, background=True, **variables):
     """Run a Blender in a home folder of its own, without a network; with environment variables."""
     others = ("PYTHON", "BLENDER", "STGA", "NUMBA")
     kept = {name: value for name, value in os.environ.items() if not name.startswith(others)}
@@ -74,13 +71,13 @@ def blender(
     output_of(full, cwd=ROOT, **how)
 
 
-def install(command: list[str], home: Path, archive: Path) -> None:
+def install(command, home, archive):
     """Install the zip of an edition, and enable it."""
     extension = ("--command", "extension", "install-file", "--repo", "user_default", "--enable")
     blender(command, home, *extension, archive)
 
 
-def files_of(home: Path) -> set[str]:
+def files_of(home):
     """All files in a home folder but those that Blender itself writes."""
     caches = ".cache/blender", ".cache/mesa_shader_cache", ".cache/openbox"
     own = *caches, ".config/blender", ".local"
@@ -94,7 +91,7 @@ def files_of(home: Path) -> set[str]:
 
 
 @pytest.fixture(scope="module")
-def home(demo: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def home(demo, tmp_path_factory):
     """A home folder in which every Blender has an old version of the complete edition."""
     folder = tmp_path_factory.mktemp("real")
     home = folder / "home"
@@ -108,18 +105,18 @@ def home(demo: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return home
 
 
-def script(command: list[str], home: Path, wait: bool, iterations: int) -> dict[str, Any]:
+def script(command, home, wait, iterations):
     """What complete_script.py saw."""
     result = home.parent / "result.json"
     arguments = (result, int(wait), f"iterations={iterations}")
     blender(command, home, "--python-exit-code", 1, "--python", SCRIPT, "--", *arguments)
-    seen: dict[str, Any] = json.loads(result.read_text())
+    seen = json.loads(result.read_text())
     print(seen)
     return seen
 
 
 @pytest.mark.parametrize("command", BLENDERS, ids=name_of)
-def test_train(command: list[str], home: Path, demo: Path, tmp_path: Path) -> None:
+def test_train(command, home, demo, tmp_path):
     """Catches a missing wheel, a worker that needs a Python or network, and worse avatars."""
     seen = script(command, home, True, ITERATIONS)
     settings = make_settings("global", iterations=ITERATIONS)
@@ -132,7 +129,7 @@ def test_train(command: list[str], home: Path, demo: Path, tmp_path: Path) -> No
 
 
 @pytest.mark.parametrize("command", BLENDERS, ids=name_of)
-def test_update_while_a_worker_trains(command: list[str], home: Path) -> None:
+def test_update_while_a_worker_trains(command, home):
     """Catches an update that fails, ends a training, or disturbs another Blender."""
     seen = script(command, home, False, UPDATE_ITERATIONS)
     run = Path(seen["run"])
@@ -153,7 +150,7 @@ def test_update_while_a_worker_trains(command: list[str], home: Path) -> None:
     assert other_profiles(home, seen["version"]) == others
 
 
-def test_uninstall(home: Path) -> None:
+def test_uninstall(home):
     """Catches files that uninstalling leaves, and one that disturbs another Blender's extension."""
     for command in BLENDERS:
         version = output_of([*command, "--version"], cwd=ROOT).split()[1]
@@ -163,11 +160,11 @@ def test_uninstall(home: Path) -> None:
     assert {name for name in files_of(home) if not name.startswith("STGA Demo/run")} == set()
 
 
-def short(version: str) -> str:
+def short(version):
     return ".".join(version.split(".")[:2])
 
 
-def other_profiles(home: Path, version: str) -> dict[str, int]:
+def other_profiles(home, version):
     """Files of other Blender versions' extensions, and when they were changed."""
     profiles = [path for path in home.glob(".config/blender/*") if path.name != short(version)]
     files = [path for profile in profiles for path in (profile / "extensions").rglob("*")]

@@ -7,13 +7,13 @@ import os
 import sys
 import tempfile
 from dataclasses import replace
-from pathlib import Path
 
 import av
 import bpy
 import numpy as np
 import pytest
 from capture.factory import write_mesh_capture
+from numpy.testing import assert_allclose, assert_array_equal
 from PIL import Image
 
 from stga_addon.avatar.file import write_avatar
@@ -59,7 +59,7 @@ def temporary(tmp_path, monkeypatch):
     assert not list(folder.glob("stga_video_*"))
 
 
-def engine_image(frame: int, path: Path) -> np.ndarray:
+def engine_image(frame, path):
     """The frame as the render engine writes it, (H, W, 4) uint8."""
     scene = bpy.context.scene
     scene.render.engine = "STGA_SPLATS"
@@ -71,7 +71,7 @@ def engine_image(frame: int, path: Path) -> np.ndarray:
     return np.asarray(Image.open(path)).astype(int)
 
 
-def around_each_image(extension, monkeypatch, before, after) -> None:
+def around_each_image(extension, monkeypatch, before, after):
     """Call `before()` and `after()` around the recording of every image."""
     operator = extension.operators.render_video.RenderVideo
     own = operator.record
@@ -103,7 +103,7 @@ def test_image_sequence_of_the_scene(extension, shown, monkeypatch):
     posed = extension.operators.render_video.PosedSplats
     counts = []
 
-    def count() -> None:
+    def count():
         gc.collect()
         # Not isinstance, which raises for a weak proxy whose object has gone.
         counts.append(sum(type(each) is posed for each in gc.get_objects()))
@@ -120,7 +120,7 @@ def test_image_sequence_of_the_scene(extension, shown, monkeypatch):
     assert 0 < max(counts) <= 2
     for frame, path in enumerate(written):
         image = np.asarray(Image.open(path)).astype(int)
-        np.testing.assert_array_equal(image, np.asarray(Image.open(shown / "beside" / path.name)))
+        assert_array_equal(image, np.asarray(Image.open(shown / "beside" / path.name)))
         expected = engine_image(frame, shown / "engine.png")
         opaque = (expected[..., 3] > 250) & (image[..., 3] > 250)
         assert opaque.mean() > 0.1
@@ -145,7 +145,7 @@ def test_undo_and_a_removed_scene_meanwhile(extension, shown, monkeypatch, tempo
     bpy.context.scene.stga.head.location.x = 5
     bpy.ops.ed.undo_push(message="moved")
 
-    def undo() -> None:
+    def undo():
         if bpy.context.scene.stga.head.location.x:
             bpy.ops.ed.undo()
             bpy.context.scene.name = "renamed"
@@ -158,7 +158,7 @@ def test_undo_and_a_removed_scene_meanwhile(extension, shown, monkeypatch, tempo
     assert bpy.context.scene.frame_current == 1
     other = bpy.data.scenes.new("other")
 
-    def remove() -> None:
+    def remove():
         if "renamed" in bpy.data.scenes:
             bpy.context.window_manager.windows[0].scene = other
             bpy.data.scenes.remove(bpy.data.scenes["renamed"])
@@ -213,10 +213,10 @@ def test_failures_leave_no_job(extension, shown, monkeypatch):
     """Catches a traceback, a late refusal, a recording on a full disk, and a job left behind."""
     operator = extension.operators.render_video
 
-    def full(*_: object) -> None:
+    def full(*_):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
-    def fails(sentence: str, name: str = "turn", **options: object) -> None:
+    def fails(sentence, name="turn", **options):
         with pytest.raises(RuntimeError, match=sentence):
             bpy.ops.stga.render_video(filepath=str(shown / name), **options)
         assert bpy.context.scene.frame_current == 1
@@ -253,15 +253,15 @@ CAMERA = Camera(63, 48, 50.0, 50.0, 31.5, 24.0, np.eye(4))
 
 
 @pytest.mark.parametrize(("channels", "mode"), [(3, "RGB"), (4, "RGBA")])
-def test_png(channels: int, mode: str) -> None:
+def test_png(channels, mode):
     """Catches rows, channels or checksums that other readers take for something else."""
     pixels = np.random.default_rng(0).integers(0, 256, (7, 5, channels), np.uint8)
     with Image.open(io.BytesIO(png_bytes(pixels))) as image:
         assert image.mode == mode
-        np.testing.assert_array_equal(np.asarray(image), pixels)
+        assert_array_equal(np.asarray(image), pixels)
 
 
-def drawn(monkeypatch: pytest.MonkeyPatch, video: DrawnVideo, shades: list[float]) -> None:
+def drawn(monkeypatch, video, shades):
     for shade in shades:
         rgb = np.full((3, CAMERA.height, CAMERA.width), shade, np.float32)
         picture = ComposedImage(rgb, np.ones((CAMERA.height, CAMERA.width), np.float32), None)
@@ -270,7 +270,7 @@ def drawn(monkeypatch: pytest.MonkeyPatch, video: DrawnVideo, shades: list[float
 
 
 @pytest.mark.slow
-def test_video_without_a_training_python(monkeypatch, tmp_path) -> None:
+def test_video_without_a_training_python(monkeypatch, tmp_path):
     """Catches colors, an order, a size or a rate in the video that is not the images'."""
     scenes = len(bpy.data.scenes)
     (tmp_path / "drawn").mkdir()
@@ -286,11 +286,11 @@ def test_video_without_a_training_python(monkeypatch, tmp_path) -> None:
             for frame in container.decode(stream)
         ]
         assert (stream.width, stream.height) == (64, 48)
-    np.testing.assert_allclose(means, shades, atol=0.03)
+    assert_allclose(means, shades, atol=0.03)
     assert len(bpy.data.scenes) == scenes
 
 
-def test_images_without_a_training_python(monkeypatch, tmp_path) -> None:
+def test_images_without_a_training_python(monkeypatch, tmp_path):
     """Catches images that are not written, a folder that takes a sequence only once, and a GPU that
     fails without a sentence."""
     out = tmp_path / "out"
@@ -302,7 +302,7 @@ def test_images_without_a_training_python(monkeypatch, tmp_path) -> None:
         drawn(monkeypatch, video, shades)
         video.encode(24.0)
         means = [np.asarray(Image.open(path)).mean() / 255 for path in sorted(out.glob("*.png"))]
-        np.testing.assert_allclose(means, shades, atol=0.01)
+        assert_allclose(means, shades, atol=0.01)
     monkeypatch.setattr(drawn_video, "draw_image", lambda *_: None)
     with pytest.raises(StgaError, match="no GPU context"):
         video.add([], CAMERA)

@@ -6,8 +6,6 @@ import json
 import os
 import threading
 import tomllib
-from collections.abc import Iterator
-from pathlib import Path
 
 import pytest
 
@@ -24,14 +22,14 @@ pytestmark = pytest.mark.skipif(
 
 
 @pytest.fixture(scope="module")
-def zips(zip_file: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+def zips(zip_file, tmp_path_factory):
     """The built zip, after one that says that it is older."""
     old = tmp_path_factory.mktemp("old") / f"stga-{OLD_VERSION}.zip"
     return with_version(zip_file, OLD_VERSION, old), zip_file
 
 
 @pytest.fixture
-def served(tmp_path: Path) -> Iterator[tuple[Path, str]]:
+def served(tmp_path):
     """A folder on loopback, and its address."""
     folder = tmp_path / "served"
     folder.mkdir()
@@ -42,7 +40,7 @@ def served(tmp_path: Path) -> Iterator[tuple[Path, str]]:
         server.shutdown()
 
 
-def extension(blender: list[str], profile: Path, *arguments: str) -> str:
+def extension(blender, profile, *arguments):
     command = [*blender, "--background", "--online-mode", "--command", "extension", *arguments]
     variables = {**os.environ, "BLENDER_USER_RESOURCES": str(profile)}
     return output_of(command, cwd=ROOT, env=variables, timeout=600)
@@ -68,7 +66,7 @@ def test_install_and_update(blender, zips, served, tmp_path):
 
 
 @pytest.mark.parametrize("blender", BLENDERS[:1], ids=name_of)
-def test_index_and_page(blender: list[str], zips: tuple[Path, Path], tmp_path: Path) -> None:
+def test_index_and_page(blender, zips, tmp_path):
     """Catches a page that names other files than the index, and a repository left half-written."""
     _, new = zips
     index = write_repository([new], tmp_path / "repository", blender)

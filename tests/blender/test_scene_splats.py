@@ -19,7 +19,7 @@ class PlainObject:
 
     instance_type = "NONE"
 
-    def get(self, name: str) -> None:
+    def get(self, name):
         assert name == tags.KIND
 
 
@@ -60,7 +60,7 @@ def test_a_selection_is_read_once(monkeypatch):
         vertex_groups, "_read_faces", lambda *given: reads.append(given) or read_faces(*given)
     )
 
-    def frozen() -> np.ndarray | None:
+    def frozen():
         (layer,) = visible_layers(bpy.context.evaluated_depsgraph_get(), cache)
         fresh = vertex_groups.frame_selection(head, scene.frame_current)
         reads.pop() if fresh is not None else None
@@ -68,7 +68,7 @@ def test_a_selection_is_read_once(monkeypatch):
         assert fresh is None or (layer.frozen == ~fresh).all()
         return layer.frozen
 
-    def changed(_: object, depsgraph: object) -> None:
+    def changed(_, depsgraph):
         cache.scene_changed(depsgraph)
 
     bpy.app.handlers.depsgraph_update_post.append(changed)

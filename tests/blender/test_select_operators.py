@@ -3,6 +3,7 @@
 import bpy
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal, assert_equal
 
 from stga_addon.capture.open import open_capture
 from stga_addon.errors import StgaError
@@ -18,13 +19,13 @@ from .test_operators import write_ball_avatar
 pytestmark = pytest.mark.usefixtures("extension")
 
 
-def rows() -> list[tuple[int, int, int]]:
+def rows():
     return [
         (row.frame, row.triangles, row.splats) for row in bpy.context.scene.stga.selected_frames
     ]
 
 
-def paint_chin(head, capture) -> np.ndarray:
+def paint_chin(head, capture):
     """A vertex group of triangles half of which never move: (F,) bool."""
     centres = capture.neutral[capture.faces].mean(1)
     low = np.unique(capture.faces[centres[:, 1] < -0.02])
@@ -44,7 +45,7 @@ def test_regions_that_are_selected_as_a_whole(head, tmp_path):
     for expected in (alone | region, alone):
         bpy.ops.stga.toggle_region(name="chin")
         bpy.ops.stga.select(threshold=0.0005)
-        np.testing.assert_array_equal(read_selection(head)[3], closure(expected, capture.faces))
+        assert_array_equal(read_selection(head)[3], closure(expected, capture.faces))
     bpy.ops.stga.select(threshold=0.0005, regions="chin")
     before = {timestep: faces.tolist() for timestep, faces in read_selection(head).items()}
     assert np.array(before[3])[region].all()
@@ -78,7 +79,7 @@ def test_the_table_counts_what_each_frame_trains(head, tmp_path):
     inside[np.unique(corners[chosen[3]])] = True
     inside[80:120] = True
     inside[:80] = False
-    np.testing.assert_array_equal(painted[3], inside[corners].all(1))
+    assert_array_equal(painted[3], inside[corners].all(1))
     assert painted[3].sum() != chosen[3].sum()
     assert rows() == [
         (t, int(faces.sum()), int(per_face[faces].sum())) for t, faces in painted.items()
@@ -87,13 +88,13 @@ def test_the_table_counts_what_each_frame_trains(head, tmp_path):
     assert rows() == []
 
 
-def materials_of(head) -> set[str]:
+def materials_of(head):
     """The materials that the head's triangles are drawn with."""
     mesh = head.evaluated_get(bpy.context.evaluated_depsgraph_get()).data
     return {mesh.materials[polygon.material_index].name for polygon in mesh.polygons}
 
 
-def heat(head, name: str, kind: str, size: int) -> np.ndarray:
+def heat(head, name, kind, size):
     attribute = head.data.attributes[name].data
     values = np.empty(len(attribute) * size, np.float32)
     attribute.foreach_get(kind, values)
@@ -109,7 +110,7 @@ def test_heat_map(head, tmp_path):
     bpy.ops.stga.heat_map()
     bpy.ops.stga.select(threshold=0.0015)
     expected = np.mean(list(read_selection(head).values()), axis=0)
-    np.testing.assert_allclose(heat(head, SHARE, "value", 1), expected, atol=1e-6)
+    assert_allclose(heat(head, SHARE, "value", 1), expected, atol=1e-6)
     assert head.data.color_attributes.active_color.name == HEAT
     color = heat(head, HEAT, "color", 4).reshape(-1, 3, 4)
     assert (color == color[:, :1]).all(), "a triangle's corners differ"
@@ -155,7 +156,7 @@ def test_only_selection_groups_change(tmp_path):
     own.data.foreach_set("value", np.arange(len(mesh.loops), dtype=np.float32))
     write_selection(head, {1: np.ones(len(mesh.polygons), bool)})
 
-    def state() -> dict[str, np.ndarray]:
+    def state():
         found = {key.name: read_values(key.data, "co", 3) for key in keys}
         found |= {"": read_values(mesh.vertices, "co", 3), "shown": evaluated_vertices(head)}
         found["edges"] = read_values(mesh.edges, "vertices", 2, np.int32)
@@ -177,7 +178,7 @@ def test_edit_mode_and_wrong_sizes_are_refused(tmp_path):
     write_selection(head, dict(zip(capture.timesteps, chosen, strict=True)))
     before = read_selection(head)
     for selected, found in zip(chosen, before.values(), strict=True):
-        np.testing.assert_array_equal(found, closure(selected, capture.faces))
+        assert_array_equal(found, closure(selected, capture.faces))
     write_selection(head, before)
     with pytest.raises(StgaError, match=r"timestep 3 has shape \(5,\)"):
         write_selection(head, {2: np.ones(len(capture.faces), bool), 3: np.ones(5, bool)})
@@ -186,4 +187,4 @@ def test_edit_mode_and_wrong_sizes_are_refused(tmp_path):
     with pytest.raises(StgaError, match="edit mode"):
         write_selection(head, {})
     bpy.ops.object.mode_set(mode="OBJECT")
-    np.testing.assert_equal(read_selection(head), before)
+    assert_equal(read_selection(head), before)

@@ -1,7 +1,6 @@
 """Which head the result of a request reaches, and by which splat object an avatar is shown."""
 
 import re
-from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 
@@ -32,7 +31,7 @@ from .test_operators import expected_world, write_ball_avatar
 from .test_train_operators import tick_until
 
 
-def splat_objects() -> list[object]:
+def splat_objects():
     return [thing for thing in bpy.data.objects if thing.get(tags.KIND) == tags.SPLATS]
 
 
@@ -50,7 +49,7 @@ def ben(head, tmp_path):
     return arrive
 
 
-def end(worker, iterations: float = 5000, cancel: bool = False, **options: object) -> Path:
+def end(worker, iterations=5000, cancel=False, **options):
     """Let the worker end with an avatar."""
     if cancel:
         bpy.ops.stga.cancel(request="training")
@@ -153,7 +152,7 @@ def test_a_run_that_was_cancelled_early_replaces_nothing(
     assert ("Show Avatar shows the new one" in error) == is_kept
 
 
-def identifiers(modifier) -> dict[str, str]:
+def identifiers(modifier):
     names = splat_nodes.DISPLAY, splat_nodes.SIZE, splat_nodes.SELECTED_ONLY
     return {name: input_identifier(modifier, name) for name in names}
 
@@ -221,7 +220,7 @@ def test_a_world_is_shown_in_the_scene_of_its_training(extension, worker, head):
 def test_a_head_hidden_by_its_splats_is_still_moved(extension, head, tmp_path):
     """Catches a head that stands still, in exports, once its splats are disabled or deleted."""
 
-    def moves() -> bool:
+    def moves():
         shapes = []
         for frame in (0, 1):
             bpy.context.scene.frame_set(frame)
@@ -243,7 +242,7 @@ def test_a_head_hidden_by_its_splats_is_still_moved(extension, head, tmp_path):
     assert moves()
 
 
-def saved_head(folder: Path) -> Path:
+def saved_head(folder):
     """A file with a head and its splats, whose run lies beside it."""
     run = folder / "run"
     run.mkdir()
@@ -254,10 +253,10 @@ def saved_head(folder: Path) -> Path:
     return folder / "head.blend"
 
 
-def bring(file: Path, how: str) -> None:
+def bring(file, how):
     name = bpy.context.scene.stga.head.parent.name
     bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
-    operator: Callable[..., object] = bpy.ops.wm.append if how == "append" else bpy.ops.wm.link
+    operator = bpy.ops.wm.append if how == "append" else bpy.ops.wm.link
     within = f"{file}/Collection/"
     more = {"instance_collections": how == "instance"}
     operator(filepath=within + name, directory=within, filename=name, **more)

@@ -7,6 +7,7 @@ import bpy
 import mathutils
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
 from stga_addon.avatar.embedding import CONVENTIONS, face_areas, to_world
 from stga_addon.avatar.file import Avatar
@@ -34,7 +35,7 @@ from stga_addon.scene.display.splat_object import (
 FRAMES = (1, 5, 9)
 
 
-def sphere(rings: int = 12, segments: int = 16) -> tuple[np.ndarray, np.ndarray]:
+def sphere(rings=12, segments=16):
     """Head-sized triangles (V, 3), (F, 3) off the origin, from random first corners."""
     rng = np.random.default_rng(0)
     around = np.linspace(0, 2 * np.pi, segments, endpoint=False)
@@ -50,7 +51,7 @@ def sphere(rings: int = 12, segments: int = 16) -> tuple[np.ndarray, np.ndarray]
     return 0.1 * ball.reshape(-1, 3) + [0.3, 1.0, 0.2], faces.astype(np.int32)
 
 
-def random_splats(faces: int, count: int, degree: int = 1, extent: float = 0.01) -> Splats:
+def random_splats(faces, count, degree=1, extent=0.01):
     rng = np.random.default_rng(1)
     return Splats(
         xyz=rng.normal(0, extent, (count, 3)).astype(np.float32),
@@ -63,7 +64,7 @@ def random_splats(faces: int, count: int, degree: int = 1, extent: float = 0.01)
     )
 
 
-def animated_head(neutral: np.ndarray, faces: np.ndarray):
+def animated_head(neutral, faces):
     """Mesh object under a turned parent; two shape keys move it over FRAMES."""
     rng = np.random.default_rng(2)
     mesh = bpy.data.meshes.new("head")
@@ -85,27 +86,27 @@ def animated_head(neutral: np.ndarray, faces: np.ndarray):
     return head
 
 
-def avatar_of(convention: str, count: int = 3000, **grid: int) -> Avatar:
+def avatar_of(convention, count=3000, **grid):
     neutral, faces = sphere(**grid)
     extent = 0.01 if convention == "stga" else 0.8
     splats = random_splats(len(faces), count, extent=extent)
     return Avatar(splats, convention, neutral.astype(np.float32), faces)
 
 
-def same_rotation(a: np.ndarray, b: np.ndarray) -> float:
+def same_rotation(a, b):
     """Largest angle in radians between two sets of quaternions, whose signs mean nothing."""
     a, b = (q / np.linalg.norm(q, axis=-1, keepdims=True) for q in (a, b))
     sign = np.sign(np.sum(a * b, axis=-1, keepdims=True))
     return float(2 * np.linalg.norm(a - sign * b, axis=-1).max())
 
 
-def assert_follows(shown, head, avatar: Avatar) -> np.ndarray:
+def assert_follows(shown, head, avatar):
     """The evaluated splats against `to_world` on the head; their positions."""
     expected = to_world(avatar.splats, avatar.frames(evaluated_vertices(head)))
     xyz, rotation, scale = evaluated_splats(shown)
     assert np.abs(xyz - expected.xyz).max() < 1e-5
     assert same_rotation(rotation, expected.rotation) < 1e-3
-    np.testing.assert_allclose(scale, np.exp(expected.log_scale), rtol=2e-3)
+    assert_allclose(scale, np.exp(expected.log_scale), rtol=2e-3)
     return xyz
 
 
@@ -117,7 +118,7 @@ def test_splats_follow_the_animated_head(convention, tmp_path):
     head.location = (0.1, 0.2, 0.3)
     shown = show_avatar(avatar, head)
     bpy.context.view_layer.update()
-    np.testing.assert_allclose(shown.matrix_world, head.matrix_world, atol=1e-6)
+    assert_allclose(shown.matrix_world, head.matrix_world, atol=1e-6)
     at = {}
     for frame in FRAMES:
         bpy.context.scene.frame_set(frame)
@@ -129,10 +130,10 @@ def test_splats_follow_the_animated_head(convention, tmp_path):
     head = bpy.data.objects["head"]
     for frame in reversed(FRAMES):
         bpy.context.scene.frame_set(frame)
-        np.testing.assert_allclose(assert_follows(shown, head, avatar), at[frame], atol=1e-6)
+        assert_allclose(assert_follows(shown, head, avatar), at[frame], atol=1e-6)
 
 
-def displayed_colors(shown) -> np.ndarray:
+def displayed_colors(shown):
     """(N, 3) scene-linear colors of the splats as points."""
     set_input(shown, splat_nodes.DISPLAY, POINTS)
     depsgraph = bpy.context.evaluated_depsgraph_get()
@@ -143,7 +144,7 @@ def displayed_colors(shown) -> np.ndarray:
     return color.reshape(-1, 4)[:, :3]
 
 
-def linear(srgb: np.ndarray) -> np.ndarray:
+def linear(srgb):
     srgb = np.clip(srgb, 0, 1)
     return np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
 
@@ -179,15 +180,13 @@ def test_colors_follow_the_active_camera(degree):
     for row, (x, y, z) in zip(basis, direction.astype(np.float32), strict=True):
         row[:] = harmonics.basis(x, y, z)
     seen = 0.5 + np.einsum("nk,nkc->nc", basis[:, : sh.shape[1]], sh)
-    np.testing.assert_allclose(displayed_colors(shown), linear(seen), atol=2e-4)
+    assert_allclose(displayed_colors(shown), linear(seen), atol=2e-4)
     assert np.abs(displayed_colors(shown) - before).max() > 0.1
     set_input(shown, splat_nodes.VIEW_DEPENDENT, False)
-    np.testing.assert_allclose(displayed_colors(shown), linear(0.5 + SH_C0 * sh[:, 0]), atol=2e-6)
+    assert_allclose(displayed_colors(shown), linear(0.5 + SH_C0 * sh[:, 0]), atol=2e-6)
 
 
-def driven_avatar(
-    convention: str, names: tuple[str, ...] = tuple(OFFSETS), seed: int = 6, count: int = 1500
-) -> Avatar:
+def driven_avatar(convention, names=tuple(OFFSETS), seed=6, count=1500):
     """Splats that follow the deformation, on a mesh with boundaries, an edge of three triangles and
     a line for a triangle.
 
@@ -241,15 +240,15 @@ def test_splats_follow_the_deformation(convention, names, tmp_path):
     stored = stored_avatar(shown)
     assert set(stored.driven_offsets) == set(names)
     assert stored.antialiased == avatar.antialiased == is_all
-    np.testing.assert_array_equal(stored.strain_range, avatar.strain_range)
+    assert_array_equal(stored.strain_range, avatar.strain_range)
     set_input(shown, splat_nodes.DISPLAY, POINTS)
     unmoved = replace(avatar, driven_offsets={})
     for frame in FRAMES:
         bpy.context.scene.frame_set(frame)
         posed = evaluated_vertices(head)
         frames, plain, again = (each.frames(posed) for each in (avatar, unmoved, stored))
-        np.testing.assert_array_equal(again.origin, frames.origin)
-        np.testing.assert_array_equal(again.color, frames.color)
+        assert_array_equal(again.origin, frames.origin)
+        assert_array_equal(again.color, frames.color)
         moved = np.median(np.linalg.norm(frames.origin - plain.origin, axis=1))
         assert moved > 3e-4 if "strain_position" in names else moved == 0
         assert np.abs(frames.deformation[:, :3]).max() > 0.5
@@ -257,13 +256,13 @@ def test_splats_follow_the_deformation(convention, names, tmp_path):
         assert 0.2 < clipped.mean() < 0.8
         assert_follows(shown, head, avatar)
         expected = 0.5 + SH_C0 * to_world(avatar.splats, frames).sh[:, 0]
-        np.testing.assert_allclose(displayed_colors(shown), linear(expected), atol=1e-3)
+        assert_allclose(displayed_colors(shown), linear(expected), atol=1e-3)
     bpy.context.scene.frame_set(FRAMES[0])
     head.shape_key_clear()
     assert np.abs(at_rest(avatar.strain_range)).max() > 0.2
     assert_follows(shown, head, unmoved)
     expected = linear(0.5 + SH_C0 * avatar.splats.sh[:, 0])
-    np.testing.assert_allclose(displayed_colors(shown), expected, atol=1e-4)
+    assert_allclose(displayed_colors(shown), expected, atol=1e-4)
 
 
 def test_updated_splats_follow_strain_anew():
@@ -278,7 +277,7 @@ def test_updated_splats_follow_strain_anew():
     update_splats(shown, avatar_attributes(second))
     assert_follows(shown, head, second)
     stored = stored_avatar(shown).driven_offsets["strain_position"]
-    np.testing.assert_array_equal(stored, second.driven_offsets["strain_position"])
+    assert_array_equal(stored, second.driven_offsets["strain_position"])
     assert not can_update(shown, replace(second, driven_offsets={}))
     assert not can_update(shown, driven_avatar("stga"))
     set_input(shown, splat_nodes.NEUTRAL, None)
@@ -291,12 +290,12 @@ def test_world_splats():
     splats = replace(random_splats(1, 300, degree=0), sh=sh)
     shown = show_world_splats(splats, "scan")
     xyz, rotation, scale = evaluated_splats(shown)
-    np.testing.assert_allclose(xyz, splats.xyz, atol=1e-7)
+    assert_allclose(xyz, splats.xyz, atol=1e-7)
     assert same_rotation(rotation, splats.rotation) < 1e-3
-    np.testing.assert_allclose(scale, np.exp(splats.log_scale), rtol=1e-5)
+    assert_allclose(scale, np.exp(splats.log_scale), rtol=1e-5)
     expected = linear(0.5 + SH_C0 * splats.sh[:, 0])
     assert (expected.min(), expected.max()) == (0, 1)
-    np.testing.assert_allclose(displayed_colors(shown), expected, atol=2e-6)
+    assert_allclose(displayed_colors(shown), expected, atol=2e-6)
 
 
 def test_names_of_trees_are_told_apart():
@@ -351,14 +350,14 @@ def test_quads_face_the_camera_and_cover_the_splat():
     quads = np.array(quads, np.float64)
     to_world = np.array(shown.matrix_world, np.float64)
     placed = centre @ to_world[:3, :3].T + to_world[:3, 3]
-    np.testing.assert_allclose(quads[:, :3, 3], placed, atol=1e-5)
+    assert_allclose(quads[:, :3, 3], placed, atol=1e-5)
     # In the quad's own space each splat is a sphere, and the camera right above its center.
     eye = (np.linalg.inv(quads) @ [*camera.location, 1.0])[:, :3]
     assert (eye[:, 2] / np.linalg.norm(eye, axis=-1)).min() > 1 - 1e-4
     turned = np.array([mathutils.Quaternion(each).to_matrix() for each in rotation], np.float64)
     axes = to_world[:3, :3] @ turned * 2 * scale[:, None]
     shapes = [m @ m.transpose(0, 2, 1) for m in (quads[:, :3, :3], axes)]
-    np.testing.assert_allclose(shapes[0], shapes[1], rtol=2e-3, atol=1e-10)
+    assert_allclose(shapes[0], shapes[1], rtol=2e-3, atol=1e-10)
     assert EXTENT == 3.0
 
 
@@ -372,12 +371,12 @@ def test_selection_grays_out_frozen_splats():
     shown = show_avatar(avatar, head)
     set_input(shown, splat_nodes.SHOW_SELECTION, True)
 
-    def grays() -> np.ndarray:
+    def grays():
         return np.isclose(displayed_colors(shown), splat_nodes.FROZEN_COLOR[:3]).all(1)
 
     bpy.context.scene.frame_set(5)
     assert 0 < selected.sum() < 1000
-    np.testing.assert_array_equal(grays(), ~selected)
+    assert_array_equal(grays(), ~selected)
     bpy.context.scene.frame_set(6)
     assert not grays().any()
     bpy.context.scene.frame_set(5)

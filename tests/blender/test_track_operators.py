@@ -9,6 +9,7 @@ import pytest
 from capture.factory import ball, write_flame_capture, write_mesh_capture
 from flame.small_head import small_head
 from mathutils import Quaternion
+from numpy.testing import assert_allclose
 from tracking.test_head_model import blender_head
 
 from stga_addon.jobs.perform import perform_in_folder
@@ -79,12 +80,12 @@ def test_the_whole_way_of_the_panel(extension, take, tmp_path, monkeypatch):
     posed = evaluated_vertices(head).astype(float)
     assert np.abs(posed - before[1]).max() > 0.003
     bpy.ops.stga.mark_key()
-    np.testing.assert_allclose(mesh_at(4), before[4], atol=1e-6)  # a key is of its frame alone
-    np.testing.assert_allclose(mesh_at(1), posed, atol=2e-5)
+    assert_allclose(mesh_at(4), before[4], atol=1e-6)  # a key is of its frame alone
+    assert_allclose(mesh_at(1), posed, atol=2e-5)
 
     bpy.ops.stga.solve_again()
     head = settings.head
-    np.testing.assert_allclose(mesh_at(1), posed, atol=5e-5)
+    assert_allclose(mesh_at(1), posed, atol=5e-5)
     assert np.abs(mesh_at(2) - before[2]).max() > 1e-4  # without landmarks: it follows
     assert np.abs(mesh_at(2) - before[2]).max() < np.abs(posed - before[1]).max()
     assert list(extension.operators.track.tracking_keys(head)) == [1]
@@ -93,7 +94,7 @@ def test_the_whole_way_of_the_panel(extension, take, tmp_path, monkeypatch):
     bpy.ops.stga.mark_key()
     bpy.ops.stga.solve_again()
     for frame in range(5):
-        np.testing.assert_allclose(mesh_at(frame), before[frame], atol=2e-6)
+        assert_allclose(mesh_at(frame), before[frame], atol=2e-6)
 
     bpy.ops.stga.dismiss(request="tracking")
     assert not (tracked / "job").exists()
@@ -108,7 +109,7 @@ def test_exported_shape_keys_as_head_model(extension, take, tmp_path):
     assert bpy.ops.stga.export_head_model.poll()
     bpy.ops.stga.export_head_model(filepath=str(tmp_path / "exported.npz"))
     found = read_head_model(tmp_path / "exported.npz").model
-    np.testing.assert_allclose(found.v_template, model.v_template, atol=1e-6)
+    assert_allclose(found.v_template, model.v_template, atol=1e-6)
     assert track(take, tmp_path / "capture", model=str(tmp_path / "exported.npz")) == {"FINISHED"}
     assert list(bpy.context.scene.stga.head[tags.TIMESTEPS]) == [0, 1, 2, 3, 4]
 
@@ -164,7 +165,7 @@ def test_the_head_is_shown_while_it_is_tracked(extension, tmp_path):
         (head,) = set(bpy.data.objects) - before
         found = np.array([head.matrix_world @ vertex.co for vertex in head.data.vertices])
         expected = size * vertices @ np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0]])
-        np.testing.assert_allclose(found, expected, atol=1e-6)
+        assert_allclose(found, expected, atol=1e-6)
     assert scene.objects["Cube"].hide_render
     name = head.name
     bpy.ops.stga.import_capture(directory=str(capture))

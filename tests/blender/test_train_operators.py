@@ -2,7 +2,6 @@
 
 import sys
 import time
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -27,7 +26,7 @@ def head(head):
     return head
 
 
-def ask_only(monkeypatch, extension) -> list:
+def ask_only(monkeypatch, extension):
     """Let the operators that train do nothing but ask; what they ask."""
     asked = []
     monkeypatch.setattr(extension.operators.train, "missing_packages", list)
@@ -37,7 +36,7 @@ def ask_only(monkeypatch, extension) -> list:
     return asked
 
 
-def tick_until(monitor, done: Callable[[], bool]) -> None:
+def tick_until(monitor, done):
     for _ in range(200):
         monitor.tick()
         if done():

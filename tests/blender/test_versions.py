@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from capture.factory import ball, write_flame_capture
+from numpy.testing import assert_allclose
 
 from stga_addon.avatar.embedding import to_world
 from stga_addon.avatar.file import Avatar, read_avatar, write_avatar
@@ -34,7 +35,7 @@ VERSIONS = {"this": None} | {
 }
 
 
-def python_of(version: str) -> str:
+def python_of(version):
     variable = VERSIONS[version]
     python = sys.executable if variable is None else os.environ.get(variable)
     if not python:
@@ -48,7 +49,7 @@ def python_of(version: str) -> str:
     ["this", *(pytest.param(v, marks=pytest.mark.nightly) for v in VERSIONS if v != "this")],
 )
 @pytest.mark.usefixtures("zip_file")  # whose wheels are needed
-def test_the_whole_workflow(version: str, kernel_bundle: tuple[Path, str], tmp_path: Path) -> None:
+def test_the_whole_workflow(version, kernel_bundle, tmp_path):
     """Catches what works in the checkout, or in one Blender, and not in the zip, or in another."""
     python = python_of(version)
     folder, model = write_flame_capture(tmp_path / "capture")
@@ -79,7 +80,6 @@ def test_the_whole_workflow(version: str, kernel_bundle: tuple[Path, str], tmp_p
     if result["can train"] or TRAINING_PYTHON:
         assert result["trained"] == len(read_avatar(tmp_path / "run/avatar.npz").splats)
     own = capture.flame
-    assert own is not None
     pair = read_motion(tmp_path / "pair/flame_param.npz", own.model)
     for row in range(5):
         pose = other["pose"][row]
@@ -88,13 +88,13 @@ def test_the_whole_workflow(version: str, kernel_bundle: tuple[Path, str], tmp_p
         mesh = flame_forward(own.model, own.shape, frame, own.static_offset)
         expected = to_world(avatar.splats, avatar.frames(mesh)).xyz
         written = read_ply(tmp_path / f"plys/{1 + row:05d}.ply").xyz
-        np.testing.assert_allclose(written, expected, atol=1e-5)
-        np.testing.assert_allclose(pair.frame(row).pose, frame.pose, atol=1e-5)
+        assert_allclose(written, expected, atol=1e-5)
+        assert_allclose(pair.frame(row).pose, frame.pose, atol=1e-5)
         if 1 + row == result["frame"]:
-            np.testing.assert_allclose(np.reshape(result["shown"], (-1, 3)), expected, atol=1e-5)
+            assert_allclose(np.reshape(result["shown"], (-1, 3)), expected, atol=1e-5)
 
 
-def run(python: str, archive: Path, folder: Path) -> dict[str, object]:
+def run(python, archive, folder):
     """What `workflow.py` reports, from a fresh Blender profile."""
     kept = {name: value for name, value in os.environ.items() if not name.startswith("NUMBA_")}
     environment = kept | {"BLENDER_USER_RESOURCES": str(folder / "profile")}

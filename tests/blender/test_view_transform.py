@@ -1,7 +1,6 @@
 """The engine's colors through view transforms, inverses of several of which are kept."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import bpy
 import numpy as np
@@ -17,7 +16,7 @@ from .test_engine import HEIGHT, WIDTH, _engine  # noqa: F401
 from .test_splat_object import active_camera, random_splats
 
 
-def scene_with(view: str, exposure: float = 0.0):
+def scene_with(view, exposure=0.0):
     scene = bpy.data.scenes.new(view)
     scene.view_settings.view_transform = view
     scene.view_settings.exposure = exposure
@@ -31,7 +30,6 @@ def test_scenes_with_different_view_transforms():
         measure(scene)
     gray = np.full((1, 3), 0.5)
     agx, brighter = (inverse_view(scene) for scene in scenes)
-    assert agx is not None
     assert np.abs(agx.show(agx.to_linear(gray)) - gray).max() < 0.01
     # sRGB's curve turns 0.5 into 0.214, of which an exposure of one stop leaves half.
     assert brighter.to_linear(gray) == pytest.approx(0.107, abs=0.002)
@@ -42,7 +40,6 @@ def test_scenes_with_different_view_transforms():
     skin = np.clip(skin, 0, 1)
     measure(scene)
     agx = inverse_view(scene)
-    assert agx is not None
     difference = 255 * np.abs(agx.show(agx.to_linear(skin)) - skin)
     assert difference.mean() < 0.5  # 0.41; levels of 8 bits
     assert np.percentile(difference, 99) < 6  # 4.6
@@ -66,7 +63,7 @@ def test_an_animated_exposure_keeps_a_few(monkeypatch):
     assert inverse_view(animated) is not None
 
 
-def sheet(color: np.ndarray | None = None) -> None:
+def sheet(color=None):
     """A sheet of soft splats of one color, else of mid-tones of skin, in front of the camera."""
     rng = np.random.default_rng(8)
     count = 600
@@ -84,7 +81,7 @@ def sheet(color: np.ndarray | None = None) -> None:
     active_camera((0, 0, 1))
 
 
-def saved_picture(folder: Path, **view: object) -> np.ndarray:
+def saved_picture(folder, **view):
     """(H, W, 4) 0 to 255 of a render that Blender saves through these settings."""
     scene = bpy.context.scene
     scene.view_settings.look = "None"

@@ -19,7 +19,7 @@ import bpy
 MODULE = "bl_ext.user_default.stga"
 
 
-def main(archive: str, folder: Path, python: str) -> dict[str, object]:
+def main(archive, folder, python):
     bpy.ops.extensions.package_install_files(
         filepath=archive, repo="user_default", enable_on_install=True
     )
@@ -76,11 +76,11 @@ def main(archive: str, folder: Path, python: str) -> dict[str, object]:
     }
 
 
-def can_train() -> bool:
+def can_train():
     return all(map(importlib.util.find_spec, ("torch", "numba", "scipy", "PIL", "platformdirs")))
 
 
-def positions() -> list[float]:
+def positions():
     """Of the splats that are displayed, in the capture's coordinates."""
     bpy.context.scene.frame_set(4)
     splat_object = importlib.import_module(MODULE + ".stga_addon.scene.display.splat_object")

@@ -5,9 +5,6 @@ import os
 import shlex
 import subprocess
 import zipfile
-from collections.abc import Sequence
-from pathlib import Path
-from typing import Any
 
 from stga_addon import __version__
 
@@ -18,11 +15,11 @@ BLENDERS = [
 OLD_VERSION = "0.1.9"
 
 
-def name_of(command: list[str]) -> str:
+def name_of(command):
     return "-".join(command[-2:])
 
 
-def with_version(archive: Path, version: str, out: Path) -> Path:
+def with_version(archive, version, out):
     """Copy a built zip to the path `out`, with another version in its manifest."""
     own, other = (f'version = "{each}"'.encode() for each in (__version__, version))
     with zipfile.ZipFile(archive) as source, zipfile.ZipFile(out, "w") as made:
@@ -33,14 +30,14 @@ def with_version(archive: Path, version: str, out: Path) -> Path:
     return out
 
 
-def output_of(command: Sequence[object], **options: Any) -> str:
+def output_of(command, **options):
     """What a program prints, which must not fail."""
     done = subprocess.run([*map(str, command)], capture_output=True, text=True, **options)
     assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-3000:]
     return done.stdout
 
 
-def result_of(command: Sequence[object], **options: Any) -> Any:
+def result_of(command, **options):
     """The JSON after RESULT of what a program prints."""
     lines = output_of(command, **options).splitlines()
     line = next(line for line in lines if line.startswith("RESULT "))

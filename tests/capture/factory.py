@@ -1,9 +1,6 @@
 """Tiny captures written to disk by the tests: a ball of 10 cm seen by cameras around it."""
 
 import json
-from collections.abc import Callable, Sequence
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import trimesh
@@ -12,7 +9,6 @@ from PIL import Image
 
 from stga_addon.avatar.file import Avatar, write_avatar
 from stga_addon.avatar.lattice import lattice_splats
-from stga_addon.capture.model import Capture
 
 WIDTH = 40
 HEIGHT = 60
@@ -24,13 +20,13 @@ RADIUS = 0.1
 SPLITS = ("train", "val", "test")
 
 
-def ball() -> tuple[np.ndarray, np.ndarray]:
+def ball():
     """(162, 3) vertices and (320, 3) triangles."""
     sphere = trimesh.creation.icosphere(2, RADIUS)
     return np.array(sphere.vertices), np.array(sphere.faces)
 
 
-def pose(camera: int) -> np.ndarray:
+def pose(camera):
     """Camera-to-world, OpenGL axes, one meter from the ball and looking at it."""
     angle = 0.4 * camera - 0.5
     cos = np.cos(angle)
@@ -38,25 +34,25 @@ def pose(camera: int) -> np.ndarray:
     return np.array([[cos, 0, sin, sin], [0, 1, 0, 0], [-sin, 0, cos, cos], [0, 0, 0, 1]])
 
 
-def silhouette() -> np.ndarray:
+def silhouette():
     """(HEIGHT, WIDTH) bool: which pixels' rays meet the ball; the same from every camera."""
     rows, columns = np.mgrid[:HEIGHT, :WIDTH] + 0.5
     off_axis = np.hypot(columns - CX, rows - CY)
     return off_axis / np.hypot(off_axis, FOCAL) < RADIUS
 
 
-def picture(timestep: int, camera: int) -> np.ndarray:
+def picture(timestep, camera):
     """(HEIGHT, WIDTH, 3) uint8 on white, of a color that only this view has."""
     color = np.array([10 * timestep, 10 * camera, 128]).astype(np.uint8)
     return np.where(silhouette()[..., None], color, np.uint8(255))
 
 
-def moved(timestep: int, vertices: np.ndarray) -> np.ndarray:
+def moved(timestep, vertices):
     """The ball's lower part stretched by 1 mm a timestep."""
     return vertices - np.where(vertices[:, 1:2] < -0.06, [[0.0, 0.001 * timestep, 0.0]], 0.0)
 
 
-def frame(timestep: int, camera: int, **more: Any) -> dict[str, Any]:
+def frame(timestep, camera, **more):
     name = f"{timestep:05d}_{camera:02d}.png"
     return {
         "timestep_index": timestep,
@@ -75,7 +71,7 @@ def frame(timestep: int, camera: int, **more: Any) -> dict[str, Any]:
     }
 
 
-def write_images(root: Path, timesteps: Sequence[int], cameras: Sequence[int]) -> None:
+def write_images(root, timesteps, cameras):
     for folder in ("images", "fg_masks"):
         (root / folder).mkdir(parents=True, exist_ok=True)
     for timestep in timesteps:
@@ -85,7 +81,7 @@ def write_images(root: Path, timesteps: Sequence[int], cameras: Sequence[int]) -
             Image.fromarray(silhouette().astype(np.uint8) * 255).save(root / "fg_masks" / name)
 
 
-def write_splits(root: Path, frames: list[dict[str, Any]], **shared: Any) -> None:
+def write_splits(root, frames, **shared):
     """The last camera is `val`, the last timestep `test`, all else `train`."""
     last_camera = max(f["camera_index"] for f in frames)
     last_timestep = max(f["timestep_index"] for f in frames)
@@ -113,7 +109,7 @@ def write_mesh_capture(root, timesteps=(0, 1, 3), cameras=(0, 1, 2), suffix=".ob
     return root
 
 
-def write_mesh(path: Path, vertices: np.ndarray, faces: np.ndarray) -> None:
+def write_mesh(path, vertices, faces):
     if path.suffix == ".obj":
         points = "".join(f"v {x:.9f} {y:.9f} {z:.9f}\n" for x, y, z in vertices)
         path.write_text(points + "".join(f"f {a} {b} {c}\n" for a, b, c in faces + 1))
@@ -121,7 +117,7 @@ def write_mesh(path: Path, vertices: np.ndarray, faces: np.ndarray) -> None:
         trimesh.Trimesh(vertices, faces, process=False).export(path)
 
 
-def write_flame_model(path: Path, seed: int = 0) -> Path:
+def write_flame_model(path, seed=0):
     """A model file in FLAME's format with the ball as template, four identity and two expression
     components."""
     random = default_rng(seed)
@@ -145,7 +141,7 @@ def write_flame_model(path: Path, seed: int = 0) -> Path:
     return path
 
 
-def flame_parameters(timestep: int) -> dict[str, np.ndarray]:
+def flame_parameters(timestep):
     """One timestep's file as VHAP writes it, with a leading 1."""
     random = default_rng(100 + timestep)
     vertices = len(ball()[0])
@@ -193,7 +189,7 @@ def write_release(root, timesteps=(0, 1), cameras=(0, 1)):
     return root
 
 
-def write_avatar_of(capture: Capture, path: Path, is_colored: bool = False, **lattice: Any) -> Path:
+def write_avatar_of(capture, path, is_colored=False, **lattice):
     """An avatar of a capture's head; is_colored: each splat has a color of its own."""
     splats = lattice_splats(capture.neutral, capture.faces, **{"order": 0, **lattice})
     if is_colored:
@@ -204,7 +200,7 @@ def write_avatar_of(capture: Capture, path: Path, is_colored: bool = False, **la
     return path
 
 
-def edit(path: Path, change: Callable[[dict[str, Any]], object]) -> None:
+def edit(path, change):
     """Change a JSON file in place."""
     document = json.loads(path.read_text())
     change(document)

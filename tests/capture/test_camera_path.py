@@ -2,10 +2,10 @@
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 from stga_addon.capture.camera import (
     UP,
-    Camera,
     central_camera,
     covered_angles,
     look_at,
@@ -17,15 +17,15 @@ from stga_addon.capture.camera import (
 CENTER = np.array([0.1, 0.2, -0.3])
 
 
-def camera(degrees: float, height: float = 0.1) -> Camera:
+def camera(degrees, height=0.1):
     """At one meter from the axis through the center, counterclockwise from +z seen from above."""
     angle = np.radians(degrees)
     eye = CENTER + np.array([np.sin(angle), height, np.cos(angle)])
     return look_at(tuple(eye), tuple(CENTER), 64, 48, 80.0)
 
 
-def assert_same_pose(one: Camera, other: Camera) -> None:
-    np.testing.assert_allclose(one.world_to_camera, other.world_to_camera, atol=1e-12)
+def assert_same_pose(one, other):
+    assert_allclose(one.world_to_camera, other.world_to_camera, atol=1e-12)
 
 
 def test_orbit():
@@ -56,7 +56,7 @@ def test_covered_angles(angles, start, expected):
     """Catches a turntable that shows a side which no camera saw, or leaves out one that they
     did."""
     covered = covered_angles([camera(angle) for angle in angles], camera(start), CENTER)
-    np.testing.assert_allclose(np.degrees(covered), expected, atol=1e-9)
+    assert_allclose(np.degrees(covered), expected, atol=1e-9)
 
 
 def test_central_camera():

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 from PIL import Image, ImageCms
 from refusal import refusal
 
@@ -46,7 +47,7 @@ def chunk(name, data):
     return struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data))
 
 
-def saved(path: Path, pixels: np.ndarray) -> Path:
+def saved(path, pixels):
     Image.fromarray(pixels).save(path)
     return path
 
@@ -57,8 +58,8 @@ def test_transparency_is_laid_over_the_background(tmp_path, background):
     view = view_of(saved(tmp_path / "x.png", np.dstack([COLOUR, ALPHA])))
     share = ALPHA[..., None] / 255
     expected = np.round(COLOUR * share + np.array(background) * (1 - share))
-    np.testing.assert_allclose(read_image(view, background), expected, atol=0.51)
-    np.testing.assert_array_equal(read_mask(view), ALPHA)
+    assert_allclose(read_image(view, background), expected, atol=0.51)
+    assert_array_equal(read_mask(view), ALPHA)
 
 
 def test_gray_and_palette(tmp_path):
@@ -73,13 +74,13 @@ def test_gray_and_palette(tmp_path):
         (la, np.dstack([np.where(bits, GREY, 255)] * 3)),
     ):
         found = read_image(view_of(saved(tmp_path / "x.png", pixels)))
-        np.testing.assert_array_equal(found, expected)
+        assert_array_equal(found, expected)
     image = read_image(view_of(saved(tmp_path / "x.png", wide)))
-    np.testing.assert_allclose(image[..., 0], wide / 257, atol=0.51)
+    assert_allclose(image[..., 0], wide / 257, atol=0.51)
     Image.fromarray(few).quantize(8).save(tmp_path / "p.png")
-    np.testing.assert_array_equal(read_image(view_of(tmp_path / "p.png")), few)
+    assert_array_equal(read_image(view_of(tmp_path / "p.png")), few)
     Image.fromarray(COLOUR).save(tmp_path / "t.png", transparency=tuple(map(int, COLOUR[2, 3])))
-    np.testing.assert_array_equal(read_image(view_of(tmp_path / "t.png"))[2, 3], [255, 255, 255])
+    assert_array_equal(read_image(view_of(tmp_path / "t.png"))[2, 3], [255, 255, 255])
 
 
 def test_size_mismatch_names_both(tmp_path):
@@ -132,17 +133,16 @@ def test_scaled_view(tmp_path):
     assert read_mask(bare) is None
     gray = saved(tmp_path / "m.png", GREY)
     for mask_file in (gray, saved(tmp_path / "c.png", np.dstack([GREY] * 3))):
-        np.testing.assert_array_equal(read_mask(replace(bare, mask=mask_file)), GREY)
+        assert_array_equal(read_mask(replace(bare, mask=mask_file)), GREY)
     view = replace(bare, mask=gray)
     small, image, mask = read_view(view, 0.5)
-    assert mask is not None
     assert image.shape == (small.camera.height, small.camera.width, 3)
-    np.testing.assert_allclose(image.mean((0, 1)), COLOUR.mean((0, 1)), atol=1)
+    assert_allclose(image.mean((0, 1)), COLOUR.mean((0, 1)), atol=1)
     assert mask.shape == image.shape[:2]
     assert small.camera.fl_x == pytest.approx(60 * small.camera.width / WIDTH)
     same, image, mask = read_view(view)
     assert same is view
-    np.testing.assert_array_equal(image, COLOUR)
+    assert_array_equal(image, COLOUR)
 
 
 def corners(image):
@@ -243,9 +243,9 @@ def test_colors_become_srgb(tmp_path, name):
     color, chunks, expected = STORED[name]
     path = tmp_path / "x.png"
     png(path, color, *chunks)
-    np.testing.assert_allclose(read_image(view_of(path))[5, 5], expected, atol=7)
+    assert_allclose(read_image(view_of(path))[5, 5], expected, atol=7)
     if expected == color:
-        np.testing.assert_array_equal(read_image(view_of(path))[5, 5], color)
+        assert_array_equal(read_image(view_of(path))[5, 5], color)
     assert is_plain(path) == (expected == color)
 
 
@@ -254,8 +254,8 @@ def test_profile_beside_transparency_and_in_jpeg(tmp_path):
     out."""
     path = tmp_path / "x.png"
     png(path, (*RED_IN_P3, 128), icc(DISPLAY_P3), mode="RGBA")
-    np.testing.assert_allclose(read_image(view_of(path), (0, 0, 0))[5, 5], (128, 0, 0), atol=4)
+    assert_allclose(read_image(view_of(path), (0, 0, 0))[5, 5], (128, 0, 0), atol=4)
     assert read_mask(view_of(path))[5, 5] == 128
     red = Image.new("RGB", (WIDTH, HEIGHT), RED_IN_P3)
     red.save(tmp_path / "x.jpg", quality=98, icc_profile=DISPLAY_P3)
-    np.testing.assert_allclose(read_image(view_of(tmp_path / "x.jpg"))[5, 5], (255, 0, 0), atol=8)
+    assert_allclose(read_image(view_of(tmp_path / "x.jpg"))[5, 5], (255, 0, 0), atol=8)

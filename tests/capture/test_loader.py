@@ -3,17 +3,15 @@
 import itertools
 import threading
 import time
-from collections.abc import Callable
-from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.testing import assert_array_equal
 from refusal import refusal
 
 from stga_addon.capture import loader as module
 from stga_addon.capture.images import read_view
 from stga_addon.capture.loader import LoaderMemory, ViewLoader
-from stga_addon.capture.model import View
 from stga_addon.capture.open import open_capture
 
 from . import factory
@@ -22,17 +20,17 @@ VIEW_BYTES = factory.WIDTH * factory.HEIGHT * 4  # image and mask
 
 
 @pytest.fixture
-def views(tmp_path: Path) -> list[View]:
+def views(tmp_path):
     capture = open_capture(factory.write_mesh_capture(tmp_path / "capture"))
     return [view for split in capture.views.values() for view in split]
 
 
 @pytest.fixture
-def decoded(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+def decoded(monkeypatch):
     """Names of the views in the order in which they are decoded."""
     names = []
 
-    def counted(view: View, *rest: object) -> object:
+    def counted(view, *rest):
         names.append(view.name)
         return read_view(view, *rest)
 
@@ -40,11 +38,11 @@ def decoded(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     return names
 
 
-def loader_threads() -> int:
+def loader_threads():
     return sum(thread.name == "view loader" for thread in threading.enumerate())
 
 
-def wait_until(condition: Callable[[], bool]) -> None:
+def wait_until(condition):
     deadline = time.monotonic() + 10
     while not condition() and time.monotonic() < deadline:
         time.sleep(0.005)
@@ -60,8 +58,8 @@ def test_order_and_content(views):
     assert [item.view for item in loaded] == order
     for view, image, mask, _ in loaded:
         assert mask is not None
-        np.testing.assert_array_equal(image, factory.picture(view.timestep, view.camera_index))
-        np.testing.assert_array_equal(mask, factory.silhouette() * 255)
+        assert_array_equal(image, factory.picture(view.timestep, view.camera_index))
+        assert_array_equal(mask, factory.silhouette() * 255)
         for array in (image, mask):
             with pytest.raises(ValueError, match="read-only"):
                 array[0] = 0

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import trimesh
 from numpy.random import default_rng
+from numpy.testing import assert_allclose, assert_array_equal
 from refusal import refusal
 from scipy.spatial.transform import Rotation
 from tracking.test_head_model import glb
@@ -39,8 +40,8 @@ def test_order_is_kept(tmp_path, suffix):
     if suffix == ".stl":  # which has no shared vertices
         vertices = vertices[faces].reshape(-1, 3)
         faces = np.arange(faces.size).reshape(-1, 3)
-    np.testing.assert_allclose(read, vertices, atol=1e-7)
-    np.testing.assert_array_equal(triangles, faces)
+    assert_allclose(read, vertices, atol=1e-7)
+    assert_array_equal(triangles, faces)
     assert (read.dtype, triangles.dtype) == (np.float64, np.int32)
 
 
@@ -49,8 +50,8 @@ def test_obj_as_trimesh_reads_it(shared_data):
     path = shared_data / "studio_head/meshes/00003.obj"
     reference = trimesh.load(path, process=False, maintain_order=True)
     vertices, faces = read_mesh(path)
-    np.testing.assert_array_equal(vertices, reference.vertices)
-    np.testing.assert_array_equal(faces, reference.faces)
+    assert_array_equal(vertices, reference.vertices)
+    assert_array_equal(faces, reference.faces)
 
 
 def test_obj_dialects(tmp_path):
@@ -61,12 +62,12 @@ def test_obj_dialects(tmp_path):
     path = tmp_path / "x.obj"
     path.write_bytes("\r\n".join(lines).encode())
     vertices, faces = read_mesh(path)
-    np.testing.assert_array_equal(vertices, [[i, i * i, 0] for i in range(5)])
-    np.testing.assert_array_equal(faces, [[3, 1, 0], [0, 1, 2], [0, 2, 3], [4, 3, 2], [0, 2, 4]])
+    assert_array_equal(vertices, [[i, i * i, 0] for i in range(5)])
+    assert_array_equal(faces, [[3, 1, 0], [0, 1, 2], [0, 2, 3], [4, 3, 2], [0, 2, 4]])
     three = "v 0 0 0\nv 1 0 0\nv 0 1 0\nf -3 -2 -1\n"
     for before, expected in (("", [0, 1, 2]), ("v 2 0 0\n", [1, 2, 3]), ("", [0, 1, 2])):
         path.write_text(before + three)
-        np.testing.assert_array_equal(read_mesh(path)[1], [expected])
+        assert_array_equal(read_mesh(path)[1], [expected])
 
 
 POLYGONS = [(0, 1, 2), (0, 2, 3, 4), (4, 3, 2), (1, 2, 3, 4, 0)]
@@ -74,7 +75,7 @@ TRIANGLES = [(0, 1, 2), (0, 2, 3), (0, 3, 4), (4, 3, 2), (1, 2, 3), (1, 3, 4), (
 SEAM = [0.1, 0.9] * 5  # Texture coordinates of a vertex differ from polygon to polygon
 
 
-def ply_of(kind: str, ending: str, polygons: list[tuple[int, ...]]) -> bytes:
+def ply_of(kind, ending, polygons):
     """A PLY as photogrammetry writes it: a texture's name, an element before the vertices, their
     texture coordinates or colors, triangles mixed with other polygons, and corners' coordinates."""
     lines = ["ply", f"format {kind} 1.0", "comment TextureFile head.png", "obj_info from a scan"]
@@ -110,12 +111,12 @@ def test_ply_dialects(tmp_path, capfd, kind, ending):
     for polygons, triangles in ((POLYGONS, TRIANGLES), (TRIANGLES, TRIANGLES)):
         path.write_bytes(ply_of(kind, ending, polygons))
         vertices, faces = read_mesh(path)
-        np.testing.assert_array_equal(vertices, [[n, n * n, -n] for n in range(5)])
-        np.testing.assert_array_equal(faces, triangles)
+        assert_array_equal(vertices, [[n, n * n, -n] for n in range(5)])
+        assert_array_equal(faces, triangles)
     assert capfd.readouterr() == ("", "")
 
 
-def repeated(nodes: int, primitives: int) -> bytes:
+def repeated(nodes, primitives):
     """A GLB whose mesh of 60 kB is placed by many nodes, or is many times its own part."""
     points = default_rng(0).random((5_000, 3))
     corners = np.arange(4_998)
@@ -184,7 +185,7 @@ def test_topology_must_not_change(tmp_path):
         factory.write_mesh(path, more if path == files[3] else vertices, triangles)
     canonical = tmp_path / "neutral.obj"
     mesh = tracked_meshes(files, len(vertices), faces.astype(np.int32), canonical, read_mesh)
-    np.testing.assert_allclose(mesh(0), vertices, atol=1e-9)
+    assert_allclose(mesh(0), vertices, atol=1e-9)
     for timestep, message in (
         (1, r"1\.obj: has 319 triangles, but .*neutral\.obj has 320"),
         (2, r"2\.obj: triangle 7 joins vertices"),
@@ -234,8 +235,8 @@ def test_procrustes_as_scipy_has_it():
     a = np.average(source, 0, weights)
     b = np.average(target, 0, weights)
     expected, _ = Rotation.align_vectors(target - b, source - a, weights)
-    np.testing.assert_allclose(rotation, expected.as_matrix(), atol=1e-9)
-    np.testing.assert_allclose(rotation @ a + translation, b, atol=1e-12)
+    assert_allclose(rotation, expected.as_matrix(), atol=1e-9)
+    assert_allclose(rotation @ a + translation, b, atol=1e-12)
 
 
 def test_moving_jaw_does_not_drag_the_head():
@@ -246,8 +247,8 @@ def test_moving_jaw_does_not_drag_the_head():
     for turn, moved, atol in (([0.3, -0.5, 0.1], opened, 1e-5), ([0, np.pi, 0], neutral, 1e-9)):
         rotation = Rotation.from_rotvec(turn).as_matrix()
         fitted = without_head_motion(moved @ rotation.T + [0.1, 0.2, -0.3], neutral)
-        np.testing.assert_allclose(fitted, moved, atol=atol)
-    np.testing.assert_allclose(without_head_motion(neutral, neutral), neutral, atol=1e-12)
+        assert_allclose(fitted, moved, atol=atol)
+    assert_allclose(without_head_motion(neutral, neutral), neutral, atol=1e-12)
     plain = weighted_procrustes(opened, neutral, np.ones(len(neutral)))
     assert np.abs(opened @ plain[0].T + plain[1] - opened).max() > 1e-3
 
@@ -255,16 +256,16 @@ def test_moving_jaw_does_not_drag_the_head():
 def test_names_and_files(toy, tmp_path):
     """Catches a region of other triangles than those painted, weights of another mesh taken for
     this one's, and a refinement that would train nothing and say so nowhere."""
-    np.testing.assert_array_equal(find_region(toy, "mouth"), toy.regions["mouth"])
+    assert_array_equal(find_region(toy, "mouth"), toy.regions["mouth"])
     path = tmp_path / "painted.npz"
     weights = np.linspace(0, 1, len(toy.faces))
     write_npz(path, {"weights": weights})
-    np.testing.assert_array_equal(find_region(toy, str(path)), weights >= 0.5)
+    assert_array_equal(find_region(toy, str(path)), weights >= 0.5)
     triangle = toy.faces[7]
     (tmp_path / "regions.json").write_text(json.dumps({"one": triangle.tolist()}))
     found = find_region(toy, str(tmp_path / "regions.json"))
     assert found[7]
-    np.testing.assert_array_equal(found, np.isin(toy.faces, triangle).all(1))
+    assert_array_equal(found, np.isin(toy.faces, triangle).all(1))
     for arrays, sentence in (
         ({"weights": np.ones(3, np.float32)}, r"one number from 0 to 1 .* found float32 \(3,\)"),
         ({"weights": np.ones(3, np.int64)}, "expected 'weights', .*found int64"),
@@ -309,8 +310,8 @@ def test_every_pixel_shows_the_nearest_triangle():
     triangle, weights = rasterize(vertices, faces[in_front], camera)
     expected, expected_weights = by_equations(vertices, faces[in_front], camera)
     assert (expected >= 0).mean() > 0.4
-    np.testing.assert_array_equal(triangle, expected)
-    np.testing.assert_allclose(weights, expected_weights, atol=1e-7)
+    assert_array_equal(triangle, expected)
+    assert_allclose(weights, expected_weights, atol=1e-7)
 
 
 def test_a_closed_mesh_has_no_holes():

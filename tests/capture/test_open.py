@@ -3,13 +3,12 @@
 import json
 import re
 import shutil
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 from PIL import Image
 from refusal import refusal
 
@@ -25,12 +24,12 @@ from stga_addon.training.effects.samples import take_samples
 from . import factory
 
 
-def no_masks(document: dict[str, Any]) -> None:
+def no_masks(document):
     for entry in document["frames"]:
         del entry["fg_mask_path"]
 
 
-def each_split(root: Path, change: Callable[[dict[str, Any]], object]) -> None:
+def each_split(root, change):
     for split in factory.SPLITS:
         factory.edit(root / f"transforms_{split}.json", change)
 
@@ -46,24 +45,24 @@ def test_mesh_capture(tmp_path, suffix):
         ("val", 2),
         ("test", 3),
     ]
-    np.testing.assert_allclose(capture.neutral[capture.faces], vertices[faces], atol=1e-7)
+    assert_allclose(capture.neutral[capture.faces], vertices[faces], atol=1e-7)
     for timestep in capture.timesteps:
         mesh = capture.mesh(timestep)
         moved = factory.moved(timestep, vertices)
-        np.testing.assert_allclose(mesh[capture.faces], moved[faces], atol=1e-7)
+        assert_allclose(mesh[capture.faces], moved[faces], atol=1e-7)
     for view in (view for split in capture.views.values() for view in split):
         expected = factory.picture(view.timestep, view.camera_index)
-        np.testing.assert_array_equal(read_image(view), expected)
-        np.testing.assert_array_equal(read_mask(view), factory.silhouette() * 255)
+        assert_array_equal(read_image(view), expected)
+        assert_array_equal(read_mask(view), factory.silhouette() * 255)
     if suffix == ".stl":
         assert any("STL" in warning for warning in capture.warnings)
     else:
         assert capture.warnings == ()
         expected = (vertices[:, 1] < -0.06)[faces].all(axis=1)
-        np.testing.assert_array_equal(capture.regions["mouth"], expected)
+        assert_array_equal(capture.regions["mouth"], expected)
 
 
-DISTORTED: list[tuple[dict[str, Any], str]] = [
+DISTORTED = [
     ({"camera_model": "OPENCV", "k1": -0.35, "p2": 0.01}, "k1 -0.35, p2 0.01"),
     ({"k3": 9e3}, "k3 9000"),
     ({"p2": 0.1}, "p2 0.1"),
@@ -99,13 +98,13 @@ def test_lenses_that_show_no_distortion(tmp_path, lens):
     assert open_capture(root).warnings == ()
 
 
-def stored_masks(root: Path, store: Callable[[np.ndarray], Any]) -> Path:
+def stored_masks(root, store):
     for path in (root / "fg_masks").iterdir():
         store(np.asarray(Image.open(path)) > 0).save(path)
     return root
 
 
-def paletted(mask: np.ndarray) -> Image.Image:
+def paletted(mask):
     image = Image.fromarray(mask.astype(np.uint8), mode="P")
     image.putpalette([0, 0, 0, 128, 0, 0])
     return image
@@ -127,7 +126,7 @@ def test_masks_of_labels(tmp_path, store, level):
     3 dB are silently lost."""
     capture = open_capture(stored_masks(factory.write_mesh_capture(tmp_path / "capture"), store))
     for view in capture.views["train"]:
-        np.testing.assert_array_equal(read_mask(view), factory.silhouette() * 255)
+        assert_array_equal(read_mask(view), factory.silhouette() * 255)
     warnings = [f"only 0 and {level}, which is read as 255"] if level < 255 else []
     assert len(capture.warnings) == len(warnings)
     assert all(each in found for each, found in zip(warnings, capture.warnings, strict=True))
@@ -140,7 +139,7 @@ def test_masks_of_parts(tmp_path):
     stored_masks(root, lambda _: Image.fromarray(parts))
     capture = open_capture(root)
     assert ["nothing above 9; expected 255" in line for line in capture.warnings] == [True]
-    np.testing.assert_array_equal(read_mask(capture.views["val"][0]), parts)
+    assert_array_equal(read_mask(capture.views["val"][0]), parts)
 
 
 def test_capture_of_a_monocular_tracker(tmp_path):
@@ -159,7 +158,7 @@ def test_capture_of_a_monocular_tracker(tmp_path):
     each_split(root, as_insta)
     capture = open_capture(root)
     assert capture.timesteps == (0, 1, 2)
-    np.testing.assert_allclose(capture.neutral, factory.ball()[0], atol=1e-8)
+    assert_allclose(capture.neutral, factory.ball()[0], atol=1e-8)
     said = "\n".join(capture.warnings)
     for part in (
         "canonical.obj, which lies there",
@@ -209,14 +208,14 @@ def test_flame_capture(tmp_path):
     for timestep in capture.timesteps:
         frame = read_frame(root / f"flame_param/{timestep:05d}.npz", model)
         expected = flame_forward(model, shape, frame, offset)
-        np.testing.assert_allclose(capture.mesh(timestep), expected, atol=1e-12)
+        assert_allclose(capture.mesh(timestep), expected, atol=1e-12)
         still = replace(frame, rotation=np.zeros(3), neck_pose=np.zeros(3), translation=np.zeros(3))
         expected = flame_forward(model, shape, still, offset)
-        np.testing.assert_allclose(capture.expression_mesh(timestep, "head"), expected, atol=1e-12)
+        assert_allclose(capture.expression_mesh(timestep, "head"), expected, atol=1e-12)
     still, whole = (capture.expression_mesh(3, zero_pose) for zero_pose in ("all", "head"))
     assert np.abs(still - whole).max() > 1e-4
     shaped = model.v_template + model.shapedirs[:, :, :4] @ shape + offset
-    np.testing.assert_allclose(capture.neutral, shaped, atol=1e-12)
+    assert_allclose(capture.neutral, shaped, atol=1e-12)
     assert set(capture.regions) == {"nose", "mouth"}
     assert len(capture.faces) == len(model.faces)
 
@@ -271,7 +270,7 @@ def test_published_topology_gets_teeth(tmp_path, shared_data, rows):
     capture = open_capture(root, model_file)
     assert capture.neutral.shape == (5143, 3)
     assert capture.faces.shape == (10144, 3)
-    np.testing.assert_allclose(capture.neutral[:5023], template + np.float32(0.001), atol=1e-7)
+    assert_allclose(capture.neutral[:5023], template + np.float32(0.001), atol=1e-7)
 
 
 def test_release_layout(tmp_path):
@@ -281,7 +280,7 @@ def test_release_layout(tmp_path):
     vertices, faces = factory.ball()
     assert (capture.layout, capture.timesteps) == ("release", (0, 1))
     moved = factory.moved(1, vertices)[faces]
-    np.testing.assert_allclose(capture.mesh(1)[capture.faces], moved, atol=1e-12)
+    assert_allclose(capture.mesh(1)[capture.faces], moved, atol=1e-12)
     selected = select_capture(capture, SelectionOptions(threshold=0.0005))
     assert np.flatnonzero(selected[0]).tolist() == [0, 2, 5]
     moving = np.abs(moved - vertices[faces]).max(axis=(1, 2)) > 0
@@ -302,8 +301,8 @@ def test_bare_folder(tmp_path):
     (tmp_path / "regions.json").write_text('{"nose": []}')
     capture = open_capture(tmp_path)
     assert capture.timesteps == (9, 10, 12)
-    np.testing.assert_allclose(capture.neutral, vertices, atol=1e-7)
-    np.testing.assert_allclose(capture.mesh(10), factory.moved(10, vertices), atol=1e-8)
+    assert_allclose(capture.neutral, vertices, atol=1e-7)
+    assert_allclose(capture.mesh(10), factory.moved(10, vertices), atol=1e-8)
     assert capture.warnings == (f"{tmp_path / 'regions.json'}: no triangle lies in nose",)
     factory.write_mesh(tmp_path / "last.obj", vertices, faces)
     assert open_capture(tmp_path).timesteps == (0, 1, 2, 3)
@@ -367,32 +366,32 @@ def test_summary(tmp_path):
     assert format_ranges([0, 2, 3, 7]) == "4: 0, 2–3, 7 (gaps 1, 4–6)"
 
 
-def remove(name: str) -> Callable[[Path], object]:
+def remove(name):
     return lambda root: (root / name).unlink()
 
 
-def cut(name: str) -> Callable[[Path], object]:
+def cut(name):
     return lambda root: (root / name).write_bytes((root / name).read_bytes()[:40])
 
 
-def in_a_point(name: str) -> Callable[[Path], None]:
+def in_a_point(name):
     vertices, faces = factory.ball()
     return lambda root: factory.write_mesh(root / name, np.full_like(vertices, 0.1), faces)
 
 
-def written(name: str, content: Any) -> Callable[[Path], None]:
+def written(name, content):
     """A file of text, or of an array."""
     if isinstance(content, str):
         return lambda root: (root / name).write_text(content) and None
     return lambda root: np.save(root / name, content)
 
 
-def edited(change: Callable[[list[dict[str, Any]]], object]) -> Callable[[Path], object]:
+def edited(change):
     path = "transforms_val.json"
     return lambda root: factory.edit(root / path, lambda document: change(document["frames"]))
 
 
-BROKEN_MESH_CAPTURES: list[tuple[Callable[[Path], object], str]] = [
+BROKEN_MESH_CAPTURES = [
     (remove("images/00001_01.png"), r"00001_01\.png: .*train\.json: frames\[3\] .*file_path"),
     (remove("fg_masks/00003_02.png"), r"00003_02\.png: does not exist, .*test\.json: frames\[2\]"),
     (remove("meshes/00003.obj"), r"00003\.obj: does not .*test\.json: frames\[0\] .*mesh_path"),
@@ -412,8 +411,8 @@ BROKEN_MESH_CAPTURES: list[tuple[Callable[[Path], object], str]] = [
 ]
 
 
-def parameters(change: dict[str, np.ndarray | None]) -> Callable[[Path], None]:
-    def damage(root: Path) -> None:
+def parameters(change):
+    def damage(root):
         arrays = factory.flame_parameters(0) | change
         given = {name: array for name, array in arrays.items() if array is not None}
         np.savez(root / "flame_param/00000.npz", **given)
@@ -421,7 +420,7 @@ def parameters(change: dict[str, np.ndarray | None]) -> Callable[[Path], None]:
     return damage
 
 
-BROKEN_FLAME_CAPTURES: list[tuple[Callable[[Path], object], str]] = [
+BROKEN_FLAME_CAPTURES = [
     (remove("flame_param/00003.npz"), r"00003\.npz: does not exist, but .*flame_param_path"),
     (cut("flame_param/00000.npz"), r"flame_param/00000\.npz: is not a readable npz"),
     (remove("model.npz"), r"model\.npz: cannot be read"),
@@ -436,7 +435,7 @@ BROKEN_FLAME_CAPTURES: list[tuple[Callable[[Path], object], str]] = [
 IDS = "training_faces/0000.npy"
 SOUP = "meshes/mesh_0000.json"
 NO_SOUP = r"0000\.json: triangles: "
-BROKEN_RELEASES: list[tuple[Callable[[Path], object], str]] = [
+BROKEN_RELEASES = [
     (written(IDS, np.array([0, 320])), r"0000\.npy: names triangles 0 to 320, but .* 0 to 319"),
     (written(IDS, np.array([-1])), r"0000\.npy: names triangles"),
     (written(IDS, np.array([0.5])), r"0000\.npy: expected a list of triangle numbers"),
@@ -473,7 +472,7 @@ def test_broken_captures(tmp_path, write, damage, message):
         every_mesh(root, model_file)
 
 
-def every_mesh(root: Path, model_file: Path | None) -> None:
+def every_mesh(root, model_file):
     capture = open_capture(root, model_file)
     for timestep in capture.timesteps:
         capture.expression_mesh(timestep, "head")
@@ -530,14 +529,14 @@ def test_a_motion_file_is_a_capture_without_views(tmp_path):
     whole = open_capture(root, model_file)
     motion = open_capture(root / "flame_param/00003.npz", model_file)
     assert (motion.layout, motion.timesteps, dict(motion.views)) == ("flame", (0,), {})
-    np.testing.assert_array_equal(motion.mesh(0), whole.mesh(3))
-    np.testing.assert_array_equal(motion.neutral, whole.neutral)
+    assert_array_equal(motion.mesh(0), whole.mesh(3))
+    assert_array_equal(motion.neutral, whole.neutral)
     assert motion.regions.keys() == whole.regions.keys()
     own = root / "flame_model.npz"
     shutil.copy(model_file, own)
     capture = open_capture(root)
     assert capture.flame_file == own.resolve()
-    np.testing.assert_array_equal(capture.mesh(0), open_capture(root, model_file).mesh(0))
+    assert_array_equal(capture.mesh(0), open_capture(root, model_file).mesh(0))
     own.write_bytes(b"")
     assert open_capture(root, model_file).flame_file == model_file
 

@@ -4,19 +4,19 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from numpy.testing import assert_array_equal
 from refusal import refusal
 
-from stga_addon.capture.camera import Camera
-from stga_addon.capture.model import Capture, first_timesteps, join_takes
+from stga_addon.capture.model import first_timesteps, join_takes
 
 
-def moved(capture: Capture, offset: float) -> Capture:
+def moved(capture, offset):
     """Another take: the same head, elsewhere."""
     mesh = capture.mesh
     return replace(capture, root=Path("other"), mesh=lambda timestep: mesh(timestep) + offset)
 
 
-def turned(camera: Camera) -> Camera:
+def turned(camera):
     """Another camera, upside down."""
     upside_down = np.diag([-1.0, -1.0, 1.0, 1.0])
     return replace(camera, world_to_camera=upside_down @ camera.world_to_camera)
@@ -30,10 +30,10 @@ def test_timesteps_follow_each_other(toy):
     assert start == max(toy.timesteps) + 1
     assert joined.timesteps == (*toy.timesteps, *(start + timestep for timestep in toy.timesteps))
     for timestep in toy.timesteps:
-        np.testing.assert_array_equal(joined.mesh(timestep), toy.mesh(timestep))
-        np.testing.assert_array_equal(joined.mesh(start + timestep), toy.mesh(timestep) + 0.1)
+        assert_array_equal(joined.mesh(timestep), toy.mesh(timestep))
+        assert_array_equal(joined.mesh(start + timestep), toy.mesh(timestep) + 0.1)
         found = joined.expression_mesh(start + timestep, "head")
-        np.testing.assert_array_equal(found, toy.expression_mesh(timestep, "head"))
+        assert_array_equal(found, toy.expression_mesh(timestep, "head"))
     for split, views in toy.views.items():
         both = joined.views[split]
         assert both[: len(views)] == views

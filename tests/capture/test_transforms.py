@@ -2,10 +2,10 @@
 
 import json
 import math
-from typing import Any
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 from refusal import refusal
 
 from stga_addon.capture.transforms import inside, read_splits, read_transforms
@@ -37,9 +37,9 @@ def test_projection_is_that_of_an_opengl_camera(tmp_path, convention, cx, cy):
     u = cx + factory.FOCAL * x / -z
     v = cy - factory.FOCAL * y / -z
     pixels, depth = camera.project(points)
-    np.testing.assert_allclose(pixels, np.c_[u, v], atol=1e-9)
-    np.testing.assert_allclose(depth, -z, atol=1e-12)
-    np.testing.assert_allclose(camera.camera_to_world_gl, factory.pose(2), atol=1e-12)
+    assert_allclose(pixels, np.c_[u, v], atol=1e-9)
+    assert_allclose(depth, -z, atol=1e-12)
+    assert_allclose(camera.camera_to_world_gl, factory.pose(2), atol=1e-12)
 
 
 def test_own_intrinsics_win(tmp_path):
@@ -136,7 +136,7 @@ def test_poses_as_programs_write_them(tmp_path):
     scaled = own * [2.0, 2.0, 0.25, 1.0]
     for matrix, repairs in ((own[:3], 0), (own.ravel(), 0), (scaled, 1), (scaled[:3], 1)):
         frame = read_one(tmp_path, factory.frame(0, 2, transform_matrix=matrix.tolist()))
-        np.testing.assert_allclose(
+        assert_allclose(
             frame.view.camera.world_to_camera, expected.view.camera.world_to_camera, atol=1e-12
         )
         assert len(frame.repairs) == repairs
@@ -199,7 +199,7 @@ def test_paths_that_leave_are_refused(tmp_path, path, field):
 SKEWED = np.eye(4)
 SKEWED[0, 1] = 0.01
 MIRRORED = np.diag([1.0, 1.0, -1.0, 1.0])
-MALFORMED: list[tuple[str, Any]] = [
+MALFORMED = [
     ("file_path", None), ("file_path", 3), ("timestep_index", -1), ("timestep_index", 1.5),
     ("timestep_index", True), ("timestep_index", "3"), ("camera_index", [1]), ("fl_x", 0),
     ("fl_x", float("nan")), ("fl_x", "200"), ("fl_y", -3.0), ("cx", float("inf")), ("cy", {}),

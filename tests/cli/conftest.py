@@ -1,7 +1,5 @@
 """A capture and a run of it, which tests of the command line only read."""
 
-from pathlib import Path
-
 import pytest
 from capture import factory
 from command_line import stga
@@ -11,12 +9,12 @@ CAMERAS = range(3)
 
 
 @pytest.fixture(scope="session")
-def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def root(tmp_path_factory):
     return factory.write_mesh_capture(tmp_path_factory.mktemp("cli") / "ball", TIMESTEPS, CAMERAS)
 
 
 @pytest.fixture(scope="session")
-def trained(root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def trained(root, tmp_path_factory):
     """A run of ten iterations of the paper's schedule, with a threshold of its own."""
     out = tmp_path_factory.mktemp("runs") / "run"
     options = "--iterations 10 --schedule paper --threshold 0.005"

@@ -1,6 +1,5 @@
 """Commands of the command line, and their errors: one sentence, exit code 2."""
 
-import argparse
 import json
 import shutil
 import subprocess
@@ -16,6 +15,7 @@ from capture import factory
 from capture.factory import edit, write_avatar_of, write_flame_capture, write_mesh_capture
 from command_line import refused, stga
 from export.web.web_data import read_web_data
+from numpy.testing import assert_allclose, assert_array_equal
 from PIL import Image
 
 from stga_addon.avatar.embedding import to_world
@@ -34,11 +34,11 @@ from stga_addon.training.run.metrics_log import read_metrics
 from .conftest import CAMERAS, TIMESTEPS
 
 
-def pictures(folder: Path) -> list[str]:
+def pictures(folder):
     return sorted(p.name for p in folder.glob("[!.]*"))
 
 
-def pixels(path: Path) -> np.ndarray:
+def pixels(path):
     with Image.open(path) as image:
         assert image.mode == "RGB"
         return np.asarray(image)
@@ -47,7 +47,7 @@ def pixels(path: Path) -> np.ndarray:
 # What each command does
 
 
-def test_select(root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_select(root, tmp_path, capsys):
     """Catches a threshold that is ignored, and masks or lines of another timestep."""
     out = tmp_path / "selection.npz"
     assert stga("select", root, "--threshold 0.0008 --out", out) == 0
@@ -84,7 +84,7 @@ def test_train_and_eval(trained, root, capsys):
     assert measured == pytest.approx(kept["detail_difference"], rel=0.02)
 
 
-def test_train_in_wall_time_and_resume(root: Path, tmp_path: Path) -> None:
+def test_train_in_wall_time_and_resume(root, tmp_path):
     """Catches --budget ignored, and --resume that starts anew or goes beyond the budget."""
     out = tmp_path / "run"
     options = "--budget 0.2s --strategy gaussian-avatars"
@@ -120,14 +120,12 @@ def test_render_a_run_an_avatar_and_a_ply(trained, root, tmp_path):
     middle = np.average(np.arange(60), weights=dark.sum(axis=1))
     assert middle == pytest.approx(factory.CY - 0.5, abs=1.5)
     for name in val:
-        np.testing.assert_array_equal(
-            *(pixels(tmp_path / kind / name) for kind in ("run", "avatar"))
-        )
+        assert_array_equal(*(pixels(tmp_path / kind / name) for kind in ("run", "avatar")))
     right, baked = (pixels(tmp_path / kind / val[1]).astype(int) for kind in ("run", "ply"))
     assert np.abs(right - baked).max() <= 1
 
 
-def test_names_of_a_long_capture() -> None:
+def test_names_of_a_long_capture():
     """Catches minutes before the first image of thousands, and two images with one name."""
     paths = [f"images/{n:05d}_{camera:02d}.png" for n in range(1000) for camera in range(16)]
     begin = process_time()
@@ -148,8 +146,8 @@ def test_export_of_frames(trained, root, tmp_path, capsys):
         assert stga("export", trained, "--format ply --out", out, chosen) == 0
         expected = to_world(avatar.splats, avatar.frames(mesh))
         again = read_ply(out)
-        np.testing.assert_allclose(again.xyz, expected.xyz, atol=1e-6)
-        np.testing.assert_allclose(again.log_scale, expected.log_scale, atol=1e-5)
+        assert_allclose(again.xyz, expected.xyz, atol=1e-6)
+        assert_allclose(again.log_scale, expected.log_scale, atol=1e-5)
     posed, neutral = (read_ply(tmp_path / f"{name}.ply").xyz for name in ("3", "None"))
     assert np.abs(posed - neutral).max() > 0.002
     assert np.linalg.norm(neutral, axis=1).mean() == pytest.approx(0.1, abs=0.01)
@@ -252,7 +250,7 @@ sys.exit(main(sys.argv[1:]))
 NUMPY_ALONE = "torch numba wgpu trimesh scipy PIL tqdm matplotlib platformdirs bpy"
 
 
-def test_commands_need_few_packages(root: Path, trained: Path, tmp_path: Path) -> None:
+def test_commands_need_few_packages(root, trained, tmp_path):
     """Catches an import that looking at a capture, selecting or exporting cannot do without, and a
     traceback where Blender, with numpy alone, lacks a package."""
     flame, model = factory.write_flame_capture(tmp_path / "flame")
@@ -291,8 +289,8 @@ def test_commands_need_few_packages(root: Path, trained: Path, tmp_path: Path) -
 def test_interruption_and_mistakes_have_their_codes(root, monkeypatch, capsys):
     """Catches a traceback after Ctrl-C, and a bug reported as the user's mistake."""
 
-    def fails_with(error: BaseException) -> None:
-        def run(options: argparse.Namespace, head: object) -> None:
+    def fails_with(error):
+        def run(options, head):
             raise error
 
         monkeypatch.setitem(commands.COMMANDS, "info", replace(commands.COMMANDS["info"], run=run))

@@ -3,7 +3,6 @@
 import json
 import re
 import shutil
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -184,7 +183,7 @@ def refusable(root, trained, tmp_path_factory):
 def test_refusals(refusable, capsys, command, says):
     """Catches a traceback, talk of something else, and files that a refused command leaves."""
 
-    def files() -> dict[Path, bytes]:
+    def files():
         found = refusable["folder"].rglob("*")
         return {path: path.read_bytes() for path in found if path.is_file()}
 
@@ -195,7 +194,7 @@ def test_refusals(refusable, capsys, command, says):
     assert not refusable["none"].exists()
 
 
-def test_a_threshold_is_given_again_when_a_run_is_resumed(root: Path, tmp_path: Path) -> None:
+def test_a_threshold_is_given_again_when_a_run_is_resumed(root, tmp_path):
     """Catches `train --resume` that refuses the threshold that the run began with."""
     run = f"train {root} --out {tmp_path}/run --device cpu"
     chosen = "--threshold 0.01 --schedule paper --iterations 1"

@@ -1,7 +1,5 @@
 """`stga render --video` and `--turntable`."""
 
-from pathlib import Path
-
 import av
 import numpy as np
 import pytest
@@ -10,8 +8,7 @@ from command_line import stga
 from PIL import Image
 
 from stga_addon.avatar.file import read_avatar
-from stga_addon.capture.camera import Camera, orbited
-from stga_addon.capture.model import Capture
+from stga_addon.capture.camera import orbited
 from stga_addon.capture.open import open_capture
 from stga_addon.cli.main import main
 from stga_addon.export.ply import write_ply
@@ -21,18 +18,18 @@ WHITE = (1.0, 1.0, 1.0)
 
 
 @pytest.fixture
-def parts(tmp_path: Path) -> dict[str, Path]:
+def parts(tmp_path):
     """A capture and an avatar whose every splat has its own color."""
     root = factory.write_mesh_capture(tmp_path / "ball", (0, 1, 3), range(3))
     avatar = factory.write_avatar_of(open_capture(root), tmp_path / "a.npz", is_colored=True)
     return {"avatar": avatar, "capture": root}
 
 
-def render(parts: dict[str, Path], *more: object) -> int:
+def render(parts, *more):
     return main([str(a) for a in ("render", parts["avatar"], "--capture", parts["capture"], *more)])
 
 
-def decoded(path: Path) -> tuple[float, list[np.ndarray]]:
+def decoded(path):
     with av.open(str(path)) as container:
         rate = container.streams.video[0].average_rate
         assert rate is not None
@@ -41,7 +38,7 @@ def decoded(path: Path) -> tuple[float, list[np.ndarray]]:
         ]
 
 
-def camera_of(capture: Capture, index: int) -> Camera:
+def camera_of(capture, index):
     views = [view for split in capture.views.values() for view in split]
     return next(view.camera for view in views if view.camera_index == index)
 
@@ -76,7 +73,7 @@ def test_video_of_the_motion(parts, tmp_path):
     assert len(decoded(tmp_path / "w.mp4")[1]) == 2
 
 
-def test_turntable_as_pictures(parts: dict[str, Path], tmp_path: Path) -> None:
+def test_turntable_as_pictures(parts, tmp_path):
     """Catches a turn about another point or of a part of the circle, and stills."""
     out = tmp_path / "turn"
     options = "--seconds", 2, "--fps", 4, "--camera", 0
@@ -94,7 +91,7 @@ def test_turntable_as_pictures(parts: dict[str, Path], tmp_path: Path) -> None:
         assert np.abs(np.asarray(Image.open(pictures[index])) - expected).max() <= 1
 
 
-def test_turntable_of_a_ply(parts: dict[str, Path], tmp_path: Path) -> None:
+def test_turntable_of_a_ply(parts, tmp_path):
     """Catches a PLY, which has neither timesteps nor capture, that cannot be turned."""
     ply = tmp_path / "scan.ply"
     cameras = parts["capture"] / "transforms_train.json"

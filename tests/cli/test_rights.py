@@ -1,7 +1,6 @@
 """Commands about what may not be read, and links to themselves."""
 
 import shutil
-from pathlib import Path
 
 import pytest
 from capture.factory import write_flame_capture
@@ -36,7 +35,7 @@ COMMANDS = {
 
 
 @pytest.fixture(scope="module")
-def inputs(root, trained, tmp_path_factory) -> dict[str, Path]:
+def inputs(root, trained, tmp_path_factory):
     """Each in a folder of its own."""
     base = tmp_path_factory.mktemp("inputs")
     found = {name: base / name / "it" for name in ("capture", "run", "flame", "footage", "job")}

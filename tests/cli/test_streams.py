@@ -19,11 +19,11 @@ ROOT = Path(__file__).parents[2]
 
 
 @pytest.fixture(scope="module")
-def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def capture(tmp_path_factory):
     return factory.write_mesh_capture(tmp_path_factory.mktemp("streams") / "ball")
 
 
-def shell(command: str, **environment: str) -> subprocess.CompletedProcess[str]:
+def shell(command, **environment):
     """Run a bash command line in which `stga` is the command line; its exit code."""
     script = f'stga() {{ {STGA} "$@"; }}\n{command}\nexit ${{PIPESTATUS[0]}}'
     return subprocess.run(
@@ -37,14 +37,14 @@ def shell(command: str, **environment: str) -> subprocess.CompletedProcess[str]:
 
 
 @pytest.mark.parametrize("command", ["info", "select", "presets --help"])
-def test_closed_pipe(capture: Path, command: str) -> None:
+def test_closed_pipe(capture, command):
     """Catches a traceback, or "Exception ignored", where the reader of a pipe has gone."""
     done = shell(f"stga {command} {capture} | head -c0")
     assert (done.returncode, done.stderr) == (0, "")
 
 
 @pytest.mark.skipif(not os.path.exists("/dev/full"), reason="no /dev/full on this system")
-def test_full_device(capture: Path) -> None:
+def test_full_device(capture):
     """Catches a traceback, and success although nothing could be printed."""
     done = shell(f"stga info {capture} > /dev/full")
     assert done.returncode == 2
@@ -56,7 +56,7 @@ def test_full_device(capture: Path) -> None:
 @pytest.mark.parametrize(
     "environment", [{"PYTHONIOENCODING": "ascii"}, {"LC_ALL": "C", "PYTHONCOERCECLOCALE": "0"}]
 )
-def test_ascii_streams(tmp_path: Path, environment: dict[str, str]) -> None:
+def test_ascii_streams(tmp_path, environment):
     """Catches a UnicodeEncodeError for a folder's name, in the output and in an error."""
     capture = factory.write_mesh_capture(tmp_path / "Käthe−²")
     done = shell(f"stga info {capture}", PYTHONUTF8="0", **environment)
@@ -84,7 +84,7 @@ assert codes == [0, 0, 2] and all(os.path.samestat(os.fstat(number), null) for n
 """
 
 
-def test_closed_descriptors(capture: Path, tmp_path: Path) -> None:
+def test_closed_descriptors(capture, tmp_path):
     """Catches a progress bar that needs stderr, and files that get a closed stream's descriptor."""
     done = shell(f"\"{sys.executable}\" -c '{THREE}' {capture} {tmp_path} <&- >&- 2>&-")
     assert (done.returncode, "Traceback" in done.stderr) == (0, False), done.stderr
@@ -94,7 +94,7 @@ def test_closed_descriptors(capture: Path, tmp_path: Path) -> None:
         assert shell(f"stga info {folder} {closed}").returncode == code, closed
 
 
-def test_interrupted_training_keeps_its_exit_code(capture: Path, tmp_path: Path) -> None:
+def test_interrupted_training_keeps_its_exit_code(capture, tmp_path):
     """Catches a bar that needs a terminal, and a traceback or other code after Ctrl-C."""
     out = tmp_path / "run"
     command = [sys.executable, "-m", "stga_addon", "train", str(capture), "--out", str(out)]
@@ -128,7 +128,7 @@ raise SystemExit(main.main(["info", "capture"]))
 
 
 @pytest.mark.skipif(os.name == "nt", reason="has no such limit")
-def test_a_tight_limit_of_addresses_is_said(capture: Path) -> None:
+def test_a_tight_limit_of_addresses_is_said(capture):
     """Catches a process that LLVM aborts, with std::bad_alloc as the only reason."""
     tight = shell(f"(ulimit -v 3000000; stga info {capture})")
     assert tight.returncode == 0
@@ -152,19 +152,19 @@ raise SystemExit(main.main(["info", "capture"]))
 """
 
 
-def test_interruption_that_c_code_drops() -> None:
+def test_interruption_that_c_code_drops():
     """Catches Ctrl-C without effect while kernels are loaded."""
     done = shell(f"\"{sys.executable}\" -c '{DROPPED}'")
     assert (done.returncode, done.stderr) == (130, "stga: interrupted\n")
 
 
-def test_interruption_says_nothing_of_what_was_half_made() -> None:
+def test_interruption_says_nothing_of_what_was_half_made():
     """Catches the traceback of a destructor where Ctrl-C came while a library made an object."""
     done = shell(f"\"{sys.executable}\" -c '{HALF_MADE}'")
     assert (done.returncode, done.stderr) == (130, "stga: interrupted\n")
 
 
-def test_messages_have_lines_of_their_own(capsys: pytest.CaptureFixture[str]) -> None:
+def test_messages_have_lines_of_their_own(capsys):
     """Catches a sentence glued to the end of the bar."""
     with ProgressBar() as bar:
         bar.report(Progress(0.5, "Training"))

@@ -36,7 +36,7 @@ NATIVE = {
 }
 
 
-def make_wheel(folder: Path, name: str, version: str, tag: str, *requirements: str) -> Path:
+def make_wheel(folder, name, version, tag, *requirements):
     stem = f"{name.replace('-', '_')}-{version}"
     path = folder / f"{stem}-{tag}.whl"
     text = f"Metadata-Version: 2.1\nName: {name}\nVersion: {version}\n"
@@ -51,7 +51,7 @@ def make_wheel(folder: Path, name: str, version: str, tag: str, *requirements: s
 def lock(monkeypatch):
     """Folder -> its wheels become those that an edition may hold."""
 
-    def lock_folders(*folders: Path) -> None:
+    def lock_folders(*folders):
         wheels = [wheel for folder in folders for wheel in folder.glob("*.whl")]
         found = {wheel.name: hashlib.sha256(wheel.read_bytes()).hexdigest() for wheel in wheels}
         monkeypatch.setattr("stga_addon.development.wheels.locked_wheels", lambda: found)
@@ -59,7 +59,7 @@ def lock(monkeypatch):
     return lock_folders
 
 
-def wheel_set(folder: Path, target: Target) -> list[Path]:
+def wheel_set(folder, target):
     """A wheel of the pinned version for each package that training needs."""
     pins = {name.split("-")[0].replace("_", "-"): name.split("-")[1] for name in locked_wheels()}
     tag = NATIVE[target.platform].format(target.python.replace(".", ""))
@@ -75,7 +75,7 @@ def wheel_set(folder: Path, target: Target) -> list[Path]:
 
 
 @pytest.mark.parametrize("target", TARGETS, ids=lambda target: target.name)
-def test_wheels_of_a_target(target: Target, tmp_path: Path) -> None:
+def test_wheels_of_a_target(target, tmp_path):
     """Catches wheels of another system or Python, and a missing or too old dependency."""
     wheels = wheel_set(tmp_path, target)
     check_wheels(wheels, target)
@@ -94,11 +94,11 @@ def test_wheels_of_a_target(target: Target, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("target", TARGETS, ids=lambda target: target.name)
-def test_the_lock_has_what_each_target_needs(target: Target) -> None:
+def test_the_lock_has_what_each_target_needs(target):
     """Catches a target that was forgotten when versions were changed, and two versions at once of
     what training asks for."""
     tags = target.tags()
-    versions: dict[str, set[str]] = {}
+    versions = {}
     for wheel, digest in locked_wheels().items():
         assert re.fullmatch("[0-9a-f]{64}", digest)
         name, version, _, own = parse_wheel_filename(wheel)
@@ -112,7 +112,7 @@ def test_the_lock_has_what_each_target_needs(target: Target) -> None:
     assert all(len(found) == 1 for found in versions.values())
 
 
-def test_wheels_are_known_by_their_hash(tmp_path, monkeypatch, lock) -> None:
+def test_wheels_are_known_by_their_hash(tmp_path, monkeypatch, lock):
     """Catches a wheel of the right name and other content, in the folder or where pip looks, which
     every user of the edition would run."""
     offered = tmp_path / "offered"
@@ -165,7 +165,7 @@ def test_only_when_told_to_does_a_zip_have_cuda(tmp_path, monkeypatch, capsys, l
     monkeypatch.setattr(f"{package}.TARGETS", [LINUX])
     monkeypatch.setattr(f"{package}.compile_kernels", lambda *_: [])
 
-    def built(name: str, *more: str) -> set[str]:
+    def built(name, *more):
         assert main(["--edition", "complete", "--out", str(tmp_path / name), *more]) == 0
         with zipfile.ZipFile(next((tmp_path / name).glob("*.zip"))) as archive:
             names = {
@@ -173,7 +173,7 @@ def test_only_when_told_to_does_a_zip_have_cuda(tmp_path, monkeypatch, capsys, l
             }
         return {wheel for wheel in names if wheel.startswith(("torch", "nvidia"))}
 
-    def refusal() -> str:
+    def refusal():
         assert main(["--edition", "complete", "--out", str(tmp_path / "refused")]) == 2
         assert not (tmp_path / "refused").exists()
         return capsys.readouterr().err

@@ -1,7 +1,6 @@
 """A generated head in FLAME's topology with expressions, and random ARKit poses."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 from flame.mouths import open_flame
@@ -9,7 +8,6 @@ from flame.mouths import open_flame
 from stga_addon.capture.mesh_geometry import connected_parts
 from stga_addon.driving.performance import ARKIT_SHAPES, COLUMN, COUNT
 from stga_addon.driving.shapes import face_points, face_shapes
-from stga_addon.flame.model import FlameModel
 
 KERNEL_M = 0.006
 REACH_M = 0.012
@@ -28,13 +26,13 @@ OPPOSITES = (
 SAMPLES = 400
 
 
-def generated_flame(shared_data: Path, components: int) -> FlameModel:
+def generated_flame(shared_data, components):
     """FLAME 2023 Open with 60 identity components, a jaw, eyes, and generated expressions."""
     model = _with_eyes(open_flame(shared_data))
     return with_expressions(replace(model, posedirs=0 * model.posedirs), components)
 
 
-def with_expressions(model: FlameModel, components: int) -> FlameModel:
+def with_expressions(model, components):
     """The model with other expressions: FLAME's own are not published openly.
 
     They are principal components of what random combinations of ICT-FaceKit's shapes other than the
@@ -63,7 +61,7 @@ def with_expressions(model: FlameModel, components: int) -> FlameModel:
     return replace(model, shapedirs=np.concatenate([identity, expressions], axis=2))
 
 
-def random_poses(count: int, rng: np.random.Generator) -> np.ndarray:
+def random_poses(count, rng):
     """(count, 52) weights as of a face in motion: no opposites, a third with closed lips."""
     weights = rng.random((count, COUNT)) * (rng.random((count, COUNT)) < 1 / 3)
     for pair in OPPOSITES:
@@ -78,7 +76,7 @@ def random_poses(count: int, rng: np.random.Generator) -> np.ndarray:
     return np.asarray(weights)
 
 
-def _with_eyes(model: FlameModel) -> FlameModel:
+def _with_eyes(model):
     """The model whose eyeballs, the smaller parts of the mesh, follow their joints."""
     label = connected_parts(len(model.v_template), model.faces)
     weights = model.weights.copy()

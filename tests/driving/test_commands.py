@@ -1,13 +1,13 @@
 """Performances on the command line: rendered, exported, and converted."""
 
 import shutil
-from pathlib import Path
 
 import numpy as np
 import pytest
 from capture.factory import write_flame_capture
 from command_line import refused, stga
 from flame.small_head import small_head, write_flame
+from numpy.testing import assert_allclose
 from PIL import Image
 from scipy.spatial.transform import Rotation
 from tracking.test_calibrations import entry
@@ -22,7 +22,6 @@ from stga_addon.driving.performers import read_performance
 from stga_addon.export.playback import DEFAULT_FPS
 from stga_addon.files import write_json
 from stga_addon.flame.forward import flame_forward, neutral_frame
-from stga_addon.flame.model import FlameModel
 from stga_addon.flame.sequence import read_motion, sequence_mesh
 from stga_addon.jobs.track import MAX_MISFIT
 from stga_addon.render.video import video_writer
@@ -37,7 +36,7 @@ pytestmark = pytest.mark.slow
 
 
 @pytest.fixture(scope="module")
-def files(tmp_path_factory) -> dict[str, Path]:
+def files(tmp_path_factory):
     """The small head's model, an avatar of it, and a take that turns and opens the jaw."""
     folder = tmp_path_factory.mktemp("drive")
     model = small_head(0)
@@ -71,16 +70,16 @@ def test_convert_there_and_back(files, tmp_path, capsys):
     assert drop[:, 1].min() < -0.008
     assert stga("drive", out, "--flame", flame, "--mirror", "--out", back) == 0
     weights = read_performance(back).weights
-    np.testing.assert_allclose(weights[-1, COLUMN["jawOpen"]], 0.9, atol=0.01)
-    np.testing.assert_allclose(weights[-1, COLUMN["jawRight"]], 0.5, atol=0.01)
+    assert_allclose(weights[-1, COLUMN["jawOpen"]], 0.9, atol=0.01)
+    assert_allclose(weights[-1, COLUMN["jawRight"]], 0.5, atol=0.01)
     weak = f"--flame {flame} --strength 0.5 --out"
     assert stga("drive", files["take.csv"], weak, tmp_path / "weak.csv") == 0
     assert stga("drive", files["take.csv"], weak, tmp_path / "weak.npz") == 0
     assert stga("drive", tmp_path / "weak.npz", weak, tmp_path / "weaker.csv") == 0
     for output, share in (("weak.csv", 0.5), ("weaker.csv", 0.25)):
         found = read_performance(tmp_path / output)
-        np.testing.assert_allclose(found.weights[-1, COLUMN["jawOpen"]], 0.9 * share, atol=0.01)
-        np.testing.assert_allclose(found.head[-1], [0.4 * share, 0, 0.2 * share], atol=0.01)
+        assert_allclose(found.weights[-1, COLUMN["jawOpen"]], 0.9 * share, atol=0.01)
+        assert_allclose(found.head[-1], [0.4 * share, 0, 0.2 * share], atol=0.01)
     assert "holds FLAME parameters already" in refused(
         capsys, "drive", out, "--out", tmp_path / "x.npz"
     )
@@ -90,8 +89,8 @@ def test_convert_there_and_back(files, tmp_path, capsys):
     assert stga("drive", out, "--out", back) == 0
     given = read_performance(files["take.csv"])
     found = read_performance(back)
-    np.testing.assert_allclose(found.weights, given.weights, atol=1e-6)
-    np.testing.assert_allclose(found.head, given.head, atol=1e-5)
+    assert_allclose(found.weights, given.weights, atol=1e-6)
+    assert_allclose(found.head, given.head, atol=1e-5)
 
 
 def test_render_and_export_a_performance(files, tmp_path, capsys):
@@ -119,7 +118,7 @@ def test_render_and_export_a_performance(files, tmp_path, capsys):
     )
 
 
-def write_moving_capture(root: Path, model: FlameModel) -> None:
+def write_moving_capture(root, model):
     """A FLAME capture whose head turns, and speaks, at random."""
     write_flame_capture(root)
     rng = np.random.default_rng(0)
@@ -186,8 +185,8 @@ def test_a_performers_avatar_tracks_a_video(files, tmp_path, monkeypatch, misfit
     frames = [own.frame(timestep) for timestep in own.timesteps]
     for timestep, frame in zip(own.timesteps, frames, strict=True):
         found = motion.frame(2 * timestep).parameters
-        np.testing.assert_allclose(found, frame.parameters, atol=1e-6)
+        assert_allclose(found, frame.parameters, atol=1e-6)
     root_joint, neck = (Rotation.from_rotvec([f.pose[joint] for f in frames]) for joint in (0, 1))
     turned = root_joint * neck
     expected = (turned * turned[0].inv()).as_euler("YXZ")
-    np.testing.assert_allclose(head[np.array(own.timesteps)], expected, atol=1e-4)
+    assert_allclose(head[np.array(own.timesteps)], expected, atol=1e-4)

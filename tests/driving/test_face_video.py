@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from command_line import refused, stga
+from numpy.testing import assert_allclose
 
 from stga_addon.driving.face_video import CAMERA_FIELD_OF_VIEW_DEG
 from stga_addon.driving.head_map import head_turns
@@ -43,10 +44,10 @@ def test_a_video_becomes_a_performance(network, tmp_path):
     assert stga("drive", video, "--out", tmp_path / "a.csv") == 0
     take = read_performance(tmp_path / "a.csv")
     assert take.fps == pytest.approx(25, rel=1e-4)
-    np.testing.assert_allclose(take.times, np.arange(10) / 25, atol=1e-4)
+    assert_allclose(take.times, np.arange(10) / 25, atol=1e-4)
     expected = (60 + 10 * np.arange(10)) / 255
-    np.testing.assert_allclose(take.weights[:, COLUMN["jawOpen"]], expected, atol=0.015)
-    np.testing.assert_allclose(take.head[:, 0], expected - expected[0], atol=0.02)
+    assert_allclose(take.weights[:, COLUMN["jawOpen"]], expected, atol=0.015)
+    assert_allclose(take.head[:, 0], expected - expected[0], atol=0.02)
 
 
 def test_a_video_without_a_face(tmp_path, capsys):

@@ -6,6 +6,7 @@ import re
 import numpy as np
 import pytest
 from command_line import stga
+from numpy.testing import assert_allclose
 from refusal import refusal
 
 from stga_addon.driving.open_motion import open_motion
@@ -42,7 +43,7 @@ def test_milliseconds_behind_frame_numbers(tmp_path):
     assert codes[4:7] == ["00:00:00:04.066", "00:00:00:04.083", "00:00:00:06.100"]
     found = read_performance(write_csv(tmp_path / "a.csv", codes, np.tile(WEIGHTS, (11, 1))[:610]))
     assert (len(found.times), found.lost, found.fps) == (610, 0, 60)
-    np.testing.assert_allclose(found.times, np.arange(610) / 60, atol=1e-9)
+    assert_allclose(found.times, np.arange(610) / 60, atol=1e-9)
 
 
 NANOSECONDS = 1_714_563_900_000_000_000  # of an epoch: more digits than a float has
@@ -81,8 +82,8 @@ def test_times_with_and_without_a_unit(tmp_path, kind):
     found = read_performance(path)
     assert found.lost == 0
     assert found.fps == pytest.approx(fps, abs=1e-6)
-    np.testing.assert_allclose(found.times, np.arange(COUNT) / fps, atol=1e-6)
-    np.testing.assert_allclose(found.weights, WEIGHTS, atol=1e-6)
+    assert_allclose(found.times, np.arange(COUNT) / fps, atol=1e-6)
+    assert_allclose(found.weights, WEIGHTS, atol=1e-6)
     assert len(found.warnings) == (sentence is not None)
     assert sentence is None or sentence in found.warnings[0]
 
@@ -96,7 +97,7 @@ def test_a_row_lost_between_frame_numbers(tmp_path):
     rng = np.random.default_rng(0)
     times = np.cumsum(rng.uniform(0.025, 0.042, COUNT)).round(4)
     found = read_performance(write_rows(tmp_path / "b.csv", "time", lambda n: times[n]))
-    np.testing.assert_allclose(found.times, times - times[0], atol=1e-9)
+    assert_allclose(found.times, times - times[0], atol=1e-9)
 
 
 def test_drop_frame_numbers_over_ten_minutes(tmp_path):
@@ -104,7 +105,7 @@ def test_drop_frame_numbers_over_ten_minutes(tmp_path):
     codes = [f"00:09:59;{n:02d}" for n in range(20, 30)]
     codes += [f"00:10:00;{n:02d}" for n in range(10)]
     found = read_performance(write_csv(tmp_path / "take.csv", codes, np.zeros((20, 52))))
-    np.testing.assert_allclose(found.times, np.arange(20) * 1001 / 30000, atol=1e-9)
+    assert_allclose(found.times, np.arange(20) * 1001 / 30000, atol=1e-9)
 
 
 @pytest.mark.parametrize("kind", ["german", "named delimiter", "tabs", "mark", "quoted"])
@@ -124,9 +125,9 @@ def test_takes_saved_again_by_a_spreadsheet(tmp_path, kind):
     }
     path.write_bytes(files[kind])
     found = read_performance(path)
-    np.testing.assert_allclose(found.weights, expected.weights)
-    np.testing.assert_allclose(found.head, expected.head)
-    np.testing.assert_allclose(found.times, expected.times)
+    assert_allclose(found.weights, expected.weights)
+    assert_allclose(found.head, expected.head)
+    assert_allclose(found.times, expected.times)
 
 
 def test_tab_separated_suffix(tmp_path):
@@ -134,15 +135,15 @@ def test_tab_separated_suffix(tmp_path):
     path = write_rows(tmp_path / "a.csv", "time", lambda n: n / 30)
     (tmp_path / "a.tsv").write_text(path.read_text().replace(",", "\t"))
     assert is_performance(tmp_path / "a.tsv")
-    np.testing.assert_allclose(read_performance(tmp_path / "a.tsv").weights, WEIGHTS)
+    assert_allclose(read_performance(tmp_path / "a.tsv").weights, WEIGHTS)
 
 
 def test_degrees_and_percent(tmp_path):
     """Catches a head that spins, shapes a hundred times too strong, and an unsaid guess."""
     path = write_rows(tmp_path / "a.csv", "time", lambda n: n / 30, WEIGHTS * 100, (20.0, -7.5, 3))
     found = read_performance(path)
-    np.testing.assert_allclose(found.weights, WEIGHTS, atol=1e-9)
-    np.testing.assert_allclose(found.head, np.radians([[20.0, -7.5, 3]] * COUNT))
+    assert_allclose(found.weights, WEIGHTS, atol=1e-9)
+    assert_allclose(found.head, np.radians([[20.0, -7.5, 3]] * COUNT))
     assert [re.sub("reach .*;", "reach;", text) for text in found.warnings] == [
         f"{path}: weights reach; they are read as percent",
         f"{path}: the head's angles reach; they are read as degrees",
@@ -174,8 +175,8 @@ def test_times_in_json(tmp_path, key, times, about, fps, sentence):
     (tmp_path / "a.json").write_bytes(text.encode("utf-16" if about else "utf-8-sig"))
     found = read_performance(tmp_path / "a.json")
     assert (found.fps, found.lost) == (pytest.approx(fps), 0)
-    np.testing.assert_allclose(found.times, np.arange(COUNT) / fps, atol=1e-3)
-    np.testing.assert_allclose(found.head, [[0.1, 0.2, 0.3]] * COUNT)
+    assert_allclose(found.times, np.arange(COUNT) / fps, atol=1e-3)
+    assert_allclose(found.head, [[0.1, 0.2, 0.3]] * COUNT)
     assert len(found.warnings) == (sentence is not None)
     assert sentence is None or sentence in found.warnings[0]
 

@@ -7,6 +7,7 @@ import pytest
 from flame.small_head import small_head
 from numpy.linalg import norm
 from numpy.random import default_rng
+from numpy.testing import assert_allclose, assert_array_equal
 from refusal import refusal
 from scipy.optimize import least_squares
 
@@ -39,7 +40,7 @@ MOUTH_RIGHT = 61
 NECK = JOINTS.index("neck")
 
 
-def sequence_of(model, shape=None) -> FlameSequence:
+def sequence_of(model, shape=None):
     shape = np.zeros(model.n_identity) if shape is None else shape
     return FlameSequence(model, shape, None, (), {}.__getitem__)
 
@@ -59,7 +60,7 @@ def rich():
     return sequence, head_map(sequence, "rich")
 
 
-def posed(sequence, found, weights) -> np.ndarray:
+def posed(sequence, found, weights):
     """(N, 3) face points of one row of weights."""
     row = found.parameters(weights[None])[0]
     count = sequence.model.n_expression
@@ -69,7 +70,7 @@ def posed(sequence, found, weights) -> np.ndarray:
     return found.points.on(mesh, sequence.model.faces)
 
 
-def weights_of(**values: float) -> np.ndarray:
+def weights_of(**values):
     weights = np.zeros(len(ARKIT_SHAPES))
     for name, value in values.items():
         weights[COLUMN[name]] = value
@@ -133,7 +134,7 @@ def test_directions(demo):
     smile = norm(posed(*demo, weights_of(mouthSmileLeft=1.0)) - rest, axis=1)
     assert smile[row[MOUTH_LEFT]] > smile[row[MOUTH_RIGHT]]
     assert posed(*demo, weights_of(jawLeft=1.0))[row[CHIN], 0] > rest[row[CHIN], 0] + 0.002
-    np.testing.assert_allclose(posed(*demo, weights_of(tongueOut=1.0)), rest, atol=1e-12)
+    assert_allclose(posed(*demo, weights_of(tongueOut=1.0)), rest, atol=1e-12)
     zero = np.zeros(3)
     ball = model.weights[:, 3] > 0.9
     before = model.v_template[ball]
@@ -182,13 +183,13 @@ def test_there_and_back(rich, tmp_path):
     take = Performance(np.arange(40) / 30, weights, head, 30.0)
     write_performance(tmp_path / "a.csv", take)
     read = read_performance(tmp_path / "a.csv")
-    np.testing.assert_allclose(read.weights, weights, atol=1e-6)
+    assert_allclose(read.weights, weights, atol=1e-6)
     motion = performed(read, sequence, "rich", MotionOptions())
     back = captured_performance(motion.sequence, "rich", motion.fps)
     write_performance(tmp_path / "b.csv", back)
     again = read_performance(tmp_path / "b.csv")
-    np.testing.assert_allclose(again.times, take.times, atol=1e-4)
-    np.testing.assert_allclose(again.head, head, atol=1e-5)
+    assert_allclose(again.times, take.times, atol=1e-4)
+    assert_allclose(again.head, head, atol=1e-5)
     error = np.abs(again.weights - effective_weights(weights)).max(axis=0)
     sure = [name.startswith(("eyeLook", "jawO", "jawL", "jawR")) for name in ARKIT_SHAPES]
     assert error[sure].max() < 0.01
@@ -203,8 +204,8 @@ def test_there_and_back(rich, tmp_path):
 def test_head_turns_are_their_angles():
     """Catches an order of yaw, pitch and roll that differs between the two ways."""
     angles = default_rng(0).uniform(-0.7, 0.7, (20, 3))
-    np.testing.assert_allclose(head_angles(head_turns(angles)), angles, atol=1e-9)
-    np.testing.assert_allclose(head_turns([[0.3, 0, 0]]), [[0, 0.3, 0]], atol=1e-12)
+    assert_allclose(head_angles(head_turns(angles)), angles, atol=1e-9)
+    assert_allclose(head_turns([[0.3, 0, 0]]), [[0, 0.3, 0]], atol=1e-12)
 
 
 def test_a_head_without_a_face():
@@ -228,5 +229,5 @@ def test_points_that_move_far_find_other_triangles():
         each.nearest(points, normals[chosen])
         for each in (surface, _Surface(model.v_template, model.faces))
     )
-    np.testing.assert_array_equal(found[0], fresh[0])
+    assert_array_equal(found[0], fresh[0])
     assert np.median(found[3]) == pytest.approx(1e-4, rel=0.1)

@@ -5,6 +5,7 @@ import re
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 from refusal import refusal
 
 from stga_addon.driving.performance import (
@@ -51,10 +52,10 @@ def test_live_link_face_rows_at_half_the_timecodes_rate_over_midnight(tmp_path):
     swapped = HEADER.copy()
     swapped[2], swapped[40] = swapped[40], swapped[2]
     found = read_performance(write_csv(tmp_path / "take.csv", codes, weights, swapped))
-    np.testing.assert_allclose(found.weights, weights, atol=1e-6)
-    np.testing.assert_allclose(found.times, np.arange(len(codes)) / 30, atol=1e-9)
+    assert_allclose(found.weights, weights, atol=1e-6)
+    assert_allclose(found.times, np.arange(len(codes)) / 30, atol=1e-9)
     assert found.fps == pytest.approx(30)
-    np.testing.assert_allclose(found.head, [[0.1, 0.2, 0.3]] * len(codes))
+    assert_allclose(found.head, [[0.1, 0.2, 0.3]] * len(codes))
 
 
 def test_lost_rows_and_rows_without_a_face(tmp_path):
@@ -68,12 +69,12 @@ def test_lost_rows_and_rows_without_a_face(tmp_path):
     (tmp_path / "take.csv").write_text("\n".join(lines))
     found = read_performance(tmp_path / "take.csv")
     assert (len(found.times), found.lost) == (7, 3)
-    np.testing.assert_allclose(resampled(found).weights, weights, atol=1e-6)
-    np.testing.assert_allclose(resampled(found, 120.0).weights[::2], weights, atol=1e-6)
+    assert_allclose(resampled(found).weights, weights, atol=1e-6)
+    assert_allclose(resampled(found, 120.0).weights[::2], weights, atol=1e-6)
     codes = [f"00:00:59;{n:02d}" for n in range(20, 30)]
     codes += [f"00:01:00;{n:02d}" for n in range(2, 12)]
     found = read_performance(write_csv(tmp_path / "take.csv", codes, np.zeros((20, 52))))
-    np.testing.assert_allclose(np.diff(found.times), 1001 / 30000, atol=1e-9)
+    assert_allclose(np.diff(found.times), 1001 / 30000, atol=1e-9)
 
 
 def test_every_form_of_csv_json_and_text(tmp_path):
@@ -87,7 +88,7 @@ def test_every_form_of_csv_json_and_text(tmp_path):
     found = read_performance(tmp_path / "take")
     (tmp_path / "take/transforms.json").touch()
     assert not is_performance(tmp_path / "take")
-    np.testing.assert_allclose(found.weights[:, :51], WEIGHTS[:, :51], atol=1e-6)
+    assert_allclose(found.weights[:, :51], WEIGHTS[:, :51], atol=1e-6)
     assert not found.weights[:, 51].any()
     order = RNG.permutation(52)
     names = [ARKIT_SHAPES[k] for k in order]
@@ -106,20 +107,20 @@ def test_every_form_of_csv_json_and_text(tmp_path):
     for name, document in documents.items():
         (tmp_path / f"{name}.json").write_text(json.dumps(document))
         found = read_performance(tmp_path / f"{name}.json")
-        np.testing.assert_allclose(found.weights, WEIGHTS, err_msg=name)
+        assert_allclose(found.weights, WEIGHTS, err_msg=name)
         assert found.fps == pytest.approx(25), name
     header = ["timeCode", *(f"blendShapes.{PASCAL[k]}" for k in order)]
     lines = [",".join(map(str, [n / 25, *row])) for n, row in enumerate(rows)]
     (tmp_path / "a2f.csv").write_text("\n".join([",".join(header), *lines]))
     found = read_performance(tmp_path / "a2f.csv")
-    np.testing.assert_allclose(found.weights, WEIGHTS)
+    assert_allclose(found.weights, WEIGHTS)
     assert found.fps == pytest.approx(25)
     named = [dict(zip(ARKIT_SHAPES, row, strict=True)) for row in WEIGHTS]
     packets = [wire.facial_mocap(row, (90, 45, -30)) for row in named]
     (tmp_path / "take.txt").write_bytes(b"\n".join(packets))
     found = read_performance(tmp_path / "take.txt")
-    np.testing.assert_allclose(found.weights, WEIGHTS, atol=0.0051)  # whole percents
-    np.testing.assert_allclose(np.degrees(found.head), [[45, 90, -30]] * 6)
+    assert_allclose(found.weights, WEIGHTS, atol=0.0051)  # whole percents
+    assert_allclose(np.degrees(found.head), [[45, 90, -30]] * 6)
 
 
 @pytest.mark.parametrize(
@@ -187,10 +188,10 @@ def test_mirror_and_smoothing():
     base.weights[:, COLUMN["jawOpen"]] = 0.4
     other = mirrored(base)
     assert other.weights[20, COLUMN["eyeBlinkRight"]] == 1.0
-    np.testing.assert_allclose(other.head[0], [-0.1, 0.2, -0.3])
-    np.testing.assert_array_equal(mirrored(other).weights, base.weights)
+    assert_allclose(other.head[0], [-0.1, 0.2, -0.3])
+    assert_array_equal(mirrored(other).weights, base.weights)
     soft = smoothed(base, 0.05).weights
-    np.testing.assert_allclose(soft[:, COLUMN["jawOpen"]], 0.4)
+    assert_allclose(soft[:, COLUMN["jawOpen"]], 0.4)
     blink = soft[:, COLUMN["eyeBlinkLeft"]]
     assert blink.argmax() == 20
     assert blink.sum() == pytest.approx(1)

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
 from stga_addon.driving.open_motion import (
     MotionOptions,
@@ -22,7 +23,7 @@ ZERO = np.zeros(3)
 FRAME = FlameFrame(np.zeros(4), ZERO, ZERO, ZERO, ZERO, np.zeros(6))
 
 
-def talking(bias: np.ndarray, count: int = 60) -> list[FlameFrame]:
+def talking(bias, count=60):
     """Quiet for a third of the time, on top of what a face leaves in the coefficients."""
     time = np.arange(count)
     moves = np.where(time < count // 3, 0, np.sin(time))[:, None] * [2.0, -1.0, 0.5, 0.0]
@@ -38,15 +39,15 @@ def test_the_performers_own_face_is_left_out():
     own = np.array([0.2, 0.0, -0.1, 0.0])
     frames = talking(bias)
     theirs = quiet_neutral(frames)
-    np.testing.assert_allclose(theirs["face"], bias)
-    np.testing.assert_allclose(theirs["jaw"], 0)
+    assert_allclose(theirs["face"], bias)
+    assert_allclose(theirs["jaw"], 0)
     moved = exchanged_neutral(frames, theirs, quiet_neutral(talking(own)))
     for frame, expected in zip(moved, talking(own), strict=True):
-        np.testing.assert_allclose(frame.expr, expected.expr, atol=1e-12)
-        np.testing.assert_allclose(frame.jaw_pose, expected.jaw_pose, atol=1e-12)
+        assert_allclose(frame.expr, expected.expr, atol=1e-12)
+        assert_allclose(frame.jaw_pose, expected.jaw_pose, atol=1e-12)
     frames = talking(bias, 3000)
     shuffled = [frames[row] for row in np.random.default_rng(0).permutation(len(frames))]
-    np.testing.assert_allclose(quiet_neutral(shuffled)["face"], bias, atol=1e-12)
+    assert_allclose(quiet_neutral(shuffled)["face"], bias, atol=1e-12)
 
 
 @pytest.mark.parametrize("choice", ["quiet", "first", "calibrated"])
@@ -58,9 +59,9 @@ def test_a_motion_begins_on_the_heads_own_face(choice):
     rest = np.zeros(4) if choice == "calibrated" else np.array([1.0, 2.0, 3.0, 4.0])
     moved, _ = adapted(talking(rest), MotionOptions(neutral=choice), trained)
     expected = own[0].expr if choice == "first" else own[1].expr
-    np.testing.assert_allclose(moved[0].expr, expected, atol=1e-12)
+    assert_allclose(moved[0].expr, expected, atol=1e-12)
     change = talking(rest)[-1].expr - rest
-    np.testing.assert_allclose(moved[-1].expr - moved[0].expr, change, atol=1e-12)
+    assert_allclose(moved[-1].expr - moved[0].expr, change, atol=1e-12)
 
 
 def test_a_resting_face_that_is_not_zero():
@@ -72,8 +73,8 @@ def test_a_resting_face_that_is_not_zero():
     rest = quiet_weights(take)
     assert rest[3] == 0.2
     changed = relative_to(take, Performance(np.zeros(1), rest[None], None, 30.0)).weights[:, 3]
-    np.testing.assert_allclose(changed[:10], 0)
-    np.testing.assert_allclose(changed[10:15], 1)
+    assert_allclose(changed[:10], 0)
+    assert_allclose(changed[10:15], 1)
 
 
 def test_led_back_to_what_was_trained():
@@ -81,14 +82,14 @@ def test_led_back_to_what_was_trained():
     trained = trained_range(talking(np.zeros(4), 200))
     inside = talking(np.zeros(4))
     for before, after in zip(inside, led_back(inside, trained), strict=True):
-        np.testing.assert_allclose(after.expr, before.expr, atol=0.05)
+        assert_allclose(after.expr, before.expr, atol=0.05)
     wild = [replace(FRAME, expr=np.array([scale, 0, 0, 0])) for scale in (0.0, 4.0, 8.0, 100.0)]
     assert outside(wild, trained)["face"][0] == 0
-    np.testing.assert_allclose(outside(wild, trained)["face"][2], 3.0, rtol=0.05)
+    assert_allclose(outside(wild, trained)["face"][2], 3.0, rtol=0.05)
     assert not outside(wild, trained)["jaw"].any()
     led = [frame.expr[0] for frame in led_back(wild, trained)]
     assert led == sorted(led)
     assert 2.0 < led[1] < led[2] < led[3] <= 2.0 * 1.25 + 0.01
     half = led_back(wild, trained, 0.5)[2].expr[0]
     assert half == (8.0 + led[2]) / 2
-    np.testing.assert_array_equal(led_back(wild, trained, 0.0)[3].expr, wild[3].expr)
+    assert_array_equal(led_back(wild, trained, 0.0)[3].expr, wild[3].expr)

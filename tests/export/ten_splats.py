@@ -23,7 +23,7 @@ FRAME = 1
 CAMERA = np.array([0.0, 0.0, 1.0])
 
 
-def ten_splats() -> bytes:
+def ten_splats():
     """The file's bytes."""
     rng = np.random.default_rng(1)
     rigged = make.rigged()
@@ -40,7 +40,7 @@ def ten_splats() -> bytes:
     return skinned_glb(replace(rigged, avatar=avatar), Playback("Ten splats", 10.0))
 
 
-def placed(data: bytes) -> np.ndarray:
+def placed(data):
     """(N, 13): position, rotation wxyz, deviations and color of each splat at FRAME, as seen from
     CAMERA, by the rules of the page."""
     header, arrays = read_web_data(data)
@@ -69,7 +69,7 @@ def placed(data: bytes) -> np.ndarray:
     return np.array(rows)
 
 
-def table(rows: np.ndarray) -> str:
+def table(rows):
     """Rows of the page's table."""
     columns = (np.s_[:3], np.s_[3:7], np.s_[7:10], np.s_[10:])
     return "\n".join(

@@ -12,7 +12,6 @@ from capture import factory
 
 from export.web.conftest import make_head
 from stga_addon.avatar.embedding import to_world
-from stga_addon.avatar.file import Avatar
 from stga_addon.capture.open import open_capture
 from stga_addon.errors import StgaError
 from stga_addon.export.formats import FORMATS, export_avatar
@@ -20,18 +19,18 @@ from stga_addon.export.playback import DEFAULT_FPS, Playback, playback_fps
 from stga_addon.export.ply import read_ply
 
 
-def posed(avatar: Avatar, *numbers: int) -> list[tuple[int, np.ndarray]]:
+def posed(avatar, *numbers):
     """Meshes that are shifted by their numbers."""
     return [(number, avatar.neutral + np.float32(number)) for number in numbers]
 
 
-def is_posed(path: Path, avatar: Avatar, number: int) -> bool:
+def is_posed(path, avatar, number):
     """Whether a PLY file holds the avatar on a mesh of `posed`."""
     ((_, mesh),) = posed(avatar, number)
     return np.allclose(read_ply(path).xyz, to_world(avatar.splats, avatar.frames(mesh)).xyz)
 
 
-def contents(folder: Path) -> dict[str, bytes]:
+def contents(folder):
     return {path.name: path.read_bytes() for path in folder.iterdir()}
 
 

@@ -1,17 +1,16 @@
 """The GaussianAvatars pair: its exact layout, the change of convention, and the way back."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 from avatar.conftest import random_mesh, random_splats
+from numpy.testing import assert_allclose, assert_array_equal
 from scipy.spatial.transform import Rotation
 
 from stga_addon.avatar.embedding import face_frames, to_world
 from stga_addon.avatar.file import Avatar
 from stga_addon.avatar.offsets import OFFSETS
-from stga_addon.avatar.splats import Splats
 from stga_addon.avatar.strain import trained_range
 from stga_addon.errors import StgaError
 from stga_addon.export.ply import (
@@ -38,7 +37,7 @@ PLY_HEADER += "".join(f"property float {name}\n" for name in PROPERTIES).encode(
 
 
 @pytest.fixture
-def sequence() -> FlameSequence:
+def sequence():
     """A moving model of twenty vertices; a gap in its timesteps, one dynamic offset."""
     rng = np.random.default_rng(5)
     template, faces = random_mesh(5, VERTICES)
@@ -53,7 +52,7 @@ def sequence() -> FlameSequence:
         faces=faces,
     )
 
-    def float32(*shape: int) -> np.ndarray:
+    def float32(*shape):
         return rng.normal(size=shape).astype(np.float32).astype(np.float64) * 0.25
 
     sizes = (EXPRESSION, 3, 3, 3, 3, 6)
@@ -63,7 +62,7 @@ def sequence() -> FlameSequence:
     return FlameSequence(model, float32(IDENTITY), offset, (0, 2, 5), frames.__getitem__)
 
 
-def avatar_on(sequence: FlameSequence, convention: str) -> Avatar:
+def avatar_on(sequence, convention):
     neutral = neutral_mesh(sequence).astype(np.float32)
     faces = sequence.model.faces
     splats = random_splats(6, 50, len(faces), sh_degree=3)
@@ -85,16 +84,16 @@ def test_motion_holds_every_array_the_viewer_asks_for(tmp_path, sequence):
         "dynamic_offset": (3, VERTICES, 3),
     }
     assert {array.dtype for array in arrays.values()} == {np.dtype("float32")}
-    np.testing.assert_array_equal(arrays["jaw_pose"][2], sequence.frame(5).jaw_pose)
-    np.testing.assert_array_equal(arrays["dynamic_offset"][1], sequence.frame(2).dynamic_offset)
+    assert_array_equal(arrays["jaw_pose"][2], sequence.frame(5).jaw_pose)
+    assert_array_equal(arrays["dynamic_offset"][1], sequence.frame(2).dynamic_offset)
     assert not arrays["dynamic_offset"][[0, 2]].any()
     bare = replace(sequence, static_offset=None)
     write_gaussian_avatars(tmp_path, avatar_on(bare, "stga"), bare)
     with np.load(tmp_path / "flame_param.npz", allow_pickle=False) as data:
-        np.testing.assert_array_equal(data["static_offset"], np.zeros((VERTICES, 3)))
+        assert_array_equal(data["static_offset"], np.zeros((VERTICES, 3)))
 
 
-def bound_splats(path: Path) -> Splats:
+def bound_splats(path):
     """Splats in the "gaussian_avatars" convention, with triangles by binding_0."""
     vertices = read_vertices(path)
     splats = splats_of(path, vertices, print)
@@ -114,22 +113,22 @@ def test_pair_reads_back_to_the_same_moving_splats(tmp_path, sequence):
     content = (tmp_path / "point_cloud.ply").read_bytes()
     assert content.startswith(PLY_HEADER)
     rows = np.frombuffer(content[len(PLY_HEADER) :], "<f4").reshape(50, 63)
-    np.testing.assert_array_equal(rows[:, 9 + 15 + 2], avatar.splats.sh[:, 3, 1])
+    assert_array_equal(rows[:, 9 + 15 + 2], avatar.splats.sh[:, 3, 1])
     splats = bound_splats(tmp_path / "point_cloud.ply")
     motion = read_motion(tmp_path / "flame_param.npz", sequence.model)
     for name in ("xyz", "rotation", "log_scale", "opacity", "sh", "face", "unbound"):
         found = getattr(splats, name)
         expected = getattr(avatar.splats, name)
-        np.testing.assert_array_equal(found, expected, err_msg=name)
+        assert_array_equal(found, expected, err_msg=name)
         assert found.dtype == expected.dtype
     for mine, timestep in zip(motion.timesteps, sequence.timesteps, strict=True):
         expected = sequence_mesh(sequence, timestep)
-        np.testing.assert_allclose(sequence_mesh(motion, mine), expected, atol=1e-12)
+        assert_allclose(sequence_mesh(motion, mine), expected, atol=1e-12)
     with pytest.raises(StgaError, match="binding_0: these splats lie in the frames"):
         read_ply(tmp_path / "point_cloud.ply")  # whose picture would be splats of meters
 
 
-def viewer_world(row: Splats, corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def viewer_world(row, corners):
     """Position (3,) and covariance (3, 3) of one splat on its triangle, by definition."""
     p, q, r = corners
     first = (q - p) / np.linalg.norm(q - p)
@@ -155,7 +154,7 @@ def test_colors_are_those_of_the_neutral_mesh(tmp_path, sequence, convention):
     assert np.abs(avatar.frames(avatar.neutral).color).max() < 1e-5
     write_gaussian_avatars(tmp_path, avatar, sequence)
     written = bound_splats(tmp_path / "point_cloud.ply").sh
-    np.testing.assert_array_equal(written, avatar.splats.sh)
+    assert_array_equal(written, avatar.splats.sh)
 
 
 def test_avatar_of_the_other_convention_stands_where_it_stood(tmp_path, sequence):
@@ -165,15 +164,15 @@ def test_avatar_of_the_other_convention_stands_where_it_stood(tmp_path, sequence
     splats = bound_splats(tmp_path / "point_cloud.ply")
     neutral = avatar.neutral.astype(np.float64)
     world = to_world(avatar.splats, face_frames(neutral, avatar.faces, neutral, "stga"))
-    np.testing.assert_array_equal(splats.face, avatar.splats.face)
-    np.testing.assert_array_equal(splats.sh, avatar.splats.sh)
+    assert_array_equal(splats.face, avatar.splats.face)
+    assert_array_equal(splats.sh, avatar.splats.sh)
     turns = Rotation.from_quat(world.rotation, scalar_first=True).as_matrix()
     axes = turns * np.exp(world.log_scale)[:, None]
     for i, face in enumerate(splats.face):
         position, covariance = viewer_world(splats.rows([i]), neutral[avatar.faces[face]])
         expected = axes[i] @ axes[i].T
-        np.testing.assert_allclose(position, world.xyz[i], atol=2e-6)
-        np.testing.assert_allclose(covariance, expected, atol=5e-6 * np.abs(covariance).max())
+        assert_allclose(position, world.xyz[i], atol=2e-6)
+        assert_allclose(covariance, expected, atol=5e-6 * np.abs(covariance).max())
 
 
 def test_conversion_there_and_back_keeps_precision_far_from_the_origin(sequence):
@@ -183,6 +182,6 @@ def test_conversion_there_and_back_keeps_precision_far_from_the_origin(sequence)
     splats = in_convention(far, "gaussian_avatars")
     there = replace(far, splats=splats, convention="gaussian_avatars")
     back = in_convention(there, "stga")
-    np.testing.assert_allclose(back.xyz, avatar.splats.xyz, rtol=1e-5, atol=1e-6)
-    np.testing.assert_allclose(back.log_scale, avatar.splats.log_scale, atol=1e-5)
+    assert_allclose(back.xyz, avatar.splats.xyz, rtol=1e-5, atol=1e-6)
+    assert_allclose(back.log_scale, avatar.splats.log_scale, atol=1e-5)
     assert in_convention(far, "stga") is far.splats

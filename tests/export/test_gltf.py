@@ -5,12 +5,12 @@ import os
 import struct
 import subprocess
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 import trimesh
 from avatar.conftest import random_splats, rendered, world_splats
+from numpy.testing import assert_allclose, assert_array_equal
 from scipy.spatial.transform import Rotation
 
 from stga_addon.avatar.embedding import to_world
@@ -24,7 +24,7 @@ UNSIGNED_BYTE = 5121
 COMPONENTS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
 
 
-def parsed(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+def parsed(path):
     """The document and the only primitive's attributes; checks the container."""
     data = path.read_bytes()
     magic, version, length, size, kind = struct.unpack("<4sIII4s", data[:20])
@@ -41,7 +41,7 @@ def parsed(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     return document, {name: column(document, binary, index) for name, index in attributes}
 
 
-def column(document: dict[str, Any], binary: bytes, index: int) -> np.ndarray:
+def column(document, binary, index):
     accessor = document["accessors"][index]
     view = document["bufferViews"][accessor["bufferView"]]
     width = COMPONENTS[accessor["type"]]
@@ -52,7 +52,7 @@ def column(document: dict[str, Any], binary: bytes, index: int) -> np.ndarray:
     return flat.reshape(-1, width)
 
 
-def harmonic_names(degree: int) -> list[str]:
+def harmonic_names(degree):
     return [f"SH_DEGREE_{n}_COEF_{i}" for n in range(degree + 1) for i in range(2 * n + 1)]
 
 
@@ -83,10 +83,10 @@ def test_keeps_the_specification(avatar, tmp_path, degree):
         accessor = document["accessors"][primitive["attributes"][name]]
         assert (accessor["type"], accessor["componentType"], accessor["count"]) == (kind, FLOAT, 50)
     position = document["accessors"][primitive["attributes"]["POSITION"]]
-    np.testing.assert_array_equal(position["min"], attributes["POSITION"].min(axis=0))
-    np.testing.assert_array_equal(position["max"], attributes["POSITION"].max(axis=0))
+    assert_array_equal(position["min"], attributes["POSITION"].min(axis=0))
+    assert_array_equal(position["max"], attributes["POSITION"].max(axis=0))
     lengths = np.linalg.norm(attributes[PREFIX + "ROTATION"], axis=1)
-    np.testing.assert_allclose(lengths, 1, atol=1e-6)
+    assert_allclose(lengths, 1, atol=1e-6)
     assert attributes[PREFIX + "SCALE"].min() >= 0
     assert 0 <= attributes[PREFIX + "OPACITY"].min() <= attributes[PREFIX + "OPACITY"].max() <= 1
 
@@ -106,12 +106,12 @@ def test_renders_equal(avatar, tmp_path):
     expected = to_world(avatar.splats, avatar.frames(avatar.neutral))
     assert np.abs(rendered(again) - rendered(expected)).max() < 1e-4
     (cloud,) = trimesh.load(tmp_path / "a.glb").geometry.values()
-    np.testing.assert_array_equal(cloud.vertices, expected.xyz)
+    assert_array_equal(cloud.vertices, expected.xyz)
     color = np.clip(0.5 + SH_C0 * expected.sh[:, 0], 0, 1)
     display = np.asarray(cloud.colors)[:, :3] / 255
     encoded = np.where(display <= 0.0031308, 12.92 * display, 1.055 * display ** (1 / 2.4) - 0.055)
     # 8 bits of linear light are coarse in the dark
-    np.testing.assert_allclose(encoded, color, atol=0.03)
+    assert_allclose(encoded, color, atol=0.03)
 
 
 LOAD = """
@@ -153,11 +153,11 @@ def test_three_reads_it(avatar, tmp_path):
     found = json.loads(done.stdout)
     world = to_world(avatar.splats, avatar.frames(avatar.neutral))
     assert found["extension"]["kernel"] == "ellipse"
-    np.testing.assert_allclose(np.reshape(found["position"], (-1, 3)), world.xyz)
+    assert_allclose(np.reshape(found["position"], (-1, 3)), world.xyz)
     rotations = Rotation.from_quat(world.unit_rotations(), scalar_first=True).as_matrix()
     axes = rotations * world.scales()[:, None]
     covariance = (axes @ axes.transpose(0, 2, 1))[:, *np.triu_indices(3)]
-    np.testing.assert_allclose(np.reshape(found["covariance"], (-1, 6)), covariance, atol=1e-7)
+    assert_allclose(np.reshape(found["covariance"], (-1, 6)), covariance, atol=1e-7)
     alpha = np.reshape(found["color"], (-1, 4))[:, 3]
-    np.testing.assert_allclose(alpha, world.opacities() * 255, atol=0.51)
+    assert_allclose(alpha, world.opacities() * 255, atol=0.51)
     assert "sphericalHarmonics3" in found

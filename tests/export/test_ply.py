@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import trimesh
 from avatar.conftest import random_splats
+from numpy.testing import assert_array_equal
 
-from stga_addon.avatar.splats import Splats
 from stga_addon.errors import StgaError
 from stga_addon.export.ply import read_ply, write_ply
 from stga_addon.export.splat_files import read_splats
@@ -19,7 +19,7 @@ CODES = {name: code for code, *names in map(str.split, TYPES.split(",")) for nam
 writers."""
 
 
-def world_splats(count: int = 20, sh_degree: int = 3) -> Splats:
+def world_splats(count=20, sh_degree=3):
     splats = random_splats(0, count, 1, sh_degree)
     return replace(splats, unbound=np.zeros(count, bool))
 
@@ -39,12 +39,12 @@ def by_hand(kind, properties, rows, *before):
     return "\n".join([*lines, ""]).encode() + body
 
 
-def layout(rest: int) -> list[str]:
+def layout(rest):
     names = [*"xyz", *(f"f_dc_{i}" for i in range(3)), *(f"f_rest_{i}" for i in range(rest))]
     return [*names, "opacity", *(f"scale_{i}" for i in range(3)), *(f"rot_{i}" for i in range(4))]
 
 
-def numbered_rows(names: list[str]) -> list[dict[str, float]]:
+def numbered_rows(names):
     return [{name: i + 100 * row for i, name in enumerate(names)} for row in range(2)]
 
 
@@ -59,7 +59,7 @@ def test_round_trip_is_exact(tmp_path, count, sh_degree):
     for name in ("xyz", "rotation", "log_scale", "opacity", "sh", "face", "unbound"):
         want = padded if name == "sh" else getattr(splats, name)
         assert getattr(back, name).dtype == want.dtype, name
-        np.testing.assert_array_equal(getattr(back, name), want, err_msg=name)
+        assert_array_equal(getattr(back, name), want, err_msg=name)
 
 
 def test_real_file_is_rewritten_byte_for_byte(shared_data, tmp_path):
@@ -77,7 +77,7 @@ def test_file_is_the_standard_layout(tmp_path):
     and a header that only our own reader understands."""
     splats = world_splats(3)
     write_ply(tmp_path / "a.ply", splats)
-    np.testing.assert_array_equal(np.float32(trimesh.load(tmp_path / "a.ply").vertices), splats.xyz)
+    assert_array_equal(np.float32(trimesh.load(tmp_path / "a.ply").vertices), splats.xyz)
     head, _, body = (tmp_path / "a.ply").read_bytes().partition(b"end_header\n")
     lines = head.decode().splitlines()
     names = [line.split()[-1] for line in lines if line.startswith("property float")]
@@ -85,12 +85,12 @@ def test_file_is_the_standard_layout(tmp_path):
     assert lines[:3] == ["ply", "format binary_little_endian 1.0", "element vertex 3"]
     column = dict(zip(names, np.frombuffer(body, "<f4").reshape(3, len(names)).T, strict=True))
     for c in range(3):
-        np.testing.assert_array_equal(column[f"f_dc_{c}"], splats.sh[:, 0, c])
+        assert_array_equal(column[f"f_dc_{c}"], splats.sh[:, 0, c])
         rest = [column[f"f_rest_{15 * c + k}"] for k in range(15)]
-        np.testing.assert_array_equal(rest, splats.sh[:, 1:, c].T)
-    np.testing.assert_array_equal(column["opacity"], splats.opacity)
-    np.testing.assert_array_equal(column["rot_0"], splats.rotation[:, 0])
-    np.testing.assert_array_equal(column["scale_2"], splats.log_scale[:, 2])
+        assert_array_equal(rest, splats.sh[:, 1:, c].T)
+    assert_array_equal(column["opacity"], splats.opacity)
+    assert_array_equal(column["rot_0"], splats.rotation[:, 0])
+    assert_array_equal(column["scale_2"], splats.log_scale[:, 2])
     assert not any(column[name].any() for name in ("nx", "ny", "nz"))
 
 
@@ -141,7 +141,7 @@ def test_elements_before_and_after_the_vertices_and_windows_line_ends(tmp_path):
         assert read_ply(tmp_path / "a.ply").xyz.tolist() == [[0, 1, 2], [100, 101, 102]]
 
 
-def head(body: str) -> bytes:
+def head(body):
     return f"ply\nformat binary_little_endian 1.0\n{body}end_header\n".encode()
 
 
@@ -151,7 +151,7 @@ GOOD = "".join(f"property float {name}\n" for name in layout(0))
 BEFORE = "element camera 2\nproperty float a\nproperty uchar b\n"  # 10 bytes of data
 
 
-def ascii_head(body: str) -> bytes:
+def ascii_head(body):
     return head(body).replace(b"binary_little_endian", b"ascii")
 
 

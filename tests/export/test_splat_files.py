@@ -2,11 +2,11 @@
 
 import gzip
 import struct
-from pathlib import Path
 
 import numpy as np
 import pytest
 from avatar.conftest import random_splats
+from numpy.testing import assert_allclose
 
 from stga_addon.errors import StgaError
 from stga_addon.export.splat_files import READERS, UNREAD_SUFFIXES, read_splats
@@ -19,7 +19,7 @@ KIND = "binary_little_endian"
 C0 = 0.28209479177387814
 
 
-def read(path: Path, content: bytes) -> tuple[object, list[str]]:
+def read(path, content):
     said = []
     path.write_bytes(content)
     return read_splats(path, said.append), said
@@ -40,8 +40,8 @@ def test_rows_that_are_not_finite_are_left_out(tmp_path):
         f"{tmp_path}/a.ply: left out splats: 3 of 7 splats hold values that are not finite"
     ]
     assert len(splats) == 4
-    np.testing.assert_allclose(splats.opacities()[2:], [1, 0], atol=1e-6)
-    np.testing.assert_allclose(splats.scales()[2], [np.exp(0.5), 0, np.exp(0.5)], atol=1e-6)
+    assert_allclose(splats.opacities()[2:], [1, 0], atol=1e-6)
+    assert_allclose(splats.scales()[2], [np.exp(0.5), 0, np.exp(0.5)], atol=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -59,7 +59,7 @@ def test_plain_colors(tmp_path, kind, names, white):
     rows = [dict.fromkeys(others, 0.1) | dict(zip(names, (0, white, white), strict=True))] * 2
     kinds = dict.fromkeys(others, "float") | dict.fromkeys(names, kind)
     splats, _ = read(tmp_path / "a.ply", by_hand(KIND, kinds, rows))
-    np.testing.assert_allclose(0.5 + C0 * splats.sh[:, 0], [[0, 1, 1]] * 2, atol=1e-6)
+    assert_allclose(0.5 + C0 * splats.sh[:, 0], [[0, 1, 1]] * 2, atol=1e-6)
 
 
 def test_other_layouts_of_trainers(tmp_path):
@@ -86,15 +86,15 @@ def test_splat_by_its_bytes(tmp_path):
     splats, said = read(tmp_path / "a.splat", row + opaque)
     assert said == []
     assert splats.xyz[0].tolist() == [1, -2, 3]
-    np.testing.assert_allclose(splats.scales(), [[0.5, 0.25, 1], [0, 1, 1]], atol=1e-6)
-    np.testing.assert_allclose(splats.opacities(), [0.4, 1], atol=1e-6)
-    np.testing.assert_allclose(0.5 + C0 * splats.sh[0, 0], [1, 0, 0.2], atol=1e-6)
-    np.testing.assert_allclose(splats.rotation[0], [-1, 127 / 128, 0, 0])
+    assert_allclose(splats.scales(), [[0.5, 0.25, 1], [0, 1, 1]], atol=1e-6)
+    assert_allclose(splats.opacities(), [0.4, 1], atol=1e-6)
+    assert_allclose(0.5 + C0 * splats.sh[0, 0], [1, 0, 0.2], atol=1e-6)
+    assert_allclose(splats.rotation[0], [-1, 127 / 128, 0, 0])
     with pytest.raises(StgaError, match="no rows of 32"):
         read(tmp_path / "a.splat", row[:-1])
 
 
-def packed(version: int, degree: int = 1) -> bytes:
+def packed(version, degree=1):
     """An SPZ of one splat by Niantic's README: a quarter turn about z."""
     half = struct.pack("<3e", 1.5, -2, 0.25)
     turn = bytes([128, 128, round(127.5 * (0.5**0.5 + 1))])
@@ -115,12 +115,12 @@ def test_spz_by_its_bytes(tmp_path, version):
     """Catches an older version refused or misread: places of 16 bits, quaternions without w."""
     splats, said = read(tmp_path / "a.spz", packed(version))
     assert said == []
-    np.testing.assert_allclose(splats.xyz, [[1.5, -2, 0.25]])
-    np.testing.assert_allclose(splats.rotation, [[0.5**0.5, 0, 0, 0.5**0.5]], atol=5e-3)
-    np.testing.assert_allclose(splats.log_scale, [[0, 0, 0]])
-    np.testing.assert_allclose(splats.opacities(), [0.2], atol=1e-6)
-    np.testing.assert_allclose(splats.sh[0, 0], (np.array([128, 255, 0]) / 255 - 0.5) / 0.15, 1e-4)
-    np.testing.assert_allclose(splats.sh[0, 1:], [[0.5, -0.5, 0]] * 3)
+    assert_allclose(splats.xyz, [[1.5, -2, 0.25]])
+    assert_allclose(splats.rotation, [[0.5**0.5, 0, 0, 0.5**0.5]], atol=5e-3)
+    assert_allclose(splats.log_scale, [[0, 0, 0]])
+    assert_allclose(splats.opacities(), [0.2], atol=1e-6)
+    assert_allclose(splats.sh[0, 0], (np.array([128, 255, 0]) / 255 - 0.5) / 0.15, 1e-4)
+    assert_allclose(splats.sh[0, 1:], [[0.5, -0.5, 0]] * 3)
 
 
 def test_spz_that_was_written_here(tmp_path):
@@ -133,12 +133,12 @@ def test_spz_that_was_written_here(tmp_path):
     found = read_splats(path, said.append)
     expected = gsply.read_spz(path)
     assert "antialiased" in said[0]
-    np.testing.assert_allclose(found.xyz, expected.means, atol=1e-6)
-    np.testing.assert_allclose(found.log_scale, expected.scales, atol=1e-6)
-    np.testing.assert_allclose(found.sh[:, 1:], expected.shN, atol=1e-6)
-    np.testing.assert_allclose(found.sh[:, 0], expected.sh0, atol=1e-5)
+    assert_allclose(found.xyz, expected.means, atol=1e-6)
+    assert_allclose(found.log_scale, expected.scales, atol=1e-6)
+    assert_allclose(found.sh[:, 1:], expected.shN, atol=1e-6)
+    assert_allclose(found.sh[:, 0], expected.sh0, atol=1e-5)
     same = (found.unit_rotations() * expected.quats).sum(1)
-    np.testing.assert_allclose(np.abs(same), 1, atol=1e-5)
+    assert_allclose(np.abs(same), 1, atol=1e-5)
 
 
 @pytest.mark.parametrize(

@@ -2,15 +2,13 @@
 
 import gzip
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 from avatar.conftest import random_splats, rendered, world_splats
+from numpy.testing import assert_allclose
 
 from stga_addon.avatar.embedding import to_world
-from stga_addon.avatar.file import Avatar
-from stga_addon.avatar.splats import Splats
 from stga_addon.export.formats import export_avatar
 from stga_addon.export.spz import write_spz
 
@@ -27,7 +25,7 @@ def read(path):
     return splats, gzip.decompress(path.read_bytes())[14]
 
 
-def written(avatar: Avatar, path: Path) -> tuple[Splats, Splats, int]:
+def written(avatar, path):
     """What is in a file of the avatar, with coefficients of a trained head's magnitude, which the
     format can hold; what was to be in it; and flags."""
     splats = replace(avatar.splats, sh=avatar.splats.sh * np.float32(0.2))
@@ -43,11 +41,11 @@ def test_reads_back(avatar, tmp_path, degree, antialiased):
     avatar = replace(avatar, splats=random_splats(4, 300, 30, degree), antialiased=antialiased)
     found, world, flags = written(avatar, tmp_path / "a.spz")
     assert flags == antialiased
-    np.testing.assert_allclose(found.xyz, world.xyz, atol=2**-17)
-    np.testing.assert_allclose(found.log_scale, world.log_scale, atol=1 / 32 + 1e-6)
-    np.testing.assert_allclose(found.opacities(), world.opacities(), atol=1 / 510 + 1e-6)
-    np.testing.assert_allclose(found.sh[:, 1:], world.sh[:, 1:], atol=1 / 256 + 1e-6)
-    np.testing.assert_allclose(found.sh[:, 0], world.sh[:, 0], atol=1 / 510 / 0.15 + 1e-6)
+    assert_allclose(found.xyz, world.xyz, atol=2**-17)
+    assert_allclose(found.log_scale, world.log_scale, atol=1 / 32 + 1e-6)
+    assert_allclose(found.opacities(), world.opacities(), atol=1 / 510 + 1e-6)
+    assert_allclose(found.sh[:, 1:], world.sh[:, 1:], atol=1 / 256 + 1e-6)
+    assert_allclose(found.sh[:, 0], world.sh[:, 0], atol=1 / 510 / 0.15 + 1e-6)
     aligned = np.abs((found.unit_rotations() * world.unit_rotations()).sum(axis=1))
     assert np.degrees(2 * np.arccos(np.minimum(aligned, 1))).max() < 0.3
 
@@ -65,12 +63,12 @@ def test_far_and_extreme_splats(tmp_path):
     )
     write_spz(tmp_path / "far.spz", splats)
     found, _ = read(tmp_path / "far.spz")
-    np.testing.assert_allclose(found.xyz, splats.xyz, rtol=1e-6, atol=0.3)
+    assert_allclose(found.xyz, splats.xyz, rtol=1e-6, atol=0.3)
     assert (found.log_scale == -10).all()
     assert found.sh.min() > 0.9
-    np.testing.assert_allclose(np.abs(found.rotation), np.abs(splats.unit_rotations()), atol=2e-3)
+    assert_allclose(np.abs(found.rotation), np.abs(splats.unit_rotations()), atol=2e-3)
     write_spz(tmp_path / "near.spz", splats.rows(np.array([2])))
-    np.testing.assert_allclose(read(tmp_path / "near.spz")[0].xyz, splats.xyz[[2]], atol=2**-17)
+    assert_allclose(read(tmp_path / "near.spz")[0].xyz, splats.xyz[[2]], atol=2**-17)
 
 
 def test_renders_nearly_equal(avatar, tmp_path):

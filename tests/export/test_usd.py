@@ -1,18 +1,14 @@
 """USD: read back by USD, checked by its validators and more, rendered equal."""
 
 import sys
-from collections.abc import Iterator
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 from avatar.conftest import rendered, world_splats
+from numpy.testing import assert_allclose, assert_array_equal
 
 from stga_addon.avatar.embedding import to_world
-from stga_addon.avatar.file import Avatar
-from stga_addon.avatar.splats import Splats
 from stga_addon.errors import StgaError
 from stga_addon.export.formats import FORMATS, Content, export_avatar
 from stga_addon.export.playback import Playback
@@ -21,13 +17,13 @@ PLAYBACK = Playback(fps=30.0)
 MISSING = "the package usd-core is not installed"
 
 
-def moved(avatar: Avatar, frames: tuple[int, ...] = (3, 4, 7)) -> Iterator[tuple[int, np.ndarray]]:
+def moved(avatar, frames=(3, 4, 7)):
     rng = np.random.default_rng(2)
     for frame in frames:
         yield frame, avatar.neutral + rng.normal(0, 0.01, avatar.neutral.shape)
 
 
-def colored(avatar: Avatar) -> Avatar:
+def colored(avatar):
     rng = np.random.default_rng(3)
     shape = (len(avatar.faces), 3, 3)
     driven = {
@@ -37,12 +33,12 @@ def colored(avatar: Avatar) -> Avatar:
     return replace(avatar, driven_offsets=driven)
 
 
-def opened(path: Path) -> Any:
+def opened(path):
     usd = pytest.importorskip("pxr.Usd", reason=MISSING)
     return usd.Stage.Open(str(path))
 
 
-def splats_at(stage: Any, time: float) -> Splats:
+def splats_at(stage, time):
     """What USD's own class of the prim says, as splats; raises where array lengths differ."""
     vol = pytest.importorskip("pxr.UsdVol")
     field = vol.ParticleField3DGaussianSplat(stage.GetPrimAtPath("/Avatar/Splats"))
@@ -73,8 +69,8 @@ def test_reads_back_and_renders_equal(avatar, tmp_path, suffix, color):
     for frame, mesh in moved(avatar):
         expected = to_world(stage_of.splats, stage_of.frames(mesh))
         found = splats_at(stage, frame)
-        np.testing.assert_array_equal(found.xyz, expected.xyz)
-        np.testing.assert_allclose(np.linalg.norm(found.rotation, axis=1), 1, atol=1e-6)
+        assert_array_equal(found.xyz, expected.xyz)
+        assert_allclose(np.linalg.norm(found.rotation, axis=1), 1, atol=1e-6)
         pictures.append(rendered(found))
         assert np.abs(pictures[-1] - rendered(expected)).max() < 1e-3
     assert np.abs(pictures[0] - pictures[1]).max() > 0.05

@@ -1,8 +1,6 @@
 """A tiny head in FLAME's format, made of random numbers: no structure that a wrong index could hide
 behind."""
 
-from typing import Any
-
 import numpy as np
 import pytest
 
@@ -10,7 +8,7 @@ from stga_addon.flame.forward import FlameFrame
 from stga_addon.flame.model import FlameModel
 
 
-def random_arrays(seed: int = 0, vertices: int = 40, components: int = 12) -> dict[str, np.ndarray]:
+def random_arrays(seed=0, vertices=40, components=12):
     """The arrays of a FLAME model file, at a head's scale in meters."""
     rng = np.random.default_rng(seed)
     weights = rng.random((vertices, 5)) ** 4
@@ -27,7 +25,7 @@ def random_arrays(seed: int = 0, vertices: int = 40, components: int = 12) -> di
     }
 
 
-def random_frame(seed: int, n_expression: int) -> FlameFrame:
+def random_frame(seed, n_expression):
     """Large poses, so that a transposed rotation or a swapped joint is centimeters off."""
     rng = np.random.default_rng(seed)
     return FlameFrame(
@@ -40,7 +38,7 @@ def random_frame(seed: int, n_expression: int) -> FlameFrame:
     )
 
 
-def model_of(arrays: dict[str, Any], n_identity: int) -> FlameModel:
+def model_of(arrays, n_identity):
     """A FlameModel straight from arrays, without the reader that other tests put to the test."""
     return FlameModel(
         v_template=arrays["v_template"],
@@ -55,5 +53,5 @@ def model_of(arrays: dict[str, Any], n_identity: int) -> FlameModel:
 
 
 @pytest.fixture
-def tiny_flame() -> FlameModel:
+def tiny_flame():
     return model_of(random_arrays(), n_identity=8)

@@ -1,14 +1,12 @@
 """A FLAME model whose jaw opens, and what meets what in its mouth."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 from scipy.sparse import coo_matrix, diags
 from scipy.sparse.linalg import spsolve
 
 from stga_addon.flame.forward import flame_forward, neutral_frame
-from stga_addon.flame.model import FlameModel
 
 from .conftest import model_of, random_arrays
 
@@ -17,7 +15,7 @@ JOINT_POSITIONS_M = np.array(
 )
 
 
-def open_flame(shared_data: Path) -> FlameModel:
+def open_flame(shared_data):
     """FLAME 2023 Open's template and identity, with a skeleton and a jaw made here. Expressions and
     correctives stay random: they are not published openly."""
     with np.load(shared_data / "flame_open" / "flame2023_open_basis.npz") as data:
@@ -35,7 +33,7 @@ def open_flame(shared_data: Path) -> FlameModel:
     return replace(model, weights=weights, j_regressor=regressor)
 
 
-def jaw_weights(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+def jaw_weights(vertices, faces):
     """(V,) how much each vertex follows the jaw: 1 at chin and lower lip, 0 above the lips, as
     smooth as possible."""
     x, y, z = vertices.T
@@ -53,31 +51,31 @@ def jaw_weights(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     return np.clip(weights, 0, 1)
 
 
-def open_edges(faces: np.ndarray) -> list[tuple[int, int]]:
+def open_edges(faces):
     """The directed edges that one triangle has alone."""
     edges = set(map(tuple, edges_of(faces).tolist()))
     return [(a, b) for a, b in edges if (b, a) not in edges]
 
 
-def edges_of(faces: np.ndarray) -> np.ndarray:
+def edges_of(faces):
     """(3F, 2) the directed edges of triangles."""
     return np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
 
 
-def jaw_opened(model: FlameModel, degrees: float, shape: np.ndarray | None = None) -> np.ndarray:
+def jaw_opened(model, degrees, shape=None):
     """The mesh (V, 3) with the jaw opened, without expression or correctives."""
     model = replace(model, posedirs=np.zeros_like(model.posedirs))
     frame = replace(neutral_frame(model), jaw_pose=np.array([np.radians(degrees), 0, 0]))
     return flame_forward(model, np.zeros(model.n_identity) if shape is None else shape, frame, None)
 
 
-def crossings(vertices: np.ndarray, skin: np.ndarray, teeth: np.ndarray) -> int:
+def crossings(vertices, skin, teeth):
     """How many pairs of an edge of one and a triangle of the other, of two sets of triangles,
     meet."""
     return _pierced(vertices, teeth, skin) + _pierced(vertices, skin, teeth)
 
 
-def _pierced(vertices: np.ndarray, edged: np.ndarray, pierced: np.ndarray) -> int:
+def _pierced(vertices, edged, pierced):
     edges = np.unique(np.sort(edges_of(edged), axis=1), axis=0)
     ends = vertices[edges]
     corners = vertices[pierced]
@@ -98,14 +96,14 @@ def _pierced(vertices: np.ndarray, edged: np.ndarray, pierced: np.ndarray) -> in
     return int(met.sum())
 
 
-def _near(some: np.ndarray, others: np.ndarray) -> np.ndarray:
+def _near(some, others):
     """Those of some (n, k, 3) that touch the box around the others."""
     low = others.min((0, 1))
     high = others.max((0, 1))
     return np.asarray(some[((some.min(1) <= high) & (some.max(1) >= low)).all(1)])
 
 
-def covered_from_front(vertices: np.ndarray, skin: np.ndarray, points: np.ndarray) -> np.ndarray:
+def covered_from_front(vertices, skin, points):
     """(n,) bool: points (n, 3) with a triangle of the skin in front of them, along z."""
     corners = vertices[skin]
     corners = corners[corners[:, :, 2].max(1) > points[:, 2].min()]
@@ -113,7 +111,7 @@ def covered_from_front(vertices: np.ndarray, skin: np.ndarray, points: np.ndarra
     b = corners[None, :, 1]
     c = corners[None, :, 2]
 
-    def twice_area(p: np.ndarray, q: np.ndarray, r: np.ndarray) -> np.ndarray:
+    def twice_area(p, q, r):
         first = q - p
         second = r - p
         return first[..., 0] * second[..., 1] - first[..., 1] * second[..., 0]

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from stga_addon.files import read_npz, write_npz
-from stga_addon.flame.model import MASK_PREFIX, FlameModel, read_flame
+from stga_addon.flame.model import MASK_PREFIX, read_flame
 
 FILE = Path(__file__).with_name("small_head.npz")
 EXPRESSIONS = (
@@ -30,7 +30,7 @@ EXPRESSIONS = (
 """Of which a coefficient of 1 is one full action. Ten components of identity come before them."""
 
 
-def small_head(person: int) -> FlameModel:
+def small_head(person):
     """The model whose template is a person's, one for each number."""
     model = read_flame(FILE)
     own = 0.6 * np.random.default_rng(person).normal(size=model.n_identity)
@@ -38,7 +38,7 @@ def small_head(person: int) -> FlameModel:
     return replace(model, v_template=model.v_template + moved)
 
 
-def small_head_colors() -> np.ndarray:
+def small_head_colors():
     """(V, 3) linear RGB."""
     return read_npz(FILE)["colors"].astype(np.float64)
 
@@ -52,7 +52,7 @@ def subdivided(model, *values):
     ab, bc, ca = len(model.v_template) + middle.reshape(-1, 3).T
     corners = [(a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca)]
 
-    def more(array: np.ndarray) -> np.ndarray:
+    def more(array):
         return np.concatenate([array, array[ends].mean(axis=1)])
 
     fine = replace(
@@ -67,7 +67,7 @@ def subdivided(model, *values):
     return fine, *map(more, values)
 
 
-def write_flame(model: FlameModel, path: Path) -> None:
+def write_flame(model, path):
     """Write a model as .npz with FLAME's keys; `n_identity` and `masks/<region>` are stored beside
     them."""
     parents = model.parents.astype(np.int64) % (1 << 32)  # FLAME spells the root's parent 2**32 - 1

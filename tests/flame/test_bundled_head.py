@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from numpy.linalg import norm
+from numpy.testing import assert_allclose, assert_array_equal
 from scipy.spatial import cKDTree
 
 from stga_addon.capture.camera import look_at
@@ -87,13 +88,13 @@ def test_eyeballs_turn_in_their_lids(head):
         eyeball = head.masks[f"{side}_eyeball"]
         center = joints[JOINTS.index(joint)]
         radius = [norm(mesh[eyeball] - center, axis=1) for mesh in (straight, looking)]
-        np.testing.assert_allclose(*radius, atol=1e-9)
+        assert_allclose(*radius, atol=1e-9)
         assert np.ptp(radius[0]) < 0.0025  # a ball with a cornea
         front = eyeball[straight[eyeball, 2].argmax()]
         assert looking[front, 0] > straight[front, 0] + 0.003  # about +y, towards the person's left
     eyeballs = np.concatenate([head.masks[f"{side}_eyeball"] for side in ("left", "right")])
     skin = np.setdiff1d(np.arange(len(straight)), eyeballs)
-    np.testing.assert_array_equal(looking[skin], straight[skin])
+    assert_array_equal(looking[skin], straight[skin])
 
 
 def seen_eyeball(model, shape, **weights):
@@ -171,11 +172,11 @@ def test_neck_turns_the_skull_alone(head):
     assert np.isin(head.masks["teeth"], skull).all()
     assert np.isin(head.masks["nose"], skull).all()
     both = (mesh[skull] - mesh[skull].mean(0) for mesh in (straight, turned))
-    np.testing.assert_allclose(*(norm(mesh, axis=1) for mesh in both), atol=1e-9)
+    assert_allclose(*(norm(mesh, axis=1) for mesh in both), atol=1e-9)
     torso = np.unique(head.faces[torso_faces(head)])
     assert norm(turned[torso] - straight[torso], axis=1).max() < 0.012
     bottom = torso[straight[torso, 1] < -0.15]
-    np.testing.assert_allclose(turned[bottom], straight[bottom], atol=1e-9)
+    assert_allclose(turned[bottom], straight[bottom], atol=1e-9)
 
 
 def test_lips_part_when_the_jaw_opens(head):
@@ -198,10 +199,10 @@ def test_arkits_weights_are_its_coefficients(head):
     weights[1, COLUMN["browInnerUp"]] = 0.9
     found = head_map(sequence, "bundled")
     frames = found.frames(Performance(np.arange(2.0), weights, None, 1.0))
-    np.testing.assert_allclose(frames[0].expr, expression(head, **given), atol=1e-12)
+    assert_allclose(frames[0].expr, expression(head, **given), atol=1e-12)
     assert frames[0].eyes_pose[1] > 0.5  # the left eye looks to the person's left
     assert not np.any([frame.jaw_pose for frame in frames])
-    np.testing.assert_allclose(arkit_weights(frames, found, sequence), weights, atol=1e-12)
+    assert_allclose(arkit_weights(frames, found, sequence), weights, atol=1e-12)
 
 
 def test_a_changed_model_file_is_read_again(tmp_path):

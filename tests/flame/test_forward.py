@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from numpy.random import default_rng
+from numpy.testing import assert_allclose, assert_array_equal
 from scipy.spatial.transform import Rotation
 
 from stga_addon.flame.forward import (
@@ -43,7 +44,7 @@ def test_same_as_four_by_four_matrices_vertex_by_vertex(tiny_flame):
         moved = rest + model.posedirs[vertex] @ feature
         skinned = [world[joint] @ np.r_[moved - joints[joint], 1] for joint in range(5)]
         expected[vertex] = (model.weights[vertex] @ skinned)[:3] + frame.translation
-    np.testing.assert_allclose(flame_forward(model, shape, frame, offsets[0]), expected, atol=1e-12)
+    assert_allclose(flame_forward(model, shape, frame, offsets[0]), expected, atol=1e-12)
 
 
 def test_equals_smplx(tmp_path):
@@ -83,7 +84,7 @@ def test_the_gradient_is_that_of_differences(tiny_flame, frame):
         for step in 0.01 * np.eye(22)
     ]
     found = parameters_gradient(person, replace(frame, dynamic_offset=offset), outer)
-    np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-12)
+    assert_allclose(found, expected, rtol=1e-9, atol=1e-12)
 
 
 def test_matrices_are_those_of_scipy():
@@ -91,5 +92,5 @@ def test_matrices_are_those_of_scipy():
     rotated."""
     quaternions = default_rng(0).normal(size=(4, 5, 4))
     expected = Rotation.from_quat(np.roll(quaternions, -1, axis=-1).reshape(-1, 4)).as_matrix()
-    np.testing.assert_allclose(to_matrices(quaternions).reshape(-1, 3, 3), expected, atol=1e-12)
-    np.testing.assert_array_equal(to_matrices(np.zeros(4)), np.eye(3))
+    assert_allclose(to_matrices(quaternions).reshape(-1, 3, 3), expected, atol=1e-12)
+    assert_array_equal(to_matrices(np.zeros(4)), np.eye(3))

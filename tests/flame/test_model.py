@@ -5,7 +5,6 @@ import codecs
 import os
 import pickle
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -22,7 +21,7 @@ from stga_addon.flame.unpickle import _RestrictedUnpickler, read_pickled_arrays
 from .conftest import random_arrays
 
 
-def _assert_model(path: Path, arrays: dict[str, np.ndarray]) -> None:
+def _assert_model(path, arrays):
     model = read_flame(path)
     named = {"j_regressor": "J_regressor", "faces": "f"}
     for name in ("v_template", "shapedirs", "posedirs", "j_regressor", "weights", "faces"):
@@ -89,7 +88,7 @@ def test_mask_file_beside_the_model(tmp_path):
     assert "mouth" not in keys
 
 
-def python2_masks(end: str = "\n") -> bytes:
+def python2_masks(end="\n"):
     """FLAME_masks.pkl as Python 2's pickle.dump(masks, file) wrote the published one."""
     text = "(dp0\n"
     for name, ids in (("nose", [0, 128, 200]), ("left_ear", [10, 13, 34])):
@@ -148,11 +147,11 @@ def test_what_stands_in_the_place_of_a_file(tmp_path, name, read):
 
 
 class _Attack:
-    def __init__(self, call: Any, *arguments: Any) -> None:
+    def __init__(self, call, *arguments):
         self.call = call
         self.arguments = arguments
 
-    def __reduce__(self) -> tuple[Any, tuple[Any, ...]]:
+    def __reduce__(self):
         return self.call, self.arguments
 
 

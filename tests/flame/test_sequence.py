@@ -1,24 +1,21 @@
 """Parameter files and the meshes they stand for."""
 
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 from numpy.random import default_rng
+from numpy.testing import assert_allclose, assert_array_equal
 from refusal import refusal
 from scipy.spatial.transform import Rotation, Slerp
 
 from stga_addon.flame.forward import (
-    FlameFrame,
     change_between,
     changed_by,
     flame_forward,
     neutral_frame,
     parameters_at,
 )
-from stga_addon.flame.model import FlameModel
 from stga_addon.flame.sequence import (
     FRAME_FIELDS,
     PARTS,
@@ -37,7 +34,7 @@ from stga_addon.flame.sequence import (
 from .conftest import random_frame
 
 
-def _arrays(seed: int, model: FlameModel) -> dict[str, np.ndarray]:
+def _arrays(seed, model):
     """A timestep as VHAP writes it: float32 with a leading 1."""
     frame = random_frame(seed, model.n_expression)
     rng = default_rng(seed)
@@ -47,7 +44,7 @@ def _arrays(seed: int, model: FlameModel) -> dict[str, np.ndarray]:
     return {name: value.astype(np.float32) for name, value in fields.items()}
 
 
-def _write(path: Path, arrays: dict[str, Any]) -> Path:
+def _write(path, arrays):
     np.savez(path, **arrays)
     return path
 
@@ -59,22 +56,22 @@ def test_a_frame_as_written(tmp_path, tiny_flame):
     path = _write(tmp_path / "00003.npz", arrays)
     frame = read_frame(path, tiny_flame)
     for name in FRAME_FIELDS:
-        np.testing.assert_array_equal(getattr(frame, name), arrays[name][0])
-    np.testing.assert_array_equal(frame.pose[3], arrays["eyes_pose"][0, :3])
+        assert_array_equal(getattr(frame, name), arrays[name][0])
+    assert_array_equal(frame.pose[3], arrays["eyes_pose"][0, :3])
     shape, offset = read_identity(path, tiny_flame)
-    np.testing.assert_array_equal(shape, arrays["shape"])
+    assert_array_equal(shape, arrays["shape"])
     assert offset is not None
-    np.testing.assert_array_equal(offset, arrays["static_offset"][0])
+    assert_array_equal(offset, arrays["static_offset"][0])
     assert frame.dynamic_offset is None
     sparse = {name: arrays[name] for name in ("rotation", "translation")}
     short = {"expr": arrays["expr"][0, :2], "shape": arrays["shape"][:3]}
     path = _write(tmp_path / "a.npz", {**sparse, **short})
     frame = read_frame(path, tiny_flame)
-    np.testing.assert_array_equal(frame.expr, [*arrays["expr"][0, :2], 0, 0])
+    assert_array_equal(frame.expr, [*arrays["expr"][0, :2], 0, 0])
     assert not frame.jaw_pose.any()
     assert not frame.eyes_pose.any()
     shape, offset = read_identity(path, tiny_flame)
-    np.testing.assert_array_equal(shape, [*arrays["shape"][:3], 0, 0, 0, 0, 0])
+    assert_array_equal(shape, [*arrays["shape"][:3], 0, 0, 0, 0, 0])
     assert offset is None
 
 
@@ -93,8 +90,7 @@ def test_offsets_without_and_with_teeth(tmp_path, tiny_flame, rows):
     given = default_rng(3).normal(size=(1, rows, 3))
     path = _write(tmp_path / "a.npz", {"shape": np.zeros(8), "static_offset": given})
     _, offset = read_identity(path, model)
-    assert offset is not None
-    np.testing.assert_array_equal(offset[:160], given[0, :160])
+    assert_array_equal(offset[:160], given[0, :160])
     assert not offset[160:].any()
 
 
@@ -112,13 +108,13 @@ def test_meshes_of_a_sequence(tiny_flame):
         return flame_forward(tiny_flame, sequence.shape, new, sequence.static_offset)
 
     still = {"rotation": zero, "translation": zero, "neck_pose": zero}
-    np.testing.assert_array_equal(sequence_mesh(sequence, 7), mesh())
-    np.testing.assert_array_equal(expression_mesh(sequence, 7, "head"), mesh(**still))
+    assert_array_equal(sequence_mesh(sequence, 7), mesh())
+    assert_array_equal(expression_mesh(sequence, 7, "head"), mesh(**still))
     calm = {**still, "jaw_pose": zero, "eyes_pose": np.zeros(6)}
-    np.testing.assert_array_equal(expression_mesh(sequence, 7, "all"), mesh(**calm))
-    np.testing.assert_array_equal(neutral_mesh(sequence), mesh(**calm, expr=np.zeros(4)))
+    assert_array_equal(expression_mesh(sequence, 7, "all"), mesh(**calm))
+    assert_array_equal(neutral_mesh(sequence), mesh(**calm, expr=np.zeros(4)))
     rest = tiny_flame.shapedirs[:, :, :8] @ sequence.shape + sequence.static_offset
-    np.testing.assert_allclose(neutral_mesh(sequence) - tiny_flame.v_template, rest, atol=1e-14)
+    assert_allclose(neutral_mesh(sequence) - tiny_flame.v_template, rest, atol=1e-14)
     with refusal("zero_pose"):
         expression_mesh(sequence, 7, "neck")
 
@@ -139,11 +135,11 @@ def test_a_motion_is_its_frames(tmp_path, tiny_flame):
         single = read_frame(_write(tmp_path / f"{timestep}.npz", {**arrays}), tiny_flame)
         single = replace(single, dynamic_offset=dynamic[timestep])
         expected = flame_forward(tiny_flame, shape, single, offset[0])
-        np.testing.assert_allclose(sequence_mesh(motion, timestep), expected, atol=1e-7)
+        assert_allclose(sequence_mesh(motion, timestep), expected, atol=1e-7)
     path = _write(tmp_path / "named.npz", {**moving, "timesteps": np.array([2, 3, 7])})
     named = read_motion(path, tiny_flame)
     assert named.timesteps == (2, 3, 7)
-    np.testing.assert_array_equal(sequence_mesh(named, 7), sequence_mesh(motion, 2))
+    assert_array_equal(sequence_mesh(named, 7), sequence_mesh(motion, 2))
 
 
 def test_plain_expression_and_pose_files(tmp_path, tiny_flame):
@@ -155,40 +151,40 @@ def test_plain_expression_and_pose_files(tmp_path, tiny_flame):
     path = _write(tmp_path / "a.npz", {"exp": expr[:, :2], "pose": pose[:, :6]})
     short = read_motion(path, tiny_flame)
     frame = short.frame(1)
-    np.testing.assert_array_equal(frame.expr, [*expr[1, :2], 0, 0])
-    np.testing.assert_array_equal(frame.rotation, pose[1, :3])
-    np.testing.assert_array_equal(frame.jaw_pose, pose[1, 3:6])
+    assert_array_equal(frame.expr, [*expr[1, :2], 0, 0])
+    assert_array_equal(frame.rotation, pose[1, :3])
+    assert_array_equal(frame.jaw_pose, pose[1, 3:6])
     others = [frame.neck_pose, frame.eyes_pose, frame.translation, short.shape]
     assert not np.concatenate(others).any()
     path = _write(tmp_path / "b.npz", {"pose": pose, "betas": np.ones((3, 8))})
     joints = read_motion(path, tiny_flame)
-    np.testing.assert_array_equal(joints.frame(2).pose, pose[2].reshape(5, 3))
-    np.testing.assert_array_equal(joints.shape, np.ones(8))
+    assert_array_equal(joints.frame(2).pose, pose[2].reshape(5, 3))
+    assert_array_equal(joints.shape, np.ones(8))
     assert not joints.frame(2).expr.any()
     # an avatar or a model file is no head that never moves
     with refusal(r"other\.npz: has none of expr, rotation"):
         read_motion(_write(tmp_path / "other.npz", {"xyz": np.zeros((4, 3))}), tiny_flame)
 
 
-def _matrices(vectors: np.ndarray) -> np.ndarray:
+def _matrices(vectors):
     return Rotation.from_rotvec(vectors.reshape(-1, 3)).as_matrix()
 
 
-def _between(first: np.ndarray, second: np.ndarray, share: float) -> np.ndarray:
+def _between(first, second, share):
     return np.asarray(Slerp([0, 1], Rotation.from_rotvec([first, second]))(share).as_matrix())
 
 
-def _motion(model: FlameModel, timesteps: tuple[int, ...] = (2, 3, 7)) -> FlameSequence:
+def _motion(model, timesteps=(2, 3, 7)):
     frames = {timestep: random_frame(timestep, 4) for timestep in timesteps}
     return FlameSequence(model, np.zeros(8), None, timesteps, frames.__getitem__)
 
 
-def _assert_same(frame: FlameFrame, other: FlameFrame) -> None:
+def _assert_same(frame, other):
     for name in ("expr", "translation"):
-        np.testing.assert_allclose(getattr(frame, name), getattr(other, name), atol=1e-12)
+        assert_allclose(getattr(frame, name), getattr(other, name), atol=1e-12)
     for name in ("rotation", "neck_pose", "jaw_pose", "eyes_pose"):
         both = (_matrices(getattr(own, name)) for own in (frame, other))
-        np.testing.assert_allclose(*both, atol=1e-12)
+        assert_allclose(*both, atol=1e-12)
 
 
 def test_parameters_between_timesteps_against_scipy():
@@ -209,16 +205,16 @@ def test_parameters_between_timesteps_against_scipy():
             for column in range(4, 19, 3):
                 own = slice(column, column + 3)
                 expected = _between(first[own], second[own], share)
-                np.testing.assert_allclose(_matrices(found[0, own])[0], expected, atol=1e-12)
+                assert_allclose(_matrices(found[0, own])[0], expected, atol=1e-12)
             rest = np.r_[:4, -3:0]
             mixed = (1 - share) * first[rest] + share * second[rest]
-            np.testing.assert_allclose(found[0, rest], mixed, atol=1e-12)
+            assert_allclose(found[0, rest], mixed, atol=1e-12)
     start, end = values
     again = changed_by(start, change_between(start, end))
     for own in (start, end, again):
         own[:, 4:-3] = Rotation.from_rotvec(own[:, 4:-3].reshape(-1, 3)).as_rotvec().reshape(40, 15)
-    np.testing.assert_allclose(again, end, atol=1e-9)
-    np.testing.assert_array_equal(changed_by(start, change_between(start, start)), start)
+    assert_allclose(again, end, atol=1e-9)
+    assert_array_equal(changed_by(start, change_between(start, start)), start)
 
 
 def test_the_same_speed_gives_the_frames_and_what_lies_between(tiny_flame):
@@ -232,11 +228,11 @@ def test_the_same_speed_gives_the_frames_and_what_lies_between(tiny_flame):
     start = motion.frame(3)
     end = motion.frame(7)
     between = frames[2]
-    np.testing.assert_allclose(between.expr, 0.75 * start.expr + 0.25 * end.expr, atol=1e-12)
+    assert_allclose(between.expr, 0.75 * start.expr + 0.25 * end.expr, atol=1e-12)
     expected = _between(start.jaw_pose, end.jaw_pose, 0.25)
-    np.testing.assert_allclose(_matrices(between.jaw_pose)[0], expected, atol=1e-12)
+    assert_allclose(_matrices(between.jaw_pose)[0], expected, atol=1e-12)
     expected = _between(start.eyes_pose[3:], end.eyes_pose[3:], 0.25)
-    np.testing.assert_allclose(_matrices(between.eyes_pose)[1], expected, atol=1e-12)
+    assert_allclose(_matrices(between.eyes_pose)[1], expected, atol=1e-12)
     (alone,) = retimed(_motion(tiny_flame, (5,)), 0.5)
     _assert_same(alone, random_frame(5, 4))
     for step, count in ((0.5, 11), (2.0, 3), (2.5, 3), (0.1, 51), (60 / 24, 3)):
@@ -256,12 +252,12 @@ def test_strength(tiny_flame):
     calm = {"expr": np.zeros(4), "neck_pose": np.zeros(3), "jaw_pose": np.zeros(3)}
     _assert_same(still, replace(frames[0], **calm, eyes_pose=np.zeros(6)))
     half = strengthened(frames, 0.5)[3]
-    np.testing.assert_allclose(half.expr, frames[3].expr / 2)
-    np.testing.assert_allclose(half.jaw_pose, frames[3].jaw_pose / 2, atol=1e-12)
+    assert_allclose(half.expr, frames[3].expr / 2)
+    assert_allclose(half.jaw_pose, frames[3].jaw_pose / 2, atol=1e-12)
     middle = (frames[0].translation + frames[3].translation) / 2
-    np.testing.assert_allclose(half.translation, middle)
+    assert_allclose(half.translation, middle)
     middle = _between(frames[0].rotation, frames[3].rotation, 0.5)
-    np.testing.assert_allclose(_matrices(half.rotation)[0], middle, atol=1e-12)
+    assert_allclose(_matrices(half.rotation)[0], middle, atol=1e-12)
 
 
 def test_driven_by_the_neutral_mesh_alone(tiny_flame):
@@ -275,16 +271,16 @@ def test_driven_by_the_neutral_mesh_alone(tiny_flame):
     neutral = flame_forward(tiny_flame, shape, neutral_frame(tiny_flame), offset)
     expected = flame_forward(tiny_flame, shape, random_frame(7, 4), offset)
     found = sequence_mesh(transferred_motion(motion, neutral), 7)
-    np.testing.assert_allclose(found, expected, atol=1e-12)
+    assert_allclose(found, expected, atol=1e-12)
 
 
 JOINTS_OF = ("rotation", "neck_pose", "jaw_pose", "eyes_pose")
 
 
-def _as_metrical_tracker_writes(frames: list[FlameFrame]) -> dict[str, np.ndarray]:
+def _as_metrical_tracker_writes(frames):
     """Arrays by its names: two rows of the jaw's and eyes' matrices, R and t of the head."""
 
-    def matrices(name: str) -> np.ndarray:
+    def matrices(name):
         vectors = np.stack([getattr(frame, name) for frame in frames])
         turns = Rotation.from_rotvec(vectors.reshape(-1, 3)).as_matrix()
         return turns.reshape(len(frames), -1, 3, 3)
@@ -311,7 +307,7 @@ def test_rotations_by_matrices_and_their_rows(tmp_path, tiny_flame):
     motion = read_motion(path, tiny_flame)
     for timestep, frame in enumerate(frames):
         found = motion.frame(timestep)
-        np.testing.assert_allclose(found.parameters, frame.parameters, atol=1e-6)
+        assert_allclose(found.parameters, frame.parameters, atol=1e-6)
     told = [text.removeprefix(f"{path}: ") for text in motion.warnings]
     begin = ["eyes, jaw: rotations of six", "R and t are read as", "eyelids is not read"]
     assert [text[: len(own)] for text, own in zip(told, begin, strict=True)] == begin
@@ -320,7 +316,7 @@ def test_rotations_by_matrices_and_their_rows(tmp_path, tiny_flame):
     single |= {"neck_pose": first["neck"][None], "jaw_pose": first["jaw"][None]}
     single |= {"eyes_pose": first["eyes"]}
     found = read_frame(_write(tmp_path / "00000.npz", single), tiny_flame)
-    np.testing.assert_allclose(found.parameters, frames[0].parameters, atol=1e-6)
+    assert_allclose(found.parameters, frames[0].parameters, atol=1e-6)
 
 
 @pytest.mark.parametrize("value", [2 * np.eye(3), np.diag([1, 1, -1]), np.zeros((3, 3))])

@@ -2,14 +2,13 @@
 
 import zlib
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 from numpy.linalg import norm
+from numpy.testing import assert_allclose, assert_array_equal
 from refusal import refusal
 
-from stga_addon.flame.model import FlameModel
 from stga_addon.flame.parts import key_regions
 from stga_addon.flame.teeth import lip_pairs, teeth_faces, with_teeth
 
@@ -29,12 +28,12 @@ LAYOUT_CRC32 = 0xB43FE122
 
 
 @pytest.fixture(scope="module")
-def flame_open(shared_data: Path) -> FlameModel:
+def flame_open(shared_data):
     return open_flame(shared_data)
 
 
 @pytest.fixture(scope="module")
-def toothed(flame_open: FlameModel) -> FlameModel:
+def toothed(flame_open):
     return with_teeth(flame_open)
 
 
@@ -44,17 +43,17 @@ def test_counts_and_untouched_head(flame_open, toothed):
     model = with_teeth(replace(flame_open, masks={"lips": np.concatenate(lip_pairs(flame_open))}))
     assert key_regions(model)["mouth"][9976:].all()
     for name in ("v_template", "shapedirs", "posedirs", "weights"):
-        np.testing.assert_array_equal(getattr(toothed, name)[:5023], getattr(flame_open, name))
-    np.testing.assert_array_equal(toothed.faces[:9976], flame_open.faces)
+        assert_array_equal(getattr(toothed, name)[:5023], getattr(flame_open, name))
+    assert_array_equal(toothed.faces[:9976], flame_open.faces)
     assert toothed.faces[9976:].min() == 5023
     assert set(toothed.faces[9976:].ravel()) == set(range(5023, 5143))
     jaw = np.isin(np.repeat(np.arange(8), 15), (LR, LE, LRB, LEB))
-    np.testing.assert_array_equal(toothed.weights[5023:][jaw], np.tile([0, 0, 1, 0, 0], (60, 1)))
-    np.testing.assert_array_equal(toothed.weights[5023:][~jaw], np.tile([0, 1, 0, 0, 0], (60, 1)))
+    assert_array_equal(toothed.weights[5023:][jaw], np.tile([0, 0, 1, 0, 0], (60, 1)))
+    assert_array_equal(toothed.weights[5023:][~jaw], np.tile([0, 1, 0, 0, 0], (60, 1)))
     assert not toothed.shapedirs[5023:, :, 60:].any()
     assert not toothed.posedirs[5023:].any()
     assert not toothed.j_regressor[:, 5023:].any()
-    np.testing.assert_array_equal(toothed.j_regressor[:, :5023], flame_open.j_regressor)
+    assert_array_equal(toothed.j_regressor[:, :5023], flame_open.j_regressor)
     corners = toothed.v_template[toothed.faces[9976:]]
     edges = corners[:, 1:] - corners[:, :1]
     double_area = norm(np.cross(edges[:, 0], edges[:, 1]), axis=1)
@@ -82,9 +81,9 @@ def test_rows_bite(toothed):
     """Catches rows that are upside down, far apart or larger than teeth, and an arch that is
     shifted, or turned towards one cheek."""
     rows = toothed.v_template[5023:].reshape(8, 15, 3)
-    np.testing.assert_allclose(rows[:, ::-1, 1:], rows[:, :, 1:], atol=1e-12)
+    assert_allclose(rows[:, ::-1, 1:], rows[:, :, 1:], atol=1e-12)
     plane = (rows[:, ::-1, 0] + rows[:, :, 0]) / 2
-    np.testing.assert_allclose(plane, plane[0, 0], atol=1e-12)
+    assert_allclose(plane, plane[0, 0], atol=1e-12)
     assert abs(plane[0, 0]) < 0.0003
     assert (np.diff(rows[:, :, 0]) < 0).all()
     assert 0.001 < (rows[LE, :, 1] - rows[UE, :, 1]).mean() < 0.004
@@ -127,7 +126,7 @@ def test_identity_carries_the_teeth(flame_open):
     expected[:, 0, 1] = at[:, 0]
     expected[:, 1, 2] = at[:, 1]
     expected[:, 2, 3] = at[:, 0] ** 2
-    np.testing.assert_allclose(found, expected, atol=1e-9)
+    assert_allclose(found, expected, atol=1e-9)
 
 
 def test_teeth_and_lips_come_from_the_mesh(flame_open, toothed):
@@ -138,11 +137,11 @@ def test_teeth_and_lips_come_from_the_mesh(flame_open, toothed):
     shapes = flame_open.shapedirs[order]
     template = 2 * flame_open.v_template[order]
     other = with_teeth(replace(flame_open, v_template=template, shapedirs=shapes, faces=faces))
-    np.testing.assert_allclose(other.v_template[5023:], 2 * toothed.v_template[5023:], atol=1e-9)
-    np.testing.assert_allclose(other.shapedirs[5023:], toothed.shapedirs[5023:], atol=1e-9)
-    np.testing.assert_array_equal(order[np.array(lip_pairs(other))], lip_pairs(toothed))
+    assert_allclose(other.v_template[5023:], 2 * toothed.v_template[5023:], atol=1e-9)
+    assert_allclose(other.shapedirs[5023:], toothed.shapedirs[5023:], atol=1e-9)
+    assert_array_equal(order[np.array(lip_pairs(other))], lip_pairs(toothed))
     upper, lower = (flame_open.v_template[ids] for ids in lip_pairs(toothed))
-    np.testing.assert_array_equal(lip_pairs(toothed), lip_pairs(flame_open))
+    assert_array_equal(lip_pairs(toothed), lip_pairs(flame_open))
     assert (np.diff(upper[:, 0]) < 0).all()
     assert (np.diff(lower[:, 0]) < 0).all()
     assert (upper[:, 1] > lower[:, 1]).all()

@@ -1,9 +1,5 @@
 """Generated arguments of each command about the files of a case, with some nonsense in them."""
 
-import random
-from pathlib import Path
-from typing import Any
-
 import stga_addon.development.commands  # noqa: F401 (adds its requests)
 from stga_addon.jobs import table as ask
 
@@ -18,7 +14,7 @@ TEXTS = [
 ]  # fmt: skip
 
 
-def generate_arguments(rng: random.Random, case: Path) -> tuple[list[str], dict[str, str]]:
+def generate_arguments(rng, case):
     """A command line about the files of the case, with some nonsense in it, and environment
     variables."""
     command = rng.choices(list(COMMANDS), [weight for weight, _ in COMMANDS.values()])[0]
@@ -36,7 +32,7 @@ def generate_arguments(rng: random.Random, case: Path) -> tuple[list[str], dict[
     return arguments, {n: v.encode("utf-8", "replace").decode() for n, v in chosen.items()}
 
 
-def some_path(rng: random.Random, case: Path, *likely: str) -> str:
+def some_path(rng, case, *likely):
     """Usually one of the `likely` names in the case, sometimes any file of it, sometimes
     nonsense."""
     chance = rng.random()
@@ -47,12 +43,12 @@ def some_path(rng: random.Random, case: Path, *likely: str) -> str:
     return rng.choice([*TEXTS, str(case / "none"), f"{case}/" + "a" * 300])
 
 
-def filled(rng: random.Random, case: Path, rows: list[Any]) -> list[str]:
+def filled(rng, case, rows):
     """Arguments of rows: a value by position; a tuple, an option that is there with a probability,
     its first value more often than the others; a list, one of several lists of rows; a function
     that makes some. "@a b": a path, mostly that of `a` or `b` in the case."""
 
-    def of(value: str) -> str:
+    def of(value):
         return some_path(rng, case, *value[1:].split()) if value.startswith("@") else value
 
     found = []
@@ -70,13 +66,13 @@ def filled(rng: random.Random, case: Path, rows: list[Any]) -> list[str]:
     return found
 
 
-def tracked_footage(case: Path) -> list[str]:
+def tracked_footage(case):
     """What `stga track` is given to track the footage of the case from its landmark files."""
     at = case / "footage"
     return [str(at / "footage"), "--model", str(at / "head.npz"), "--landmarks", str(at / "points")]
 
 
-def begun_avatar(rng: random.Random, case: Path) -> list[str]:
+def begun_avatar(rng, case):
     """As if a first call had been interrupted, sometimes."""
     if rng.random() < 0.4:
         (case / "new").mkdir(parents=True, exist_ok=True)
@@ -96,7 +92,7 @@ BATCH_PLANS = (
 )
 
 
-def batch_plan(rng: random.Random, case: Path) -> list[str]:
+def batch_plan(rng, case):
     value = rng.choice(['"val"', "1", "-1", "nan", "1e400", "[]", '"../x"', '""', "true"])
     plan = rng.choice(BATCH_PLANS).format(new=some_path(rng, case, "new"), value=value)
     (case / "plan.toml").write_bytes(plan.encode("utf-8", "surrogatepass"))
@@ -107,7 +103,7 @@ FLAME = (0.2, "--flame", "@flame/model.npz")
 MODEL = "@flame/model.npz"
 POINT = (0.2, "--principal-point", "vhap", "opencv", "center", *TEXTS)
 BARE = ["@mesh mesh release mesh/meshes", (0.05, "--flame", MODEL)]
-CAPTURE: list[Any] = [[BARE, BARE, ["@flame motion.npz", (0.9, "--flame", MODEL)]], POINT]
+CAPTURE = [[BARE, BARE, ["@flame motion.npz", (0.9, "--flame", MODEL)]], POINT]
 CHOICES = [f"{e}={c}" for e in ("jaw", "teeth", "tracking", "exposure") for c in ("on", "off")]
 EFFECT = (0.2, "--effect", *CHOICES, "jaw=auto", *TEXTS, "jaw=", "=on", "a" * 5000)
 DEVICE = (0.2, "--device", "cpu", "auto", "tpu")
@@ -115,7 +111,7 @@ SEED = (0.2, "--seed", "5", *NUMBERS)
 THRESHOLD = (0.2, "--threshold", "0.001", *NUMBERS)
 OUT = (1, "--out", "@new")
 FPS = (0.2, "--fps", "25", *NUMBERS)
-TRAIN: list[Any] = [
+TRAIN = [
     SEED,
     THRESHOLD,
     (0.2, "--target-psnr", "30", *NUMBERS),
@@ -124,10 +120,10 @@ TRAIN: list[Any] = [
     (0.3, "--strategy", "global", "selective", "gaussian-avatars", "x"),
 ]
 RESUMED = [["@mesh", (1, "--out", "@run unfinished")], ["@flame", (1, "--out", "@tracked run")]]
-RESUME: list[Any] = [RESUMED, (1, "--resume"), FLAME, [[], [], [], [], TRAIN]]
+RESUME = [RESUMED, (1, "--resume"), FLAME, [[], [], [], [], TRAIN]]
 ITERATIONS = (1, "--iterations", "1", "2")
 BUDGET = [[ITERATIONS], [ITERATIONS], [ITERATIONS], [(1, "--budget", "0.01s", *NUMBERS[:9])]]
-CONTINUE: list[Any] = [
+CONTINUE = [
     (1, "--iterations", "1", "2", "0", "x"),
     OUT,
     (0.2, "--growth", "0.5", *NUMBERS),
@@ -136,7 +132,7 @@ CONTINUE: list[Any] = [
     DEVICE,
 ]
 TAKE = "@take mesh flame"
-TRACK: list[Any] = [
+TRACK = [
     [
         [lambda _, case: tracked_footage(case), OUT, (0.2, "--focal", "900", *NUMBERS)],
         [
@@ -153,7 +149,7 @@ TRACK: list[Any] = [
 ]
 FORMATS = ("ply", "ply-sequence", "gaussian-avatars", "usd", "web", "gltf", "spz", "obj")
 SUFFIXES = {"usd": ".usdc", "web": ".html", "gltf": ".glb", "skinned-gltf": ".glb", "spz": ".spz"}
-COMMANDS: dict[str, tuple[float, list[Any]]] = {
+COMMANDS = {
     "info": (3, [*CAPTURE, EFFECT, DEVICE]),
     "select": (3, [
         *CAPTURE, THRESHOLD, (0.2, "--zero-pose", "head", "all", "x"), (0.3, "--out", "@new.npz"),

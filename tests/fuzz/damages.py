@@ -4,25 +4,21 @@ place."""
 import copy
 import json
 import os
-import random
 import warnings
 import zipfile
-from collections.abc import Callable
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 from PIL import Image
 
 from .arguments import TEXTS
 
-JSON_VALUES: list[Any] = [
+JSON_VALUES = [
     None, True, False, 0, 1, -1, 2.5, 10**30, -(10**400), 1e308, 1e-320, float("nan"),
     float("inf"), -float("inf"), "1", "nan", *TEXTS, "a" * 5000, "vhap", "opencv", "../x",
     "/dev/null", "images", "images/00000_00.png", [], {}, [[]], [None], [0] * 1000, {"": {}},
     [[0, 0, 0, 0]] * 4, [1e300] * 3, {"a": [1, {"b": None}]},
 ]  # fmt: skip
-ARRAYS: list[Callable[[np.ndarray], np.ndarray]] = [
+ARRAYS = [
     lambda a: a[:-1] if a.ndim else a.reshape(1), lambda a: a[None], lambda a: a.astype(np.float16),
     lambda a: np.zeros(0, a.dtype), lambda a: np.zeros((0, *a.shape[1:]), a.dtype),
     lambda a: np.full_like(a, 0),
@@ -38,7 +34,7 @@ BYTES = [
 ]  # fmt: skip
 
 
-def damage(rng: random.Random, case: Path, arguments: list[str]) -> str:
+def damage(rng, case, arguments):
     """Change one file of the case, mostly one that the arguments name; returns what was done to
     it."""
     files = sorted(path for path in case.rglob("*") if path.is_file() and not path.is_symlink())
@@ -50,18 +46,18 @@ def damage(rng: random.Random, case: Path, arguments: list[str]) -> str:
     return f"{path.relative_to(case)}: {done}"
 
 
-def damage_content(rng: random.Random, path: Path) -> str:
+def damage_content(rng, path):
     """Change what a file holds, its bytes or the values in it; returns what was done."""
     change = MUTATIONS.get(path.suffix, mutate_bytes) if rng.random() < 0.7 else mutate_bytes
     return f"{change.__name__} {change(rng, path)}"
 
 
-def mutate_bytes(rng: random.Random, path: Path) -> str:
+def mutate_bytes(rng, path):
     path.write_bytes(mutated(rng, path.read_bytes()))
     return ""
 
 
-def mutated(rng: random.Random, content: bytes) -> bytes:
+def mutated(rng, content):
     """A replacement, insertion, deletion, repetition or another bit, and sometimes an early end."""
     at = rng.randrange(len(content) + 1)
     length = rng.choice([0, 1, 2, 4, 8, 40])
@@ -72,7 +68,7 @@ def mutated(rng: random.Random, content: bytes) -> bytes:
     return content if rng.random() < 0.85 else content[: rng.randrange(len(content) + 1)]
 
 
-def mutate_json(rng: random.Random, path: Path) -> str:
+def mutate_json(rng, path):
     """Replace, delete, add or copy one value, at any depth."""
     try:
         text = path.read_text(encoding="utf-8")
@@ -105,7 +101,7 @@ def mutate_json(rng: random.Random, path: Path) -> str:
     return f"{kind} {trail}"
 
 
-def mutate_npz(rng: random.Random, path: Path) -> str:
+def mutate_npz(rng, path):
     """Change, remove or rename one array of an intact archive, or damage its bytes: otherwise the
     archive's checksums detect nearly all damage."""
     try:
@@ -151,7 +147,7 @@ def mutate_npz(rng: random.Random, path: Path) -> str:
     return f"{name} {arrays[name].dtype if name in arrays else 'gone'}"
 
 
-def mutate_picture(rng: random.Random, path: Path) -> str:
+def mutate_picture(rng, path):
     """Another size, mode or format in the same file."""
     size = rng.choice([(40, 60), (60, 40), (1, 1), (41, 60), (4000, 4000)])
     mode = rng.choice(["RGB", "RGBA", "L", "LA", "P", "I;16", "1", "F", "CMYK"])
@@ -160,7 +156,7 @@ def mutate_picture(rng: random.Random, path: Path) -> str:
     return f"{mode} {size}"
 
 
-def replace_file(rng: random.Random, path: Path) -> str:
+def replace_file(rng, path):
     """Nothing, an empty file, a folder, a link to itself, a pipe or another file in its place."""
     kind = rng.choice(["missing", "empty", "folder", "link", "pipe", "other"])
     content = rng.choice(sorted(p for p in path.parent.iterdir() if p.is_file())).read_bytes()
@@ -178,7 +174,7 @@ def replace_file(rng: random.Random, path: Path) -> str:
     return kind
 
 
-MUTATIONS: dict[str, Callable[[random.Random, Path], str]] = {
+MUTATIONS = {
     ".json": mutate_json,
     ".jsonl": mutate_json,
     ".npz": mutate_npz,

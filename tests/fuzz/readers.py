@@ -47,7 +47,7 @@ from stga_addon.tracking.footage.realitycapture import (
     read_realitycapture_csv,
     read_realitycapture_xmp,
 )
-from stga_addon.tracking.footage.shots import Shot, undistortion
+from stga_addon.tracking.footage.shots import undistortion
 from stga_addon.tracking.footage.sources import Sources, sequence_names
 from stga_addon.tracking.head_model import read_head_model
 from stga_addon.tracking.landmarks import read_camera, read_places
@@ -68,58 +68,58 @@ class Target:
     read: Callable[[Path], Any]
 
 
-def avatar(path: Path) -> None:
+def avatar(path):
     neutral, faces = random_mesh(1, 20)
     regions = {"nose": np.ones(len(faces), bool)}
     splats = random_splats(2, 6, len(faces))
     write_avatar(path, Avatar(splats, "stga", neutral.astype(np.float32), faces, regions=regions))
 
 
-def ascii_splats(path: Path) -> None:
+def ascii_splats(path):
     head = ["ply", "format ascii 1.0", "element vertex 3"]
     head += [*(f"property float {name}" for name in PROPERTIES), "end_header"]
     rows = [" ".join(f"{v:g}" for v in row) for row in splat_columns(random_splats(4, 3, 1))]
     path.write_text("\n".join([*head, *rows, ""]))
 
 
-def flame_frame(path: Path) -> None:
+def flame_frame(path):
     sizes = {"expr": 3, "shape": 9, "rotation": 3, "jaw_pose": 3, "eyes_pose": 6, "translation": 3}
     np.savez(path, **{name: np.ones((1, size), np.float32) for name, size in sizes.items()})
 
 
-def flame_motion(path: Path) -> None:
+def flame_motion(path):
     sizes = {"expr": 3, "rotation": 3, "translation": 3}
     arrays = {name: np.ones((4, size), np.float32) for name, size in sizes.items()}
     np.savez_compressed(path, shape=np.ones(9), dynamic_offset=np.zeros((4, 40, 3)), **arrays)
 
 
-def flame_pickle(protocol: int) -> Callable[[Path], Any]:
+def flame_pickle(protocol):
     arrays = random_arrays(vertices=6)
     arrays["J_regressor"] = scipy.sparse.csc_matrix(arrays["J_regressor"])
     return lambda path: path.write_bytes(pickle.dumps(arrays, protocol))
 
 
-def transforms(path: Path) -> None:
+def transforms(path):
     frames = [factory.frame(0, camera, mesh_path="meshes/0.obj") for camera in range(2)]
     path.write_text(json.dumps({"frames": frames, "w": 40, "h": 60, "camera_angle_x": 0.5}))
 
 
-def mesh(path: Path) -> None:
+def mesh(path):
     factory.write_mesh(path, default_rng(0).normal(size=(12, 3)), FACES)
 
 
-def picture(path: Path) -> None:
+def picture(path):
     image = Image.fromarray(default_rng(0).integers(0, 255, (6, 5, 4), np.uint8))
     image.convert("RGB" if path.suffix == ".jpg" else "RGBA").save(path)
 
 
-def seen(path: Path) -> None:
+def seen(path):
     view = View(0, 0, Camera(5, 6, 10.0, 10.0, 2.0, 2.0, np.eye(4)), "x", path)
     read_mask(view)
     read_image(view)
 
 
-def metrics(path: Path) -> None:
+def metrics(path):
     for n in range(3):
         metrics_log.append_metrics(path.parent, {"iteration": n, **LINE, "psnr": 20.5, "ssim": 0.9})
 
@@ -130,11 +130,11 @@ LANDMARK_CAMERA = FootageCamera("cam0", RIG[0], ImageFrames(dict.fromkeys(range(
 ROW = "{},1,2,3,10,20,30,24.3,0.01,-0.01,0.1,0.02,0,0,0.001,0\n"
 
 
-def colmap_target(file: str) -> Target:
+def colmap_target(file):
     """A door of COLMAP's model; the other of its two files is whole."""
     suffix = Path(file).suffix
 
-    def write(path: Path, alone: bool = True) -> None:
+    def write(path, alone=True):
         scenes.write_colmap_text(path.parent, RIG, NAMES)
         if suffix == ".bin":
             write_colmap_binary(path.parent, RIG, NAMES, 4, (0.1, 0.0, 0.0, 0.0))
@@ -142,7 +142,7 @@ def colmap_target(file: str) -> Target:
             if (alone and other != path) or other.suffix != suffix:
                 other.unlink()
 
-    def read(path: Path) -> None:
+    def read(path):
         with tempfile.TemporaryDirectory() as folder:
             write(Path(folder) / file, alone=False)
             shutil.copyfile(path, Path(folder) / file)
@@ -151,18 +151,18 @@ def colmap_target(file: str) -> Target:
     return Target(file, write, read)
 
 
-def undistorted(shots: list[Shot]) -> None:
+def undistorted(shots):
     """Look for the images of the shots, and prepare their undistortion, as opening footage does."""
     sequence_names(Sources(Path("/nowhere")), (shot.label for shot in shots))
     for shot in shots:
         undistortion(shot.camera, shot.lens, shot.where)
 
 
-def size_of(label: str) -> tuple[int, int]:
+def size_of(label):
     return 40, 30
 
 
-def nerfstudio(path: Path) -> None:
+def nerfstudio(path):
     frames = [
         test_calibrations.entry(
             camera, f"images/{name}", k1=0.1, p2=0.001, mask_path=f"masks/{name}"
@@ -172,22 +172,22 @@ def nerfstudio(path: Path) -> None:
     path.write_text(json.dumps({"frames": frames, "camera_model": "OPENCV"}))
 
 
-def landmarks(path: Path) -> None:
+def landmarks(path):
     points = default_rng(0).uniform(0, 40, (4, 6, 2)).astype(np.float32)
     np.savez(path, timesteps=np.arange(4), points=points, confidence=np.ones((4, 6), np.float32))
 
 
-def places(path: Path) -> None:
+def places(path):
     np.savez(path, face=np.array([0, 3, -1, 2, 1, 3]), barycentric=np.full((6, 3), 1 / 3))
 
 
-def linear_head(path: Path) -> None:
+def linear_head(path):
     skeleton = {"J_regressor": np.full((5, 4), 0.25), "weights": np.eye(4, 5)}
     bases = {"identity": np.ones((4, 3, 2)), "expression": np.ones((4, 3, 1))}
     np.savez(path, mean=np.eye(4, 3), faces=np.array([[0, 1, 2]]), **bases, **skeleton)
 
 
-def performance(path: Path) -> None:
+def performance(path):
     found = read_performance(path)
     assert np.isfinite(found.weights).all()
     assert np.isfinite(found.times).all()

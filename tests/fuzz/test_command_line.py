@@ -16,7 +16,6 @@ import warnings
 from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -53,7 +52,7 @@ REPORTED_FAILURES = 20
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def folder(tmp_path_factory):
     """FOLDER/template, from which FOLDER/case is copied anew for every case; paths in its files
     point into the case."""
     folder = tmp_path_factory.mktemp("fuzz")
@@ -90,7 +89,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def requests_about(case: Path) -> dict[str, ask.Request]:
+def requests_about(case):
     """A request of each kind, by its name, about the files of the case."""
     capture = case / "mesh"
     run = case / "splats"
@@ -135,7 +134,7 @@ def requests_about(case: Path) -> dict[str, ask.Request]:
 
 
 @pytest.fixture(autouse=True)
-def _without_what_takes_minutes(monkeypatch: pytest.MonkeyPatch) -> None:
+def _without_what_takes_minutes(monkeypatch):
     monkeypatch.setattr(preset_timing, "seconds_per_iteration", lambda *_, **__: 1e-5)
     monkeypatch.setattr("stga_addon.development.commands.carry_out_plan", lambda *_: None)
     monkeypatch.setattr("stga_addon.development.benchmark.benchmark.write_report", lambda *_: "")
@@ -144,7 +143,7 @@ def _without_what_takes_minutes(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("stga_addon.development.demo.run.run_demo", lambda *_, **__: None)
 
 
-def call(arguments: list[Any]) -> tuple[Any, str, str]:
+def call(arguments):
     """Exit code, stdout and stderr of the command line."""
     out = io.StringIO()
     error = io.StringIO()
@@ -187,11 +186,11 @@ def test_command_line(folder, monkeypatch, part):
     assert not failures, "\n\n".join(report[:REPORTED_FAILURES])
 
 
-def find_problem(arguments: list[str], folders: list[Path]) -> str | None:
+def find_problem(arguments, folders):
     """What is wrong with a call, as one text for all calls with the same cause; None where it
     behaves."""
 
-    def stop(*_: Any) -> None:
+    def stop(*_):
         raise TimeoutError(f"no answer in {MAX_CASE_S} s")
 
     signal.signal(signal.SIGALRM, stop)

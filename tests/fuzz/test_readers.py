@@ -18,9 +18,7 @@ import time
 import tracemalloc
 import warnings
 import zipfile
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -55,12 +53,12 @@ SECONDS = float(os.environ.get("STGA_FUZZ_SECONDS", 0))
 EXAMPLES = 40  # Damages of each reader's file, the same every time; more until SECONDS are over
 
 
-def behaves(read: Callable[[], Any], folder: Path) -> str:
+def behaves(read, folder):
     """The error's message, or "" where `read` loads. Fails on anything else, on a reader that takes
     too long or too much memory, and on one that adds files to `folder` or beside it, or removes
     some."""
 
-    def listing() -> list[str]:
+    def listing():
         walk = os.walk(folder)
         inside = [os.path.join(base, name) for base, a, b in walk for name in (*a, *b)]
         return sorted([*inside, *os.listdir(folder.parent)])
@@ -101,7 +99,7 @@ JUNK = {
     "pickle": pickle.dumps({"a": 1}),
     "zip of millions": b"PK\x05\x06" + struct.pack("<4H2LH", 0, 0, 65535, 65535, 2**31, 0, 0),
 }
-IN_PLACE: dict[str, Callable[[Path], object]] = {
+IN_PLACE = {
     "link to itself": lambda path: path.symlink_to(path.name),
     "pipe": os.mkfifo,
     "device": lambda path: path.symlink_to("/dev/zero"),
@@ -163,13 +161,13 @@ def test_what_is_no_file(tmp_path, reader):
 # Arrays and archives that lie
 
 
-def npy(descr: Any = "<f4", shape: Any = (GIGA,), data: bytes = b"", header: str = "") -> bytes:
+def npy(descr="<f4", shape=(GIGA,), data=b"", header=""):
     """A npy file that says what it likes about its content."""
     text = header or repr({"descr": descr, "fortran_order": False, "shape": shape})
     return b"\x93NUMPY\x01\x00" + struct.pack("<H", len(text) + 1) + text.encode() + b"\n" + data
 
 
-def archive(path: Path, entries: dict[str, bytes], packing: int = zipfile.ZIP_DEFLATED) -> Path:
+def archive(path, entries, packing=zipfile.ZIP_DEFLATED):
     with zipfile.ZipFile(path, "w", packing) as out:
         for name, content in entries.items():
             out.writestr(name, content)
@@ -253,7 +251,7 @@ def test_bits_that_are_no_number(tmp_path, name):
 # Meshes
 
 
-def gltf(**changes: Any) -> bytes:
+def gltf(**changes):
     """One triangle; `changes` replace parts of the document."""
     points = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], "<f4").tobytes()
     primitive = {"attributes": {"POSITION": 0}, "indices": 1}
@@ -271,7 +269,7 @@ def gltf(**changes: Any) -> bytes:
     return head_glb({**document, **changes}, points + np.array([0, 1, 2], "<u4").tobytes())
 
 
-def accessors(**changes: Any) -> list[dict[str, Any]]:
+def accessors(**changes):
     first = {"bufferView": 0, "componentType": 5126, "count": 3, "type": "VEC3", **changes}
     kept = {key: value for key, value in first.items() if value is not None}
     return [kept, {"bufferView": 1, "componentType": 5125, "count": 3, "type": "SCALAR"}]
@@ -285,7 +283,7 @@ SIGNAL = struct.pack("<I", SIGNALING_NAN["f4"])
 OBJ = b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n"
 
 
-def ply(vertices: int, rest: bytes, kind: str = "binary_little_endian") -> bytes:
+def ply(vertices, rest, kind="binary_little_endian"):
     coordinates = "property float x\nproperty float y\nproperty float z\n"
     return f"ply\nformat {kind} 1.0\nelement vertex {vertices}\n{coordinates}".encode() + rest
 
@@ -365,13 +363,13 @@ def test_splats_beyond_their_numbers(tmp_path):
     assert behaves(lambda: read_splats(path), tmp_path) == ""
 
 
-def primitives(count: int, targets: int) -> list[dict[str, Any]]:
+def primitives(count, targets):
     """A mesh of equal primitives with targets of names of their own."""
     part = {"attributes": {"POSITION": 0}, "targets": [{"POSITION": 1}] * targets}
     return [{"primitives": [part] * count}]
 
 
-def zeros(count: Any, **more: Any) -> list[dict[str, Any]]:
+def zeros(count, **more):
     """Accessors of zeros, which need no data."""
     return [{"componentType": 5126, "count": count, "type": "VEC3", **more}] * 2
 
@@ -416,7 +414,7 @@ def test_head_models(tmp_path, data, expected):
 # Pickles
 
 
-def pickled(value: bytes, key: bytes = b"v_template") -> bytes:
+def pickled(value, key=b"v_template"):
     return b"\x80\x02}U" + bytes([len(key)]) + key + value + b"s."
 
 
@@ -476,7 +474,7 @@ class Sparse:
     __module__ = "scipy.sparse._csc"
     __qualname__ = "csc_matrix"
 
-    def __init__(self, **state: Any) -> None:
+    def __init__(self, **state):
         self.__dict__.update(state)
 
 
@@ -505,14 +503,14 @@ def test_shapes_that_are_none(tmp_path, shape):
 # Captures
 
 
-def capture_with(root: Path, change: Callable[[dict[str, Any]], object]) -> Path:
+def capture_with(root, change):
     """A mesh capture whose first training frame and top level were changed."""
     factory.write_mesh_capture(root, (0, 1), (0, 1))
     factory.edit(root / "transforms_train.json", change)
     return root
 
 
-FRAME_VALUES: dict[str, dict[str, Any]] = {
+FRAME_VALUES = {
     "path of nul": {"file_path": "a\0b.png"},
     "half a character": {"mesh_path": "\ud800.obj"},
     "long path": {"file_path": "x" * 5000 + ".png"},
@@ -564,7 +562,7 @@ def test_view_names_hold_no_backslashes(tmp_path):
 # Wrong in one field, which the message names
 
 
-def rewritten(path: Path, change: Any) -> None:
+def rewritten(path, change):
     """change: (old, new) text; new values of an npz's arrays, None removes one; of a JSON object,
     or of the second of its frames."""
     if isinstance(change, tuple):
@@ -578,7 +576,7 @@ def rewritten(path: Path, change: Any) -> None:
         np.savez(path, **{name: value for name, value in arrays.items() if value is not None})
 
 
-def full(value: Any, *shape: int) -> np.ndarray:
+def full(value, *shape):
     return np.full(shape, value)
 
 
@@ -763,7 +761,7 @@ NAMES_OF_TEXTS = {
     "wide": "expected a focal length of 1 to 1e7",
     "count": "expected a whole number, not '999",
 }
-WRONG: dict[str, list[tuple[Any, str]]] = {
+WRONG = {
     "nerfstudio": [
         ({"k1": "much"}, r"frames\[1\].k1: expected a finite number, not 'much'"),
         ({"camera_model": "WIDE"}, r"frames\[1\].camera_model: 'WIDE' is not one of"),
@@ -803,7 +801,7 @@ def test_wrong_fields_are_named(tmp_path, reader, change, message):
 # Runs
 
 
-META_VALUES: dict[str, Any] = {
+META_VALUES = {
     "iteration": [-2, 1.5, 10**40, True],
     "visit": ["5"],
     "last_timestep": [1.5, [1]],

@@ -2,16 +2,14 @@
 
 import os
 import shlex
-from collections.abc import Callable, Iterator
 
 import pytest
-from filelock import FileLock
 
 BLENDER = shlex.split(os.environ.get("STGA_BLENDER", ""))
 
 
 @pytest.fixture(scope="module", autouse=True)
-def window(alone: Callable[[str], FileLock]) -> Iterator[None]:
+def window(alone):
     """One window at a time: a second one takes the keyboard and the processor from the first."""
     if not BLENDER:
         pytest.skip("STGA_BLENDER does not say how to start a Blender with a window")

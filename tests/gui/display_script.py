@@ -11,7 +11,6 @@ import io
 import sys
 from pathlib import Path
 from time import perf_counter
-from typing import Any
 
 import bpy
 import gpu
@@ -44,14 +43,14 @@ RENDER_PATIENCE_S = 60.0
 REGIONS_S = 0.3
 """Between two steps, for regions to get their places."""
 seen["pictures"] = {}
-views: dict[str, np.ndarray] = {}
+views = {}
 
 
-def no_python() -> str:
+def no_python():
     raise StgaError("no training Python")
 
 
-def set_up() -> Any:
+def set_up():
     """The avatar's head, hidden, at a turned and scaled place, and nothing else."""
     for candidate in list(bpy.data.objects):
         bpy.data.objects.remove(candidate)
@@ -82,14 +81,14 @@ def set_up() -> Any:
     return shown
 
 
-def redraw(times: int = 2) -> float:
+def redraw(times=2):
     """Milliseconds of one redraw."""
     begin = perf_counter()
     bpy.ops.wm.redraw_timer(type="DRAW_WIN_SWAP", iterations=times)
     return 1e3 * (perf_counter() - begin) / times
 
 
-def picture(name: str) -> None:
+def picture(name):
     """A screenshot, where the viewport is in it, and its view."""
     took = redraw()
     in_window.picture(FOLDER / f"{name}.png")
@@ -107,7 +106,7 @@ def picture(name: str) -> None:
     seen["problem"] = display.problem
 
 
-def pictures(shown: Any) -> None:
+def pictures(shown):
     _, area, _ = viewport()
     space = area.spaces.active
     scene = bpy.context.scene
@@ -152,7 +151,7 @@ def pictures(shown: Any) -> None:
     bpy.data.objects.remove(bpy.data.objects["quad"])
 
 
-def bones_in_front(shown: Any) -> None:
+def bones_in_front(shown):
     """A bone behind the splats, drawn In Front, with the splats and without."""
     data = bpy.data.armatures.new("rig")
     rig = bpy.data.objects.new("rig", data)
@@ -179,7 +178,7 @@ def bones_in_front(shown: Any) -> None:
     bpy.data.objects.remove(rig)
 
 
-def shadows() -> None:
+def shadows():
     """The shadow maps of a sun and a lamp as drawn, and these lights in the avatar's space."""
     lamps = []
     for kind, place, energy in (("SUN", (0.4, -0.6, 1.0), 2.0), ("POINT", (0.3, 0.2, 0.4), 5.0)):
@@ -203,7 +202,7 @@ def shadows() -> None:
         bpy.data.objects.remove(lamp)
 
 
-def parts_of_the_view(area: Any) -> None:
+def parts_of_the_view(area):
     """Local view of the quad alone, and a clipping region of the world's x > 0."""
     quad = bpy.data.objects["quad"]
     for candidate in bpy.context.view_layer.objects:
@@ -222,24 +221,24 @@ def parts_of_the_view(area: Any) -> None:
     view.use_clip_planes = False
 
 
-def textures() -> list[Any]:
+def textures():
     """What the display holds on the GPU, besides shaders."""
     renderer = display._renderer
     projected = renderer._projected.values()
     return [*renderer._static_textures.values(), *projected, renderer._color, renderer._depth]
 
 
-def freed(held: list[Any]) -> bool:
+def freed(held):
     """Whether nobody else holds any of the textures: Blender frees one with its Python object."""
     return all(sys.getrefcount(held[index]) == 2 for index in range(len(held)))
 
 
-def pictures_per_redraw() -> int:
+def pictures_per_redraw():
     """How often one redraw of the only viewport draws: more often where a handler stayed."""
     count = 0
     draw = SplatRenderer.draw
 
-    def counted(*arguments: Any) -> None:
+    def counted(*arguments):
         nonlocal count
         count += 1
         draw(*arguments)
@@ -250,7 +249,7 @@ def pictures_per_redraw() -> int:
     return count
 
 
-def memory(shown: Any) -> None:
+def memory(shown):
     """Textures while the display is off, while its object is gone, and after undo."""
     seen["drawn"] = [pictures_per_redraw()]
     held = textures()
@@ -274,10 +273,10 @@ def memory(shown: Any) -> None:
     picture("after undo")
 
 
-def failure() -> None:
+def failure():
     """An error while drawing: reported once, the handler removed, points shown."""
 
-    def broken(*_: object) -> None:
+    def broken(*_):
         raise MemoryError("out of memory")
 
     display._renderer.draw = broken
@@ -290,7 +289,7 @@ def failure() -> None:
     seen["failed"] = display.failed, not display._handlers, display.problem
 
 
-def after_failure() -> Any:
+def after_failure():
     """Off and on again; returns the textures that are held before another file is opened."""
     shown = bpy.data.objects["head splats"]
     seen["fallback"] = display_mode(shown)
@@ -310,13 +309,13 @@ def after_failure() -> Any:
     seen["freed"]["loaded"] = freed(held)
 
 
-def after_load() -> None:
+def after_load():
     seen["after load"] = bool(display._handlers), display._renderer is None, display.problem
     set_up()
     seen["drawn"].append(pictures_per_redraw())
 
 
-def start_render() -> None:
+def start_render():
     """F12 in AgX in its own thread, whose view transform the main thread measures."""
     scene = bpy.context.scene
     scene.render.engine = engine.ENGINE
@@ -332,7 +331,7 @@ def start_render() -> None:
         bpy.ops.render.render("INVOKE_DEFAULT")
 
 
-def steps() -> Any:
+def steps():
     with in_viewport():  # without a title bar: pixels of the window are those of the screenshot
         bpy.ops.wm.window_fullscreen_toggle()
     yield REGIONS_S

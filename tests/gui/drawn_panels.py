@@ -1,7 +1,6 @@
 """The panels of the sidebar as their layouts are filled, and the buttons in them."""
 
 from types import SimpleNamespace
-from typing import Any
 
 import bpy
 from in_window import in_viewport, module, viewport
@@ -11,13 +10,13 @@ PANEL_MARGIN = 36
 """Of a sidebar's width: tabs, and the borders of panel and sub-panel."""
 
 
-def draw(panel: Any) -> Layout:
+def draw(panel):
     """What a panel draws now."""
     with in_viewport("UI"):  # which has a width
         return filled(panel, bpy.context)
 
 
-def drawn() -> dict[str, Layout]:
+def drawn():
     """Label of each panel that is to be seen -> what is drawn in it."""
     with in_viewport("UI"):
         return {
@@ -28,13 +27,13 @@ def drawn() -> dict[str, Layout]:
         }
 
 
-def buttons() -> dict[str, tuple[str, dict[str, Any]]]:
+def buttons():
     """ "Panel: text" of each button in sidebar, menus and preferences -> operator and options."""
     menus = {"Import": Layout(), "Export": Layout()}
     operators = module("operators")
     operators._import_menu(SimpleNamespace(layout=menus["Import"]), bpy.context)
     operators._export_menu(SimpleNamespace(layout=menus["Export"]), bpy.context)
-    found: dict[str, tuple[str, dict[str, Any]]] = {}
+    found = {}
     preferences = draw(module("ui.properties").Preferences)
     for panel, layout in {**drawn(), **menus, "Preferences": preferences}.items():
         for leaf in layout.leaves:
@@ -49,7 +48,7 @@ def buttons() -> dict[str, tuple[str, dict[str, Any]]]:
     return found
 
 
-def cut_texts() -> dict[str, list[int]]:
+def cut_texts():
     """ "Panel: text" of each row that is wider than the sidebar -> its width, and the room."""
     scale = bpy.context.preferences.system.ui_scale
     room = viewport("UI")[2].width / scale - PANEL_MARGIN

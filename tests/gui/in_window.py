@@ -5,10 +5,7 @@ import subprocess
 import sys
 import time
 import traceback
-from collections.abc import Iterator
 from contextlib import suppress
-from pathlib import Path
-from typing import Any
 
 import bpy
 
@@ -16,43 +13,43 @@ ARGUMENTS = sys.argv[sys.argv.index("--") + 1 :]
 STEP_S = 0.1
 _addons = bpy.context.preferences.addons.keys()
 extension = next((name for name in _addons if name.endswith(".stga")), "")
-seen: dict[str, Any] = {"version": bpy.app.version_string}
+seen = {"version": bpy.app.version_string}
 bpy.context.preferences.view.show_splash = False
 
 
-def module(name: str) -> Any:
+def module(name):
     """A module of the extension."""
     return sys.modules[f"{extension}.{name}"]
 
 
-def chosen() -> Any:
+def chosen():
     return bpy.context.scene.stga
 
 
-def viewport(kind: str = "WINDOW") -> tuple[Any, Any, Any]:
+def viewport(kind="WINDOW"):
     """The first window, its 3D viewport and a region of that."""
     window = bpy.context.window_manager.windows[0]
     area = next(area for area in window.screen.areas if area.type == "VIEW_3D")
     return window, area, next(region for region in area.regions if region.type == kind)
 
 
-def in_viewport(kind: str = "WINDOW") -> Any:
+def in_viewport(kind="WINDOW"):
     """The context of a click there, which a timer has not."""
     window, area, region = viewport(kind)
     return bpy.context.temp_override(window=window, area=area, region=region)
 
 
-def picture(file: Path) -> None:
+def picture(file):
     bpy.ops.wm.redraw_timer(type="DRAW_WIN_SWAP", iterations=2)
     subprocess.run(["import", "-window", "root", str(file)], check=True)
 
 
-def play(steps: Iterator[Any], result: Path, patience_s: float = 180.0) -> None:
+def play(steps, result, patience_s=180.0):
     """Take steps, each when what the one before yielded has come true; write `seen`, and quit."""
     until = None
     since = time.monotonic()
 
-    def step() -> float | None:
+    def step():
         nonlocal until, since
         waited = time.monotonic() - since
         try:

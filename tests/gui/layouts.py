@@ -17,16 +17,16 @@ NESTED = ("row", "column", "box", "split", "grid_flow", "column_flow")
 class Layout:
     """Takes the place of a panel's layout, and keeps what is drawn."""
 
-    def __init__(self, kind: str = "column", **options: Any) -> None:
+    def __init__(self, kind="column", **options):
         self.kind = kind
         self.options = options
         self.items = list[Any]()
 
-    def __getattr__(self, kind: str) -> Any:
+    def __getattr__(self, kind):
         if kind.startswith("__"):
             raise AttributeError(kind)
 
-        def draw(*arguments: Any, **options: Any) -> Any:
+        def draw(*arguments, **options):
             nested = kind in NESTED
             self.items.append(Layout(kind, **options) if nested else Leaf(kind, arguments, options))
             return self.items[-1] if nested else self.items[-1].button
@@ -34,15 +34,15 @@ class Layout:
         return draw
 
     @property
-    def leaves(self) -> list[Any]:
+    def leaves(self):
         return [leaf for item in self.items for leaf in item.leaves]
 
     @property
-    def text(self) -> str:
+    def text(self):
         return " ".join(leaf.text for leaf in self.leaves)
 
     @property
-    def width(self) -> float:
+    def width(self):
         """That the texts need."""
         widths = [item.width for item in self.items] or [0.0]
         if self.kind == "row":  # whose items are equally wide
@@ -55,7 +55,7 @@ class Layout:
 class Leaf:
     """A label, field or button, with its width: that of the text, the icon and the value."""
 
-    def __init__(self, kind: str, arguments: Any, options: dict[str, Any]) -> None:
+    def __init__(self, kind, arguments, options):
         self.kind = kind
         self.arguments = arguments
         self.options = options
@@ -74,7 +74,7 @@ class Leaf:
         self.text = options.get("text", self.text)
 
     @property
-    def width(self) -> float:
+    def width(self):
         blf.size(0, bpy.context.preferences.ui_styles[0].widget.points)
         place = "Operator" if self.kind == "operator" else "*"
         shown = bpy.app.translations.pgettext_iface(self.text, place)
@@ -83,7 +83,7 @@ class Leaf:
         return float(text + (ICON if has_icon else 0) + (NUMBER if self.is_number else 0))
 
 
-def filled(panel: Any, context: Any) -> Layout:
+def filled(panel, context):
     """What a panel draws; Blender makes panels itself, in a window only."""
     own = [vars(base) for base in reversed(panel.__mro__) if ".ui." in base.__module__]
     members = {name: thing for part in own for name, thing in part.items() if name[:2] != "__"}

@@ -12,9 +12,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
 
 import bpy
 import numpy as np
@@ -49,11 +47,11 @@ for name in ("pressed", "clicks", "messages", "undo", "cut", "texts", "images", 
     seen[name] = {}
 
 
-def shot(name: str) -> None:
+def shot(name):
     in_window.picture(FOLDER / f"{name}.png")
 
 
-def click(name: str, action: Callable[..., Any], /, *how: Any, **options: Any) -> Any:
+def click(name, action, /, *how, **options):
     """Do what a click does, and draw the window; notes for how long both hold Blender up, in
     seconds of processor time of its thread, without what a window costs in which nothing changes,
     and by the clock; or its message."""
@@ -75,13 +73,13 @@ def click(name: str, action: Callable[..., Any], /, *how: Any, **options: Any) -
         seen["clicks"][name] = [round(value, 3) for value in (done - cpu, drawing, wall)]
 
 
-def opened(file: Path) -> float:
+def opened(file):
     """Open it in the window as it is; seconds to wait."""
     bpy.ops.wm.open_mainfile(filepath=str(file), load_ui=False)
     return 0.3
 
 
-def show_only(root: str = "") -> None:
+def show_only(root=""):
     """Let the sidebar show one panel with those below it, or all of them, none folded."""
     panels = module("ui.panel").CLASSES
     for panel in reversed(panels):
@@ -95,7 +93,7 @@ def show_only(root: str = "") -> None:
             bpy.utils.register_class(panel)
 
 
-def panels_unfolded(state: str) -> Iterator[Any]:
+def panels_unfolded(state):
     """A picture of each panel, and the texts that do not fit."""
     open_sidebar = module("stga_addon.scene.avatar_scene").open_sidebar
     show_only()
@@ -116,10 +114,10 @@ def panels_unfolded(state: str) -> Iterator[Any]:
 RUN_IN_WORK = "training_run"  # noted when a job's first report arrives, whatever is undone
 
 
-def digest() -> dict[str, Any]:
+def digest():
     """What undo is to bring back."""
     scene = bpy.context.scene
-    found: dict[str, Any] = {"frame": scene.frame_current, "engine": scene.render.engine}
+    found = {"frame": scene.frame_current, "engine": scene.render.engine}
     for owner in (chosen(), scene.stga_lighting):
         names = {*owner.bl_rna.properties.keys()} - {"rna_type", "name", RUN_IN_WORK}
         found |= {name: getattr(owner, name) for name in names}
@@ -144,18 +142,18 @@ def digest() -> dict[str, Any]:
     return found
 
 
-def running() -> list[Any]:
+def running():
     return [kind for kind in kinds if monitor.state_of(bpy.context.scene, kind).is_running]
 
 
-def browser() -> Any:
+def browser():
     """The window and area of a file browser that is open."""
     windows = bpy.context.window_manager.windows
     found = [(window, area) for window in windows for area in window.screen.areas]
     return next((pair for pair in found if pair[1].type == "FILE_BROWSER"), None)
 
 
-def press(state: str) -> Iterator[Any]:
+def press(state):
     """Press every button to be seen, and undo, close or cancel what it does."""
     for what, (name, options) in drawn_panels.buttons().items():
         group, function = name.split(".")
@@ -200,7 +198,7 @@ def press(state: str) -> Iterator[Any]:
         yield 0.2
 
 
-def stop_workers() -> Iterator[Any]:
+def stop_workers():
     for kind in running():
         state = lambda kind=kind: monitor.state_of(bpy.context.scene, kind)  # noqa: E731
         with in_viewport():
@@ -211,35 +209,35 @@ def stop_workers() -> Iterator[Any]:
                 bpy.ops.stga.dismiss(request=kind)
 
 
-def fresh() -> Iterator[Any]:
+def fresh():
     """Every panel and every button in a file without a head."""
     yield from panels_unfolded("fresh")
     yield from press("fresh")
 
 
-def open_demo() -> Iterator[Any]:
+def open_demo():
     click("Open Demo Capture", bpy.ops.stga.open_demo, "INVOKE_DEFAULT", True)
     yield lambda: viewport("UI")[2].active_panel_category == "STGA"
     shot("demo")
 
 
-def misunderstand() -> None:
+def misunderstand():
     """Train into a folder that a file never saved does not have."""
     click("Train without a folder", bpy.ops.stga.train, directory="//run")
     seen["error in the panel"] = bpy.context.window_manager.stga_message
     shot("error")
 
 
-def training() -> Any:
+def training():
     return monitor.state_of(bpy.context.scene, kinds.TRAINING)
 
 
-def once(what: str, is_over: Callable[[], bool]) -> Callable[[], bool]:
+def once(what, is_over):
     """What waits for the end of something in a training, and notes the clock in the panel."""
     begin = time.monotonic()
     noted = seen["time left"].setdefault(what, [])
 
-    def wait() -> bool:
+    def wait():
         status = training().snapshot.status
         figures = dict(status.figures)
         if not noted or noted[-1][1:3] != [status.message, figures.get("left_s")]:
@@ -250,7 +248,7 @@ def once(what: str, is_over: Callable[[], bool]) -> Callable[[], bool]:
     return wait
 
 
-def train() -> Iterator[Any]:
+def train():
     begin = time.monotonic()
     settings = {"directory": chosen().run_folder, "minutes": chosen().minutes}
     click("Train", bpy.ops.stga.train, **settings)
@@ -264,7 +262,7 @@ def train() -> Iterator[Any]:
     seen["train panel"] = [part for part in ("Quality", "More") if part in train_panel]
 
 
-def pose() -> Iterator[Any]:
+def pose():
     click("Pose the Head", bpy.ops.stga.pose_head)
     yield 0.2
     neck = bpy.context.view_layer.objects.active.pose.bones["neck"]
@@ -280,7 +278,7 @@ def pose() -> Iterator[Any]:
     bpy.ops.wm.save_as_mainfile(filepath=str(FIRST))
 
 
-def packet(number: int, opening: float) -> bytes:
+def packet(number, opening):
     """What a phone sends with Live Link Face: a mouth that opens, 0 to 1, and a smile."""
     values = {"jawOpen": opening, "mouthSmileLeft": 0.5, "mouthSmileRight": 0.5}
     names = module("stga_addon.driving.live.decoders").PACKET_SHAPES
@@ -290,25 +288,25 @@ def packet(number: int, opening: float) -> bytes:
     return b"\x06" + text + end
 
 
-def corners() -> np.ndarray:
+def corners():
     """(V, 3) vertices of the head as it is posed."""
     return np.array(module("stga_addon.scene.arrays").evaluated_vertices(chosen().head))
 
 
-def drive(head: str) -> Iterator[Any]:
+def drive(head):
     """Drive the head by a phone, press the button that there is meanwhile, and stop by Esc."""
     resting = corners()
     ended = threading.Event()
     counted = {"poses": 0, "draws": 0}
 
-    def send() -> None:
+    def send():
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as phone:
             for number in range(PACKETS):
                 phone.sendto(packet(number, number % RATE / RATE), ("127.0.0.1", PORT))
                 if ended.wait(1 / RATE):
                     return
 
-    def count(what: str, *_: Any) -> None:
+    def count(what, *_):
         counted[what] += 1
 
     chosen().drive.port = PORT
@@ -338,7 +336,7 @@ def drive(head: str) -> Iterator[Any]:
     seen.setdefault("driven", {})[head] = [moved, left, *rates]
 
 
-def live() -> Iterator[Any]:
+def live():
     """Drive the demo's head, and one of FLAME, by a phone."""
     yield from drive("demo")
     bpy.ops.wm.read_homefile(app_template="")
@@ -350,7 +348,7 @@ def live() -> Iterator[Any]:
     yield opened(FIRST)
 
 
-def display() -> Iterator[Any]:
+def display():
     shading = viewport()[1].spaces.active.shading
     lighting = bpy.context.scene.stga_lighting
     seen["shading"] = {}
@@ -369,7 +367,7 @@ def display() -> Iterator[Any]:
         shot(f"light {mode}")
 
 
-def pressed() -> Iterator[Any]:
+def pressed():
     """Every panel and every button in the demo's file."""
     yield opened(FIRST)
     yield from panels_unfolded("demo")
@@ -377,7 +375,7 @@ def pressed() -> Iterator[Any]:
     seen["left"] = chosen().splats is not None
 
 
-def select_only(*things: Any) -> None:
+def select_only(*things):
     for thing in bpy.context.selected_objects:
         thing.select_set(False)
     for thing in things:
@@ -387,7 +385,7 @@ def select_only(*things: Any) -> None:
         bpy.context.view_layer.objects.active = thing
 
 
-def duplicate() -> Iterator[Any]:
+def duplicate():
     """Duplicate the splats, and the whole avatar; move the copy aside, and undo."""
     yield opened(FIRST)
     seen["duplicates undone"] = {}
@@ -410,7 +408,7 @@ def duplicate() -> Iterator[Any]:
         yield 0.2
 
 
-def append() -> Iterator[Any]:
+def append():
     yield opened(FIRST)
     name = chosen().splats.name
     bpy.ops.wm.read_homefile(app_template="")
@@ -422,7 +420,7 @@ def append() -> Iterator[Any]:
     yield from panels_unfolded("appended")
 
 
-def delete() -> Iterator[Any]:
+def delete():
     """Delete the splats, then the head; undo brings them back."""
     yield opened(FIRST)
     names = {*bpy.data.objects.keys()}
@@ -439,7 +437,7 @@ def delete() -> Iterator[Any]:
     seen["deletion undone"] = {*bpy.data.objects.keys()} == names
 
 
-def disable() -> Iterator[Any]:
+def disable():
     """Disable and enable the extension with an avatar in the scene."""
     yield opened(FIRST)
     before = digest()
@@ -451,7 +449,7 @@ def disable() -> Iterator[Any]:
     seen["kept"] = [name for name in before if before[name] != after.get(name)]
 
 
-def render() -> Iterator[Any]:
+def render():
     """An image, and a video of two frames, with each engine."""
     yield opened(FIRST)
     scene = bpy.context.scene
@@ -464,7 +462,7 @@ def render() -> Iterator[Any]:
     scene.frame_end = scene.frame_start + 1
     scene.cycles.samples = scene.eevee.taa_render_samples = SAMPLES
     scene.cycles.use_denoising = False  # which not every build can
-    complete: list[str] = []
+    complete = []
     note = lambda *_: complete.append("")  # noqa: E731
     bpy.app.handlers.render_complete.append(note)
     eevee = "BLENDER_EEVEE_NEXT" if bpy.app.version < (5, 0) else "BLENDER_EEVEE"
@@ -492,7 +490,7 @@ def render() -> Iterator[Any]:
     bpy.app.handlers.render_complete.remove(note)
 
 
-def drop() -> Iterator[Any]:
+def drop():
     """Drop a video: the dialog of Avatar from Video."""
     video = str(FOLDER / "CYCLES.mp4")
     click("Drop", bpy.ops.stga.avatar_from_video, "INVOKE_DEFAULT", filepath=video)
@@ -504,7 +502,7 @@ def drop() -> Iterator[Any]:
 # The second hour
 
 
-def train_more() -> Iterator[Any]:
+def train_more():
     yield opened(FIRST)
     before = training().snapshot.status.figures["iteration"]
     options = {"directory": chosen().run_folder, "minutes": MORE_MINUTES, "more": True}
@@ -514,12 +512,12 @@ def train_more() -> Iterator[Any]:
     shot("trained more")
 
 
-def shown() -> list[Any]:
+def shown():
     tags = module("stga_addon.scene.tags")
     return [each for each in bpy.context.scene.objects if each.get(tags.KIND) == tags.SPLATS]
 
 
-def show_again() -> Iterator[Any]:
+def show_again():
     """Show the avatar twice, look at its sliders, and click on it."""
     yield opened(FIRST)
     for _ in range(2):
@@ -544,7 +542,7 @@ def show_again() -> Iterator[Any]:
     shot("clicked")
 
 
-def second_head() -> Iterator[Any]:
+def second_head():
     """Import another head beside the first."""
     scene = bpy.context.scene
     settings = lambda: [  # noqa: E731
@@ -569,7 +567,7 @@ def second_head() -> Iterator[Any]:
     yield lambda: chosen().head.parent == first
 
 
-def left_out() -> Iterator[Any]:
+def left_out():
     """A mesh and a blur that the engine leaves out, and the button that shows all."""
     scene = bpy.context.scene
     engine = module("stga_addon.scene.render.engine").ENGINE
@@ -588,7 +586,7 @@ def left_out() -> Iterator[Any]:
         seen["shows all"].append(what in said and scene.render.engine != engine)
 
 
-def german() -> Iterator[Any]:
+def german():
     """Every panel in another language, which Blender translates where it knows the words."""
     yield opened(FIRST)
     view = bpy.context.preferences.view
@@ -602,7 +600,7 @@ STEPS = """fresh open_demo misunderstand train pose live display pressed duplica
 render drop disable train_more show_again second_head left_out german"""
 
 
-def steps() -> Iterator[Any]:
+def steps():
     for name in ARGUMENTS[1:] or STEPS.split():
         print(f"STEP {name} {time.monotonic() - STARTED:.0f} s", flush=True)
         yield from globals()[name]() or ()

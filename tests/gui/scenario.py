@@ -8,9 +8,7 @@ function below, RESULT the JSON file that says what was seen.
 import os
 import signal
 import sys
-from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
 
 import bpy
 from mathutils import Vector
@@ -27,31 +25,31 @@ test = module("operators.training_python").test
 lock_owner = module("stga_addon.worker.lock").lock_owner
 
 
-def request(kind: str) -> Any:
+def request(kind):
     return monitor.state_of(bpy.context.scene, monitor.Kind(kind))
 
 
-def state() -> str:
+def state():
     return str(request("training").snapshot.state)
 
 
-def figures() -> dict[str, float]:
+def figures():
     return dict(request("training").snapshot.status.figures)
 
 
-def is_training() -> bool:
+def is_training():
     return state() == "working" and figures().get("iteration", 0) > 0
 
 
-def splats() -> int:
+def splats():
     return 0 if chosen().splats is None else len(chosen().splats.data.vertices)
 
 
-def job_folder() -> Path:
+def job_folder():
     return Path(request("training").folder)
 
 
-def first() -> Iterator[Callable[[], bool]]:
+def first():
     """Train, cancel, resume, crash, report, undo, reopen, and leave with the worker at work."""
     bpy.context.preferences.addons[extension].preferences.training_python = PYTHON
     bpy.ops.wm.save_userpref()
@@ -105,7 +103,7 @@ def first() -> Iterator[Callable[[], bool]]:
     bpy.ops.wm.save_mainfile()
 
 
-def second() -> Iterator[Callable[[], bool]]:
+def second():
     """Find the worker that went on while Blender was closed; then a short run."""
     seen["found"] = lock_owner(job_folder() / "worker.lock")
     yield is_training
@@ -123,7 +121,7 @@ def second() -> Iterator[Callable[[], bool]]:
     seen["dismissed"] = chosen().training_run == ""
 
 
-def videos() -> Iterator[Callable[[], bool]]:
+def videos():
     """A video cancelled while it is recorded, one while rendered, and a finished one."""
     folder = Path(BLEND).parent
     scene = bpy.context.scene
@@ -150,7 +148,7 @@ def videos() -> Iterator[Callable[[], bool]]:
     seen["frame after videos"] = scene.frame_current
 
 
-def looks_at_head() -> bool:
+def looks_at_head():
     """Whether every viewport shows the head, and little else."""
     head = chosen().head
     corners = [head.matrix_world @ Vector(corner) for corner in head.bound_box]
@@ -169,7 +167,7 @@ def looks_at_head() -> bool:
     )
 
 
-def splats_at_work() -> list[float]:
+def splats_at_work():
     """Where the first splats are: training moves them."""
     mesh = chosen().splats.data
     return [value for vertex in mesh.vertices[:20] for value in vertex.co]

@@ -5,7 +5,6 @@ import shutil
 import subprocess
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import filelock
 import numpy as np
@@ -36,7 +35,7 @@ PROBE = (
 )
 
 
-def has_vulkan() -> bool:
+def has_vulkan():
     """Whether Blender starts with Vulkan and does not fall back to OpenGL."""
     command = [*BLENDER, "--factory-startup", "--gpu-backend", "vulkan", "--python-expr", PROBE]
     return (
@@ -46,9 +45,7 @@ def has_vulkan() -> bool:
 
 
 @pytest.fixture(scope="module", params=["opengl", "vulkan"])
-def shown(
-    request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
-) -> tuple[Path, dict[str, Any]]:
+def shown(request, tmp_path_factory):
     """The folder with the pictures, and what display_script.py saw, by each GPU backend."""
     backend = request.param
     if backend == "vulkan" and not has_vulkan():
@@ -75,7 +72,7 @@ def shown(
     return folder, result
 
 
-def on_screen(folder: Path, result: dict[str, Any], name: str) -> tuple[np.ndarray, Camera]:
+def on_screen(folder, result, name):
     """(3, H, W) sRGB of the viewport in the screenshot, less its border, and its camera."""
     with np.load(folder / "views.npz") as views:
         width, height, *lens = views[name].tolist()
@@ -93,7 +90,7 @@ def on_screen(folder: Path, result: dict[str, Any], name: str) -> tuple[np.ndarr
 
 
 @pytest.mark.parametrize("name", ["solid", "wireframe", "orthographic", "filmic", "engine"])
-def test_viewport_equals_the_rasterizer(shown: tuple[Path, dict[str, Any]], name: str) -> None:
+def test_viewport_equals_the_rasterizer(shown, name):
     """Catches colors that a view transform, a blend or an offset of the viewport changes."""
     folder, result = shown
     found, camera = on_screen(folder, result, name)
@@ -112,7 +109,7 @@ def test_viewport_equals_the_rasterizer(shown: tuple[Path, dict[str, Any]], name
 
 
 @pytest.mark.parametrize("name", ["material agx", "engine filmic", "engine filmic points"])
-def test_view_transforms_leave_colors(shown: tuple[Path, dict[str, Any]], name: str) -> None:
+def test_view_transforms_leave_colors(shown, name):
     """Catches splats that AgX or Filmic changes, in any mode."""
     folder, result = shown
     found, plain = (on_screen(folder, result, which)[0] for which in (name, "solid"))
@@ -123,7 +120,7 @@ def test_view_transforms_leave_colors(shown: tuple[Path, dict[str, Any]], name: 
     assert np.median(np.abs(found - plain)[:, colored]) < 3 / 255
 
 
-def test_shadow_maps(shown: tuple[Path, dict[str, Any]]) -> None:
+def test_shadow_maps(shown):
     """Catches a head that throws no shadow on itself."""
     folder, result = shown
     atlas = np.load(folder / "shadows.npy")
@@ -134,7 +131,7 @@ def test_shadow_maps(shown: tuple[Path, dict[str, Any]]) -> None:
         check_shadow_map(atlas, index, ShadowMap(of.neutral, of.faces, light).depth)
 
 
-def test_bones_in_front(shown: tuple[Path, dict[str, Any]]) -> None:
+def test_bones_in_front(shown):
     """Catches splats that cover bones drawn in front, and holes around such bones."""
     folder, result = shown
     names = ("bone and splats", "bone", "hidden", "solid")
@@ -150,7 +147,7 @@ def test_bones_in_front(shown: tuple[Path, dict[str, Any]]) -> None:
     assert psnr_db(np.where(away, both, 0), np.where(away, splats, 0)) > 30
 
 
-def test_what_else_is_displayed(shown: tuple[Path, dict[str, Any]]) -> None:
+def test_what_else_is_displayed(shown):
     """Catches splats where they are hidden or clipped, ignored depth, and modes without."""
     folder, result = shown
     assert result["problem"] == ""
@@ -176,7 +173,7 @@ def test_what_else_is_displayed(shown: tuple[Path, dict[str, Any]]) -> None:
     )
 
 
-def test_errors_and_the_end(shown: tuple[Path, dict[str, Any]]) -> None:
+def test_errors_and_the_end(shown):
     """Catches an endless error or wait, what outlives its use, and splats lost to undo."""
     folder, result = shown
     failed, removed, problem = result["failed"]

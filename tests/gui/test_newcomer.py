@@ -25,7 +25,7 @@ MAX_WORDS = 3
 MIN_POSES_PER_SECOND = 30
 
 
-def test_the_first_two_hours(tmp_path: Path) -> None:
+def test_the_first_two_hours(tmp_path):
     """Catches what misbehaves in the first two hours, and what only a window has."""
     folder = Path(os.environ.get("STGA_GUI_FOLDER", tmp_path))
     folder.mkdir(exist_ok=True)

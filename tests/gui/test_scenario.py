@@ -4,9 +4,7 @@ import json
 import os
 import subprocess
 import sys
-from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import pytest
 from capture.factory import write_mesh_capture
@@ -20,7 +18,7 @@ ROOT = Path(__file__).resolve().parents[2]
 
 
 @pytest.fixture(scope="module")
-def home(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+def home(tmp_path_factory):
     """A folder with an empty Blender profile in which the built zip is installed."""
     folder = tmp_path_factory.mktemp("gui")
     archive = build_zip(folder)
@@ -31,7 +29,7 @@ def home(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
         request_cancel(job)
 
 
-def blender(home: Path, *arguments: object) -> None:
+def blender(home, *arguments):
     environment = {**os.environ, "BLENDER_USER_RESOURCES": str(home / "profile")}
     command = [*BLENDER, *map(str, arguments)]
     done = subprocess.run(
@@ -41,18 +39,18 @@ def blender(home: Path, *arguments: object) -> None:
     assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-3000:]
 
 
-def play(home: Path, part: str, capture: Path, *file: object) -> dict[str, Any]:
+def play(home, part, capture, *file):
     """What a part of scenario.py saw."""
     result = home / f"{part}.json"
     script = Path(__file__).with_name("scenario.py")
     arguments = (part, result, capture, home / "head.blend", sys.executable)
     blender(home, *file, "--python", script, "--", *arguments)
-    seen: dict[str, Any] = json.loads(result.read_text())
+    seen = json.loads(result.read_text())
     assert "traceback" not in seen, seen["traceback"]
     return seen
 
 
-def test_training_in_a_window(home: Path) -> None:
+def test_training_in_a_window(home):
     """Catches what only a window has: timers, undo, workers that outlive Blender."""
     capture = Path(os.environ.get("STGA_GUI_CAPTURE") or write_mesh_capture(home / "capture"))
     seen = play(home, "first", capture)

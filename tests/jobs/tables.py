@@ -14,7 +14,6 @@ from stga_addon.jobs.convert_motion import ConvertMotion
 from stga_addon.jobs.export import Export
 from stga_addon.jobs.finished_run import Evaluate, MakeExact, Relight
 from stga_addon.jobs.render import Render
-from stga_addon.jobs.table import Request, Result
 from stga_addon.jobs.track import MakeAvatar, SolveAgain, Track
 from stga_addon.jobs.train import Extend, Refine, Resume, Selected, SelectForTake, Train
 from stga_addon.progress import Written
@@ -27,7 +26,7 @@ PLAYED = Played(
     {"expr": np.ones((2, 4))},
     {-2: np.arange(4) < 2, 12: np.ones(4, bool)},
 )
-REQUESTS: tuple[Request, ...] = (
+REQUESTS = (
     Train(
         Path("r"),
         HEAD,
@@ -95,7 +94,7 @@ REQUESTS: tuple[Request, ...] = (
         options=MotionOptions(gains={"jaw": 0.5}, stay_trained=None),
     ),
 )
-RESULTS: tuple[Result, ...] = (
+RESULTS = (
     Written(Path("a.npz"), ("PSNR 30 dB", "avatar: a.npz")),
     Selected({3: np.arange(4) < 2}),
     Analyzed((EffectDecision("jaw", "auto", True, "turns by 9°", "none"),), {"draft": 31.5}),

@@ -1,6 +1,5 @@
 """State of a request that Blender follows: transitions without Blender."""
 
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,8 +10,6 @@ from stga_addon.jobs.monitor_state import (
     SLICE_INTERVAL_S,
     CancelAsked,
     Dismissed,
-    Effect,
-    Event,
     Failed,
     KillWorker,
     LoadAvatar,
@@ -48,9 +45,9 @@ ENDS = (WorkerState.FINISHED, WorkerState.CANCELLED, WorkerState.FAILED, WorkerS
 TRAINING = RequestState(Kind.TRAINING)
 
 
-def after(*events: Event, state: RequestState = TRAINING) -> tuple[RequestState, list[Effect]]:
+def after(*events, state=TRAINING):
     """The state after the events, and the effects of the last one."""
-    effects: Sequence[Effect] = ()
+    effects = ()
     for event in events:
         state, effects = transition(state, event)
     return state, list(effects)
@@ -62,7 +59,7 @@ def status(state, preview=0, folder=JOB, error="", **wanted):
     return StatusRead(folder, WorkerSnapshot(state, WorkerStatus(error=error)), files, **wanted)
 
 
-def loads(effects: list[Effect]) -> list[Path]:
+def loads(effects):
     return [effect.path for effect in effects if isinstance(effect, LoadAvatar)]
 
 
@@ -245,7 +242,7 @@ def test_unexpected_error_stops_until_the_next_start_or_check():
 # An avatar from footage
 
 
-def made(state: WorkerState, **files: int) -> StatusRead:
+def made(state, **files):
     """A status of making an avatar; files: name -> stamp."""
     stamps = {name: (stamp, 1) for name, stamp in files.items()}
     return StatusRead(JOB, WorkerSnapshot(state), RunFiles(**stamps))

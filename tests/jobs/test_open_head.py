@@ -1,7 +1,5 @@
 """The folder of the head that Blender has open: what is written is read back."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 from capture.factory import edit, write_avatar_of, write_flame_capture, write_mesh_capture
@@ -18,7 +16,7 @@ VERTICES = 162
 
 
 @pytest.fixture
-def folder(tmp_path: Path) -> Path:
+def folder(tmp_path):
     root = write_mesh_capture(tmp_path / "capture")
     chosen = {-2: np.zeros(FACES, bool), 10: np.arange(FACES) < 40}
     meshes = {frame: open_capture(root).neutral + frame for frame in (-2, 10)}
@@ -28,7 +26,7 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def test_a_head_is_read_back(folder: Path) -> None:
+def test_a_head_is_read_back(folder):
     """Catches frames of the scene, which may be negative, that lose their sign, order or meshes."""
     head = read_head(folder)
     capture = open_capture(folder / "capture")
@@ -40,7 +38,7 @@ def test_a_head_is_read_back(folder: Path) -> None:
     assert np.array_equal(played.meshes[-2], capture.neutral - 2)
 
 
-def test_damaged_folders(folder: Path) -> None:
+def test_damaged_folders(folder):
     """Catches a traceback for rates and names that are none, and for arrays that are gone."""
     for fps in (float("inf"), float("nan"), 0, "25", None, 10**400):
         edit(folder / HEAD, lambda values, fps=fps: values.update(fps=fps))

@@ -28,7 +28,7 @@ FOUND = {
 }
 
 
-def check(python: object, timeout_s: float = 120.0):
+def check(python, timeout_s=120.0):
     return finish_check(str(python), start_check(str(python)), timeout_s)
 
 

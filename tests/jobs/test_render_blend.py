@@ -13,7 +13,7 @@ from refusal import refusal
 
 from stga_addon.jobs.blender import RenderBlend, blender_command
 from stga_addon.jobs.perform import perform, worker_arguments, write_request
-from stga_addon.progress import Cancelled, Progress, Written, ignore
+from stga_addon.progress import Cancelled, Written, ignore
 
 BLENDER = """
 import os, sys, time
@@ -38,7 +38,7 @@ for frame in range(first, last + 1):
 
 
 @pytest.fixture
-def shot(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> RenderBlend:
+def shot(tmp_path, monkeypatch):
     script = tmp_path / "blender.py"
     script.write_text(BLENDER)
     (tmp_path / "shot.blend").touch()
@@ -48,22 +48,22 @@ def shot(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> RenderBlend:
     return RenderBlend(tmp_path / "shot.blend", tmp_path / "out", (8, 12))
 
 
-def pictures(folder: Path) -> dict[str, str]:
+def pictures(folder):
     return {path.name: path.read_text() for path in folder.glob("*.png")}
 
 
-def calls(folder: Path) -> list[list[str]]:
+def calls(folder):
     return [line.split()[1:] for line in (folder / "log").read_text().splitlines()]
 
 
 WHOLE = {f"{frame:06d}.png": f"half {frame}" for frame in range(8, 13)}
 
 
-def test_only_missing_frames_are_rendered(shot: RenderBlend, tmp_path: Path) -> None:
+def test_only_missing_frames_are_rendered(shot, tmp_path):
     """Catches frames that are rendered twice, left out, or by another engine or training Python."""
     shot.output.mkdir()
     (shot.output / "000010.png").write_text("half 10")
-    shares: list[float] = []
+    shares = []
     perform(shot, lambda progress: bool(shares.append(progress.share)), lambda line: None)
     assert pictures(shot.output) == WHOLE
     same = ["STGA_SPLATS", sys.executable]
@@ -73,7 +73,7 @@ def test_only_missing_frames_are_rendered(shot: RenderBlend, tmp_path: Path) -> 
     assert len(calls(tmp_path)) == 2
 
 
-def test_a_program_with_spaces_in_its_path(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_a_program_with_spaces_in_its_path(monkeypatch, tmp_path):
     """Catches "C:/Program Files/…/blender.exe" that is taken apart, and a command that is not."""
     program = tmp_path / "Blender Foundation" / "blender"
     program.parent.mkdir()
@@ -101,7 +101,7 @@ def test_cancelling_ends_blender(shot, tmp_path, monkeypatch):
     """Catches a Blender that goes on after Ctrl-C, and pictures of which only a part is written."""
     monkeypatch.setenv("PAUSE", "0.3")
 
-    def report(progress: Progress) -> bool:
+    def report(progress):
         return progress.share >= 0.4
 
     with pytest.raises(Cancelled):
@@ -112,7 +112,7 @@ def test_cancelling_ends_blender(shot, tmp_path, monkeypatch):
         os.kill(process, 0)
 
 
-def test_a_film_cancelled_with_its_last_picture_is_whole(shot: RenderBlend) -> None:
+def test_a_film_cancelled_with_its_last_picture_is_whole(shot):
     """Catches a job that is reported as cancelled, and done again, though no picture is missing."""
     result = perform(shot, lambda progress: progress.share == 1, lambda line: None)
     assert result == Written(shot.output)
@@ -146,11 +146,11 @@ def test_blender_ends_with_a_killed_worker(shot, tmp_path, monkeypatch):
     assert set(os.listdir(shot.output)) == set(WHOLE)
 
 
-def test_two_jobs_with_one_output(shot: RenderBlend) -> None:
+def test_two_jobs_with_one_output(shot):
     """Catches a job that removes what the Blender of another one is writing."""
     other = replace(shot, frames=(20, 21))
 
-    def report(progress: Progress) -> bool:
+    def report(progress):
         if progress.share == 0.2:  # the first Blender has four pictures to go
             perform(other, ignore, lambda line: None)
         return False

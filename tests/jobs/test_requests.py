@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from dataclasses import fields, replace
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any, get_args
+from typing import get_args
 
 import numpy as np
 import pytest
@@ -17,7 +17,7 @@ from cli.test_render_video import decoded
 from command_line import stga
 from refusal import refusal
 
-from stga_addon.avatar.file import Avatar, read_avatar, write_avatar
+from stga_addon.avatar.file import read_avatar, write_avatar
 from stga_addon.capture.open import open_capture
 from stga_addon.errors import StgaError
 from stga_addon.files import read_npz
@@ -29,7 +29,7 @@ from stga_addon.jobs.perform import perform_in_folder, write_request
 from stga_addon.jobs.render import Render
 from stga_addon.jobs.table import JOBS, Result
 from stga_addon.jobs.track import SolveAgain, Track
-from stga_addon.jobs.train import Refine, Resume, Train
+from stga_addon.jobs.train import Resume, Train
 from stga_addon.progress import Clock, Progress, TimeLeft, Written
 from stga_addon.training.effect_catalog import RELIGHT, WORLD, EffectDecision
 from stga_addon.training.run.folder import Run, write_run
@@ -49,7 +49,7 @@ from stga_addon.worker.status import (
 from .tables import REQUESTS, RESULTS
 
 
-def same(a: Any, b: Any) -> bool:
+def same(a, b):
     """Equality of plain values, types and arrays included."""
     if isinstance(a, np.ndarray):
         return isinstance(b, np.ndarray) and a.dtype == b.dtype and np.array_equal(a, b)
@@ -63,40 +63,40 @@ def same(a: Any, b: Any) -> bool:
 
 
 @pytest.fixture
-def capture(tmp_path: Path) -> Path:
+def capture(tmp_path):
     return write_mesh_capture(tmp_path / "capture")
 
 
-def training(run: Path, capture: Path, **changes: Any) -> Train:
+def training(run, capture, **changes):
     settings = make_settings(
         "selective", **{"iterations": 12, "hull_points": False, "seed": 3, **changes}
     )
     return Train(run, capture, settings, principal_point="opencv", selection=painted())
 
 
-def painted() -> dict[int, np.ndarray]:
+def painted():
     return {0: np.zeros(320, bool), 1: np.arange(320) < 40, 3: np.arange(320) % 2 == 0}
 
 
-def check(request: Any) -> None:
+def check(request):
     JOBS[type(request)].check(request)
 
 
-def asked(request: Train | Resume | Refine) -> Path:
+def asked(request):
     """The folder of a request that is written into it."""
     folder = jobs.request_folder(request.run)
     write_request(folder, request)
     return folder
 
 
-def test_every_request_is_tried() -> None:
+def test_every_request_is_tried():
     """Catches a request or result that is missing in the tables here, or has no work."""
     assert {type(request) for request in REQUESTS} == set(JOBS)
     assert {type(result) for result in RESULTS} == set(get_args(Result))
 
 
 @pytest.mark.parametrize("value", [*REQUESTS, *RESULTS], ids=lambda value: type(value).__name__)
-def test_round_trip(tmp_path: Path, value: Any) -> None:
+def test_round_trip(tmp_path, value):
     """Catches a field that is lost, or changes its type, between the panel and the worker."""
     if type(value) in JOBS:
         write_request(tmp_path, value)
@@ -106,7 +106,7 @@ def test_round_trip(tmp_path: Path, value: Any) -> None:
         assert same(jobs.read_result(tmp_path), value)
 
 
-def test_the_next_request_forgets_the_last(tmp_path: Path, capture: Path) -> None:
+def test_the_next_request_forgets_the_last(tmp_path, capture):
     """Catches yesterday's selection, preview, result or wish to cancel in today's work."""
     folder = asked(training(tmp_path / "run", capture))
     for name in (jobs.PREVIEW, CANCEL_FILE, STATUS_FILE):
@@ -116,7 +116,7 @@ def test_the_next_request_forgets_the_last(tmp_path: Path, capture: Path) -> Non
     assert sorted(path.name for path in folder.iterdir()) == [jobs.REQUEST, LOG_FILE]
 
 
-def test_refusals(tmp_path: Path, capture: Path) -> None:
+def test_refusals(tmp_path, capture):
     """Catches a run overwritten, or resumed where none is, only after a worker was started."""
     run = tmp_path / "run"
     with refusal(r"holds no run \(run\.json is missing\)"):
@@ -135,14 +135,14 @@ def test_refusals(tmp_path: Path, capture: Path) -> None:
         check(Track(Path("f"), Path("m"), capture))
 
 
-DAMAGES: dict[str, Any] = {"format": "stga-job", "version": 0, "kind": "Paint", "run": 5}
+DAMAGES = {"format": "stga-job", "version": 0, "kind": "Paint", "run": 5}
 DAMAGES |= {"capture": None, "device": "toaster", "settings": {}, "principal_point": "up"}
 DAMAGES |= {"selection": {"x": {"array": "selection.0"}}, "unknown": 1}
 TEXTS = "[]", "3", '{"format": "stga-request", "version": 1}', "[" * 100_000
 
 
 @pytest.mark.parametrize("name", [*DAMAGES, *TEXTS], ids=lambda name: name[:20])
-def test_damaged_requests(tmp_path: Path, name: str) -> None:
+def test_damaged_requests(tmp_path, name):
     """Catches a traceback or a guess for a request that is damaged or of another version."""
     write_request(tmp_path, REQUESTS[0])
     if name in DAMAGES:
@@ -155,7 +155,7 @@ def test_damaged_requests(tmp_path: Path, name: str) -> None:
     assert name in TEXTS or re.search(expected, str(caught.value))
 
 
-def test_time_left_is_told_by_the_pace_of_what_was_done_last() -> None:
+def test_time_left_is_told_by_the_pace_of_what_was_done_last():
     """Catches an average over slow and fast work, and work that was done in an earlier call."""
     now = 0.0
     left = TimeLeft(lambda: now)
@@ -171,7 +171,7 @@ def test_time_left_is_told_by_the_pace_of_what_was_done_last() -> None:
     assert told == pytest.approx(0.15 * 100)
 
 
-def test_a_clock_never_goes_back(tmp_path: Path) -> None:
+def test_a_clock_never_goes_back(tmp_path):
     """Catches 73, 25, 55 and 7 minutes that are left one after another, too little that is said as
     if it were true, and 100 % before the end."""
     minutes = (73.0, 64.0, 49.0, 25.0, 39.0, 55.0, 24.0, math.nan, 7.0)
@@ -189,7 +189,7 @@ def test_a_clock_never_goes_back(tmp_path: Path) -> None:
     assert [status.progress for status in told] == [0.0, 0.3, 0.3, 0.4, 0.5, 0.6, 0.9, 0.99, 0.99]
 
 
-def test_what_has_not_come_true_is_not_said_again() -> None:
+def test_what_has_not_come_true_is_not_said_again():
     """Catches "About 20 s left" for a minute and a half."""
     seconds = iter((0.0, 20.0, 90.0))
     clock = Clock(lambda: next(seconds))
@@ -198,7 +198,7 @@ def test_what_has_not_come_true_is_not_said_again() -> None:
     assert said == ["About 20 s left", "About 20 s left", "More than 20 s left"]
 
 
-def test_what_follows_training_is_told_ahead(tmp_path: Path, monkeypatch: Any) -> None:
+def test_what_follows_training_is_told_ahead(tmp_path, monkeypatch):
     """Catches 100 % for minutes of light and world, and a time that is too short before training
     knows its own."""
 
@@ -209,13 +209,13 @@ def test_what_follows_training_is_told_ahead(tmp_path: Path, monkeypatch: Any) -
         request = Train(tmp_path, tmp_path, make_settings(iterations=1))
         run = SimpleNamespace(effect_plan=plan, settings=SimpleNamespace(tracking=False))
 
-        def train_as_asked(self, report: Any) -> Path:
+        def train_as_asked(self, report):
             report(Progress(0.0, "Placing splats"))
             report(Progress(0.5, "Training", figures=lambda: {"left_s": 30.0}))
             report(Progress(1.0, "Finished", figures=lambda: {"left_s": 1.0}))
             return tmp_path / "avatar.npz"
 
-    def half(prepared: Any, *others: Any) -> Any:
+    def half(prepared, *others):
         others[-1](Progress(0.5, "Halfway"))
         return ("done",) if len(others) == 2 else "done"
 
@@ -224,9 +224,9 @@ def test_what_follows_training_is_told_ahead(tmp_path: Path, monkeypatch: Any) -
     monkeypatch.setattr(train, "CurveUpdater", lambda _: lambda: None)
     for name in ("_light_of", "_world_of"):
         monkeypatch.setattr(train, name, half)
-    told: list[tuple[float, float]] = []
+    told = []
 
-    def report(progress: Progress) -> bool:
+    def report(progress):
         told.append((progress.share, progress.figures()["left_s"]))
         return False
 
@@ -287,14 +287,14 @@ def test_a_worker_renders_and_exports_what_the_command_line_would(tmp_path, capt
             assert contents(here) == contents(there)
 
 
-def contents(path: Path) -> dict[str, bytes]:
+def contents(path):
     """Name -> bytes of the files of a folder, or of one file."""
     files = path.glob("[!.]*") if path.is_dir() else (path,)
     return {file.name: file.read_bytes() for file in files}
 
 
 @pytest.mark.slow
-def test_a_cancelled_render_keeps_its_pictures_alone(tmp_path: Path, capture: Path) -> None:
+def test_a_cancelled_render_keeps_its_pictures_alone(tmp_path, capture):
     """Catches a worker that renders a whole film after it was cancelled, or leaves half a video."""
     pytest.importorskip("numba")
     avatar = write_avatar_of(open_capture(capture), tmp_path / "a.npz")
@@ -304,7 +304,7 @@ def test_a_cancelled_render_keeps_its_pictures_alone(tmp_path: Path, capture: Pa
         wanted = Render(avatar, tmp_path / name, is_video, turntable=90.0, capture=capture)
         write_request(folder, replace(wanted, device="cpu"))
 
-        def cancel_at_the_second(progress: Progress, folder: Path = folder) -> bool:
+        def cancel_at_the_second(progress, folder=folder):
             if progress.detail.startswith("Image 2 of"):
                 request_cancel(folder)
             return False
@@ -322,7 +322,7 @@ def test_a_request_continues_what_it_began(tmp_path, capture):
     request = training(tmp_path / "run", capture, iterations=40)
     folder = asked(request)
 
-    def cancel(progress: Progress) -> bool:
+    def cancel(progress):
         if iteration_of(progress) == 5:
             request_cancel(folder)
         assert iteration_of(progress) <= 6
@@ -353,7 +353,7 @@ def test_a_request_continues_what_it_began(tmp_path, capture):
     assert perform_in_folder(tracked.out / "job", resume=True) == Written(tracked.out)
 
 
-def iteration_of(progress: Progress) -> float:
+def iteration_of(progress):
     return progress.figures().get("iteration", 0)
 
 
@@ -367,12 +367,12 @@ def test_previews_while_it_trains(tmp_path, capture, monkeypatch):
     previews = []
     folder = asked(training(run, capture))
 
-    def look(progress: Progress) -> bool:
+    def look(progress):
         if (folder / jobs.PREVIEW).exists():
             previews.append(len(read_avatar(folder / jobs.PREVIEW).splats))
         return False
 
-    def full(path: Path, avatar: Avatar) -> None:
+    def full(path, avatar):
         if path.name == jobs.PREVIEW:
             raise StgaError(f"{path}: cannot be written (No space left on device)")
         write_avatar(path, avatar)
@@ -403,7 +403,7 @@ def test_mistakes_reach_the_folder_and_the_exit_code(tmp_path, capture, capsys):
     assert seen.status.traceback == ""
 
 
-def test_an_interpreter_without_anything_is_named(tmp_path: Path, capture: Path) -> None:
+def test_an_interpreter_without_anything_is_named(tmp_path, capture):
     """Catches a traceback about imports where a sentence should say which Python lacks what."""
     folder = asked(training(tmp_path / "run", capture))
     subprocess.run(

@@ -10,7 +10,6 @@ import tempfile
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 from capture import factory
@@ -22,14 +21,14 @@ from stga_addon.avatar.splats import Splats
 from stga_addon.export.playback import Playback
 from stga_addon.export.rig import Rig, RiggedAvatar, ShapeControls
 from stga_addon.export.skinned_gltf import skinned_glb
-from stga_addon.flame.forward import FlameFrame, frame_of
+from stga_addon.flame.forward import frame_of
 from stga_addon.flame.model import read_flame
 from stga_addon.flame.sequence import FlameSequence
 from stga_addon.jobs.perform import request_folder, write_request, write_result
 from stga_addon.jobs.train import Train
 from stga_addon.progress import Written
 from stga_addon.training.effect_catalog import EffectDecision
-from stga_addon.training.optimize.state import TrainState, new_offset, new_state
+from stga_addon.training.optimize.state import new_offset, new_state
 from stga_addon.training.run.checkpoint import (
     Checkpoint,
     strain_range_of,
@@ -62,13 +61,13 @@ METRICS = {"iteration": 10, "seconds": 5.5, "evaluation_s": 0.5, "wall_s": 7.25,
 METRICS |= {"loss": 0.125, "psnr": 30.5, "ssim": 0.875, "peak_memory_mb": 512.0}
 
 
-def ramp(*shape: int, start: int = 0) -> np.ndarray:
+def ramp(*shape, start=0):
     """Float32 in −0.5…1 that every type in a file holds exactly."""
     values = (np.arange(np.prod(shape)) + start) % 97 / 64 - 0.5
     return values.reshape(shape).astype(np.float32)
 
 
-def splats() -> Splats:
+def splats():
     return Splats(
         xyz=ramp(COUNT, 3),
         rotation=np.eye(4, dtype=np.float32)[[0, 1, 2, 3, 0]],
@@ -80,7 +79,7 @@ def splats() -> Splats:
     )
 
 
-def avatar() -> Avatar:
+def avatar():
     light = AvatarLight(
         radiance=ramp(9, 3),
         transfer=ramp(4, 9) + 0.5,
@@ -108,7 +107,7 @@ def avatar() -> Avatar:
     )
 
 
-def state() -> TrainState:
+def state():
     made = new_state(splats())
     for part in (made.first, made.second):
         for array in part:
@@ -118,7 +117,7 @@ def state() -> TrainState:
     return made
 
 
-def checkpoint() -> Checkpoint:
+def checkpoint():
     tracking = ramp(2, 23).astype(np.float64)
     digest = IDENTITY.digest
     return Checkpoint(
@@ -138,7 +137,7 @@ def checkpoint() -> Checkpoint:
     )
 
 
-def run() -> Run:
+def run():
     return Run(
         Path("/captures/anna"),
         Path("/models/flame.npz"),
@@ -152,38 +151,38 @@ def run() -> Run:
     )
 
 
-def train() -> Train:
+def train():
     settings = make_settings(iterations=3, preset="draft")
     return Train(Path("/runs/anna"), Path("/captures/anna"), settings, selection=SELECTION)
 
 
-def tracked_frames() -> dict[int, FlameFrame]:
+def tracked_frames():
     """Those of a sequence before it was refined."""
     return {timestep: frame_of(ramp(20, start=timestep) / 8) for timestep in TIMESTEPS}
 
 
-def refined() -> np.ndarray:
+def refined():
     """(T, P + 3) parameters, and shifts of the torso."""
     return np.asarray(ramp(2, 23, start=40) / 8, np.float64)
 
 
-def sequence(model_file: Path) -> FlameSequence:
+def sequence(model_file):
     """With the frames of `tracked_frames`; writes the model."""
     model = read_flame(factory.write_flame_model(model_file))
     return FlameSequence(model, ramp(4), None, TIMESTEPS, tracked_frames().__getitem__)
 
 
-def strain_range(folder: Path) -> Any:
+def strain_range(folder):
     """Of a run of two timesteps in the folder: read, where there is none measured and written."""
     scales = 0.8 - ramp(2, 3) / 8
     views = {"train": [SimpleNamespace(timestep=timestep) for timestep in range(2)]}
-    capture: Any = SimpleNamespace(
+    capture = SimpleNamespace(
         faces=FACES, neutral=NEUTRAL, views=views, mesh=lambda timestep: NEUTRAL * scales[timestep]
     )
     return strain_range_of(folder, capture, replace(run(), continuation=None))
 
 
-def rigged() -> RiggedAvatar:
+def rigged():
     """On two joints, with two shapes of which one is a slider, in three frames."""
     controls = ShapeControls(("jawOpen", "mouthClose"), ramp(2, 10), ramp(2, 1), *("jawOpen",) * 2)
     rig = Rig(
@@ -204,7 +203,7 @@ def rigged() -> RiggedAvatar:
     return RiggedAvatar(avatar(), rig, controls)
 
 
-def make(folder: Path) -> None:
+def make(folder):
     """Write the files of this version."""
     write_run(folder, run())
     write_avatar(folder / "avatar.npz", avatar())

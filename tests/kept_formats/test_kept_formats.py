@@ -7,6 +7,7 @@ import pytest
 from capture import factory
 from export.web.test_player import evaluated
 from export.web.web_data import posed_mesh, read_web_data
+from numpy.testing import assert_allclose, assert_array_equal, assert_equal
 
 from stga_addon.avatar.file import read_avatar
 from stga_addon.capture.open import open_capture, with_sequence
@@ -27,7 +28,7 @@ FOLDERS = sorted(make.DATA.iterdir())
 pytestmark = pytest.mark.parametrize("folder", FOLDERS, ids=lambda folder: folder.name)
 
 
-def assert_same(found: object, expected: object) -> None:
+def assert_same(found, expected):
     """Values of two objects, with equal arrays of the same types."""
     assert type(found) is type(expected)
     assert vars(found).keys() == vars(expected).keys()
@@ -35,15 +36,15 @@ def assert_same(found: object, expected: object) -> None:
         ours = getattr(found, name)
         if isinstance(value, np.ndarray):
             assert ours.dtype == value.dtype, name
-            np.testing.assert_array_equal(ours, value, err_msg=name)
+            assert_array_equal(ours, value, err_msg=name)
         elif isinstance(value, dict):
             assert ours.keys() == value.keys()
-            np.testing.assert_equal(ours, value)
+            assert_equal(ours, value)
         elif not hasattr(value, "__dataclass_fields__"):
             assert ours == value, name
 
 
-def test_avatar(folder: Path) -> None:
+def test_avatar(folder):
     """Catches an avatar file of people that is refused, or loses its colors, light or regions."""
     found = read_avatar(folder / "avatar.npz")
     expected = make.avatar()
@@ -52,42 +53,41 @@ def test_avatar(folder: Path) -> None:
     assert_same(found.light, expected.light)
 
 
-def test_run(folder: Path) -> None:
+def test_run(folder):
     """Catches a run that cannot be resumed, or goes on with other settings or another selection."""
     assert read_run(folder) == make.run()
     assert read_run(folder).identity == make.IDENTITY
     digest = make.IDENTITY.digest
     assert_same(read_checkpoint(folder), make.checkpoint())
     found = arrays_of(read_checkpoint(folder).state)
-    np.testing.assert_equal(found, arrays_of(make.checkpoint().state))
+    assert_equal(found, arrays_of(make.checkpoint().state))
     offset = read_checkpoint(folder).state.driven_offsets["strain_position"]
     assert_same(offset, make.state().driven_offsets["strain_position"])
     selection = read_selection(folder, len(make.FACES), digest)
     assert selection.keys() == make.SELECTION.keys()
-    np.testing.assert_equal(selection, make.SELECTION)
-    np.testing.assert_array_equal(read_residuals(folder, len(make.FACES)), make.RESIDUAL)
+    assert_equal(selection, make.SELECTION)
+    assert_array_equal(read_residuals(folder, len(make.FACES)), make.RESIDUAL)
     assert read_metrics(folder) == [make.METRICS]
 
 
-def test_strain_range(folder: Path, tmp_path: Path) -> None:
+def test_strain_range(folder, tmp_path):
     """Catches a run's range of deformation that is refused, or measured anew in other numbers."""
     found = make.strain_range(folder)
-    np.testing.assert_allclose(found, make.strain_range(tmp_path), atol=1e-6)
+    assert_allclose(found, make.strain_range(tmp_path), atol=1e-6)
     assert np.abs(found[:, :, :2]).max() > 0.3
 
 
-def test_tracking(folder: Path, tmp_path: Path) -> None:
+def test_tracking(folder, tmp_path):
     """Catches refined tracking that is left out, or mixed up."""
     root, model = factory.write_flame_capture(tmp_path, make.TIMESTEPS, (0,))
     capture = with_sequence(open_capture(root, model), make.sequence(model))
     refined = with_refined_tracking(capture, folder).flame
-    assert refined is not None
     for timestep, expected in zip(make.TIMESTEPS, make.refined(), strict=True):
-        np.testing.assert_array_equal(refined.frame(timestep).parameters, expected[:-3])
+        assert_array_equal(refined.frame(timestep).parameters, expected[:-3])
         assert refined.frame(timestep).dynamic_offset is not None
 
 
-def test_request(folder: Path) -> None:
+def test_request(folder):
     """Catches a request of a batch or a run that a newer worker refuses."""
     expected = make.train()
     assert_same(read_request(request_folder(folder)), expected)
@@ -96,7 +96,7 @@ def test_request(folder: Path) -> None:
 
 
 @pytest.mark.needs("node")
-def test_web_data(folder: Path, tmp_path: Path) -> None:
+def test_web_data(folder, tmp_path):
     """Catches data on people's servers that a newer player refuses, or poses in another way."""
     names = (make.OLDER_SKINNED, make.SKINNED)
     data = next(folder / name for name in names if (folder / name).exists()).read_bytes()
@@ -106,5 +106,5 @@ def test_web_data(folder: Path, tmp_path: Path) -> None:
     assert len(results) == len(rig.pose)
     for frame, result in enumerate(results):
         expected = posed_mesh(header, arrays, rig.coefficients[frame], rig.pose[frame], frame)
-        np.testing.assert_allclose(np.reshape(result["vertices"], (-1, 3)), expected, atol=1e-5)
+        assert_allclose(np.reshape(result["vertices"], (-1, 3)), expected, atol=1e-5)
         assert np.ptp(np.reshape(result["texels"], (-1, 5, 4))[:, 3, :3]) > 0.01

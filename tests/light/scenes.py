@@ -5,7 +5,7 @@ import trimesh
 from avatar.conftest import splats_of
 
 from stga_addon.avatar.file import Avatar, AvatarLight
-from stga_addon.avatar.splats import SH_C0, Splats
+from stga_addon.avatar.splats import SH_C0
 from stga_addon.capture.color import linear_to_srgb
 from stga_addon.light.harmonics import uniform
 from stga_addon.light.relight import HIGHLIGHT_SHARE
@@ -14,7 +14,7 @@ from stga_addon.light.surface import Bounce, transfer_of
 RADIUS = 0.1
 
 
-def ball_and_plate(subdivisions: int = 3) -> tuple[np.ndarray, np.ndarray]:
+def ball_and_plate(subdivisions=3):
     """Vertices and triangles of a ball of 10 cm, and a plate 6 cm above a part of it."""
     ball = trimesh.creation.icosphere(subdivisions, RADIUS)
     place = trimesh.transformations.translation_matrix((0.05, 0.16, 0.0))
@@ -43,7 +43,7 @@ def blocked(points, direction, vertices, faces):
     return found
 
 
-def middle_splats(face: np.ndarray, log_scale: float, coefficients: int = 1) -> Splats:
+def middle_splats(face, log_scale, coefficients=1):
     """A gray splat in the middle of each of the triangles."""
     return splats_of(
         np.zeros((len(face), 3)),

@@ -3,12 +3,12 @@
 import os
 import shutil
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 from capture import factory
 from command_line import refused, stga
+from numpy.testing import assert_allclose, assert_array_equal
 from PIL import Image
 from refusal import refusal
 
@@ -33,18 +33,18 @@ direction = [-1, 0, -0.5]
 
 
 @pytest.fixture(scope="module")
-def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def root(tmp_path_factory):
     return factory.write_mesh_capture(tmp_path_factory.mktemp("light") / "ball", (0, 1), range(4))
 
 
 @pytest.fixture(scope="module")
-def run(root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def run(root, tmp_path_factory):
     out = tmp_path_factory.mktemp("runs") / "run"
     assert stga("train", root, "--out", out, "--iterations 10 --schedule paper") == 0
     return out
 
 
-def rendered(run: Path, root: Path, out: Path, *options: str) -> np.ndarray:
+def rendered(run, root, out, *options):
     cameras = root / "transforms_val.json"
     assert stga("render", run, "--cameras", cameras, "--out", out, *options) == 0
     with Image.open(sorted(out.iterdir())[0]) as image:
@@ -55,7 +55,6 @@ def test_a_run_ends_with_its_light(run, capsys, root, tmp_path):
     """Catches a training whose avatar has no light, or has it against one's will, and a file
     that grows by much."""
     avatar = read_avatar(run / "avatar.npz")
-    assert avatar.light is not None
     assert avatar.light.transfer.shape == (len(avatar.neutral), 9)
     without = run.parent / "without.npz"
     write_avatar(without, replace(avatar, light=None))
@@ -76,7 +75,7 @@ def test_a_run_ends_with_its_light(run, capsys, root, tmp_path):
 def test_a_training_is_whole_without_what_follows_it(error, root, tmp_path, monkeypatch, capsys):
     """Catches a run of an hour that ends with a traceback because its light could not be found."""
 
-    def fail(*_: object) -> None:
+    def fail(*_):
         raise error
 
     for name in ("light.estimate.estimate_light", "training.world.world_of"):
@@ -102,7 +101,7 @@ def test_a_gray_card_sets_the_level_and_a_running_trainings_avatar_is_kept(
     assert problem in capsys.readouterr().err
     assert (copy / "avatar.npz").read_bytes() == before
 
-    def estimate(*given: object) -> object:
+    def estimate(*given):
         with refusal("another run is working"), locked(copy):
             pytest.fail("a training could begin between reading and writing")
         return estimate_light(*given)
@@ -116,10 +115,10 @@ def test_a_gray_card_sets_the_level_and_a_running_trainings_avatar_is_kept(
         assert light.source == "gray_card"
         found.append(light.irradiance.mean(0))
     # the ball of this capture has no red
-    np.testing.assert_allclose(found[0][1:], 2 * found[1][1:], rtol=2e-3)
+    assert_allclose(found[0][1:], 2 * found[1][1:], rtol=2e-3)
 
 
-def test_cameras_are_compared_as_one(run: Path, root: Path, tmp_path: Path) -> None:
+def test_cameras_are_compared_as_one(run, root, tmp_path):
     """Catches a light estimated without the exposure correction of the avatar's colors."""
     gain = np.array([0.7, 0.8, 0.6])
     offset = np.array([12.0, 5.0, 8.0])
@@ -133,12 +132,10 @@ def test_cameras_are_compared_as_one(run: Path, root: Path, tmp_path: Path) -> N
     avatar = read_avatar(avatar_file)
     settings = {**avatar.settings, "exposure": [[2.0, *gain, *offset]]}
     write_avatar(avatar_file, replace(avatar, settings=settings))
-    assert avatar.light is not None
     add_light(avatar_file, open_capture(tmp_path / "capture"))
     light = read_avatar(avatar_file).light
-    assert light is not None
     # images are rounded to levels
-    np.testing.assert_allclose(light.irradiance, avatar.light.irradiance, rtol=0.05)
+    assert_allclose(light.irradiance, avatar.light.irradiance, rtol=0.05)
 
 
 def test_render_under_lights(run, root, tmp_path, capsys):
@@ -150,7 +147,7 @@ def test_render_under_lights(run, root, tmp_path, capsys):
     stripped = tmp_path / "stripped"
     shutil.copytree(run, stripped)
     write_avatar(stripped / "avatar.npz", replace(read_avatar(run / "avatar.npz"), light=None))
-    np.testing.assert_array_equal(rendered(stripped, root, tmp_path / "same"), plain)
+    assert_array_equal(rendered(stripped, root, tmp_path / "same"), plain)
     right = rendered(run, root, tmp_path / "right", "--light", str(lights))
     assert np.abs(right - plain).max() > 20
     lights.write_text(LIGHTS.replace("[-1, 0, -0.5]", "[1, 0, -0.5]"))
@@ -166,7 +163,7 @@ def test_render_under_lights(run, root, tmp_path, capsys):
         assert message in refused(capsys, "render", source, cameras, light)
 
 
-def test_albedo_as_ply(run: Path, tmp_path: Path) -> None:
+def test_albedo_as_ply(run, tmp_path):
     """Catches an export that keeps the recorded light, or loses splats."""
     out = tmp_path / "albedo.ply"
     assert stga("export", run, "--format ply --albedo --out", out) == 0
@@ -174,5 +171,5 @@ def test_albedo_as_ply(run: Path, tmp_path: Path) -> None:
     splats = read_ply(out)
     assert not splats.sh[:, 1:].any()
     shown = srgb_to_linear(np.maximum(0.5 + 0.28209479 * splats.sh[:, 0], 0))
-    np.testing.assert_allclose(shown, np.clip(Relighter(avatar).albedo, 0, 1), atol=2e-3)
+    assert_allclose(shown, np.clip(Relighter(avatar).albedo, 0, 1), atol=2e-3)
     assert albedo_avatar(avatar).light is None

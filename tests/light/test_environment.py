@@ -1,10 +1,10 @@
 """Environments and files of lights: what is written is read, and an environment keeps its light."""
 
 import struct
-from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 from refusal import refusal
 
 from stga_addon.light.environment import (
@@ -17,14 +17,14 @@ from stga_addon.light.environment import (
 from stga_addon.light.harmonics import LAMBERT, basis
 
 
-def rgbe(pixels: np.ndarray) -> np.ndarray:
+def rgbe(pixels):
     """(…, 4) uint8 of radiance (…, 3): Ward's shared exponent, rounded down."""
     exponent = np.floor(np.log2(np.maximum(pixels.max(-1), 1e-30))).astype(int) + 1
     mantissa = np.floor(pixels * 256 / np.exp2(exponent)[..., None])
     return np.concatenate([mantissa, exponent[..., None] + 128], axis=-1).astype(np.uint8)
 
 
-def write_hdr(path: Path, pixels: np.ndarray, packed: bool) -> Path:
+def write_hdr(path, pixels, packed):
     """A Radiance picture with flat rows, or run-length encoded ones."""
     height, width = pixels.shape[:2]
     body = rgbe(pixels)
@@ -71,21 +71,21 @@ def test_an_environment_keeps_its_irradiance():
     image = np.full((64, 128, 3), 0.2)
     vectors, angle = pixel_directions(64, 128)
     assert (angle * 128).sum() == pytest.approx(4 * np.pi)
-    np.testing.assert_allclose(vectors[32, 64], [1, 0, 0], atol=0.05)
-    np.testing.assert_allclose(vectors[32, 32], [0, 1, 0], atol=0.05)
+    assert_allclose(vectors[32, 64], [1, 0, 0], atol=0.05)
+    assert_allclose(vectors[32, 32], [0, 1, 0], atol=0.05)
     sun = vectors @ (toward := np.array([0.6, 0.0, 0.8])) > np.cos(np.radians(4))
     image[sun] = [400.0, 300.0, 200.0]
     world, suns = split_environment(image, np.eye(3))
     assert len(suns) == 1
-    np.testing.assert_allclose(-suns[0].direction, toward, atol=0.02)
+    assert_allclose(-suns[0].direction, toward, atol=0.02)
     assert 0.1 < suns[0].angle < 0.2
     for normal in (toward, np.array([1.0, 0, 0]), np.array([0, 0, -1.0])):
         truth = (image * angle[..., None] * np.maximum(vectors @ normal, 0)[..., None]).sum((0, 1))
         found = (basis(normal[None]) * LAMBERT @ world)[0]
         found += suns[0].color * max(-suns[0].direction @ normal, 0)
-        np.testing.assert_allclose(found, truth, rtol=0.02, atol=0.05)
+        assert_allclose(found, truth, rtol=0.02, atol=0.05)
     whole = split_environment(image, np.eye(3), max_suns=0)[0]
-    np.testing.assert_allclose(whole[0], world[0] + suns[0].color * 0.28209, rtol=1e-3)
+    assert_allclose(whole[0], world[0] + suns[0].color * 0.28209, rtol=1e-3)
 
 
 def test_lights_of_a_text_file(tmp_path):
@@ -96,12 +96,12 @@ def test_lights_of_a_text_file(tmp_path):
     rest = "world = [0.1, 0.2, 0.3]\nexposure = 1.5"
     path.write_text(f"{rest}\n[[lights]]\n{sun}\n[[lights]]\n{area}\n")
     lighting = read_lighting(path)
-    np.testing.assert_allclose(lighting.lights[0].color, [3, 1.5, 0.75])
-    np.testing.assert_allclose(lighting.lights[0].direction, [0, -1, 0])
+    assert_allclose(lighting.lights[0].color, [3, 1.5, 0.75])
+    assert_allclose(lighting.lights[0].direction, [0, -1, 0])
     assert (lighting.exposure, lighting.lights[1].size, lighting.shadows) == (1.5, (0.2, 0.4), True)
-    np.testing.assert_allclose((basis(np.eye(3)[:1]) @ lighting.world)[0], [0.1, 0.2, 0.3])
+    assert_allclose((basis(np.eye(3)[:1]) @ lighting.world)[0], [0.1, 0.2, 0.3])
     around = turned(lighting, np.zeros(3), 90)
-    np.testing.assert_allclose(around.lights[1].position, [1, 1, -1], atol=1e-9)
+    assert_allclose(around.lights[1].position, [1, 1, -1], atol=1e-9)
     for text, message in (
         ("lights = 3", "lights"),
         ('[[lights]]\nkind = "laser"\nstrength = 1', "kind"),

@@ -1,9 +1,8 @@
 """A capture's light from colors made with a known one; occlusion against cast rays."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 from scipy.spatial.transform import Rotation
 
 from light.scenes import ball_and_plate, blocked
@@ -16,14 +15,14 @@ from stga_addon.light.surface import Bounce, transfer_of
 SKIN = np.array([0.5, 0.36, 0.25])
 
 
-def soft_light() -> np.ndarray:
+def soft_light():
     light = uniform((0.6, 0.6, 0.6))
     light[1:4] = [[0.3] * 3, [0.5] * 3, [-0.2] * 3]
     return light
 
 
 @pytest.fixture(scope="module")
-def received() -> np.ndarray:
+def received():
     """(F, 9) transfer of the triangles of a ball under a plate."""
     vertices, faces = ball_and_plate(3)
     return np.asarray(transfer_of(vertices, faces, 96)[0][faces].mean(1), np.float64)
@@ -53,7 +52,7 @@ def test_a_soft_light_is_found_despite_spots_and_highlights(received):
     assert np.abs(have - want).mean() < 0.03 * want.mean()
     assert residual < HARD_RESIDUAL / 2
     known, _ = fit_light(*recorded(received, light), light)
-    np.testing.assert_array_equal(known, light)
+    assert_array_equal(known, light)
     vertices, faces = ball_and_plate(3)
     normals = vertex_normals(vertices, faces)[faces].mean(1)
     toward = np.array([0.9, 0.1, 0.3]) / np.linalg.norm([0.9, 0.1, 0.3])
@@ -74,9 +73,9 @@ def test_what_is_rarely_seen_is_lit_as_when_it_is_seen():
     open_sky = Bounce(vertices, faces, np.ones(len(vertices)))
     found = recorded_irradiance(direct, cameras, faces, open_sky)
     at = vertices[:, 0]
-    np.testing.assert_allclose(found[at > 0.03], (0.1 + 2.0) / 2)
-    np.testing.assert_allclose(found[(at < -0.03) & (at > -0.07)], 2.0, rtol=1e-3)
-    np.testing.assert_allclose(found[at < -0.098], (0.1 + 2.0) / 2)  # never seen
+    assert_allclose(found[at > 0.03], (0.1 + 2.0) / 2)
+    assert_allclose(found[(at < -0.03) & (at > -0.07)], 2.0, rtol=1e-3)
+    assert_allclose(found[at < -0.098], (0.1 + 2.0) / 2)  # never seen
 
 
 def test_light_that_skin_reflects_has_no_unit():
@@ -93,7 +92,7 @@ def test_light_that_skin_reflects_has_no_unit():
     assert (found[edge] > 1.2 * found.min(0)).all()
 
 
-def test_eyeballs_are_found(shared_data: Path):
+def test_eyeballs_are_found(shared_data):
     """Catches eyes without a highlight of their own, and skin that is taken for one."""
     from stga_addon.capture.open import open_capture
 
@@ -113,7 +112,7 @@ def test_harmonics_turn_with_their_axes():
     light = rng.normal(size=3)
     project = basis(sky).T * (4 * np.pi / len(sky))
     sharp, turned = (np.maximum(sky @ axis, 0)[:, None] for axis in (light, turn @ light))
-    np.testing.assert_allclose(rotated(project @ sharp, turn), project @ turned, atol=2e-3)
+    assert_allclose(rotated(project @ sharp, turn), project @ turned, atol=2e-3)
 
 
 def test_transfer_and_occlusion_are_those_of_cast_rays():
@@ -135,5 +134,5 @@ def test_transfer_and_occlusion_are_those_of_cast_rays():
     normals = vertex_normals(vertices, faces)
     below = (normals[:, 1] < -0.3) & (np.linalg.norm(vertices, axis=1) < 0.1001)
     assert below.sum() > 100
-    np.testing.assert_allclose(transfer[below], basis(normals[below]) * LAMBERT, atol=0.03)
-    np.testing.assert_allclose(occlusion[below], 1, atol=0.01)
+    assert_allclose(transfer[below], basis(normals[below]) * LAMBERT, atol=0.03)
+    assert_allclose(occlusion[below], 1, atol=0.01)

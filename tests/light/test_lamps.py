@@ -6,6 +6,7 @@ import sys
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 from light.scenes import ball_and_plate, blocked
 from stga_addon.capture.mesh_geometry import vertex_normals
@@ -21,7 +22,7 @@ AROUND = np.array([[-0.1, -0.1, -0.1], [0.1, 0.1, 0.1]])
 UP = np.array([[0.0, 0.0, 1.0]])
 
 
-def irradiance(light: Light) -> float:
+def irradiance(light):
     lamps = Lamps(Lighting(lights=(light,)), AROUND, NO_FACES)
     return float(lamps.irradiance(np.zeros((1, 3)), UP)[0, 1])
 
@@ -84,7 +85,7 @@ def test_another_object_throws_its_shadow():
     drawn = np.isfinite(found)
     assert drawn.mean() > 0.1
     assert np.ptp(expected[drawn]) > 0.1
-    np.testing.assert_allclose(found[drawn], expected[drawn], rtol=1e-4)
+    assert_allclose(found[drawn], expected[drawn], rtol=1e-4)
 
 
 LIGHTS = (
@@ -158,7 +159,7 @@ def test_lights():
     for arrays, add in zip(found, (shade.add_lights, array_kernels.add_lights), strict=True):
         add(points, normals, *rest, *arrays)
     assert found[0].max() > 0.5
-    np.testing.assert_allclose(found[1], found[0], rtol=2e-3, atol=2e-5)
+    assert_allclose(found[1], found[0], rtol=2e-3, atol=2e-5)
 
 
 @pytest.mark.parametrize("light", LIGHTS[:2], ids=["sun", "point"])
@@ -181,4 +182,4 @@ def test_shadow_maps(light):
         for one, kernels in zip(lit, (shadow, array_kernels), strict=True):
             kernels.lit_shares(depth[0], places, bias, np.float32(step), one)
         assert 0.05 < lit[0].mean() < 0.95
-        np.testing.assert_allclose(lit[1], lit[0], atol=1e-5)
+        assert_allclose(lit[1], lit[0], atol=1e-5)

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import trimesh
 from numpy.linalg import norm
+from numpy.testing import assert_allclose, assert_array_equal
 
 from light.scenes import blocked, lit_avatar, middle_splats
 from stga_addon.avatar.file import Avatar, AvatarLight
@@ -23,7 +24,7 @@ EYE = np.array([0.0, 0.0, 1.0])
 SUN = Light("sun", np.full(3, 3.0), direction=(0, -1, 0))
 
 
-def eye_below_a_lid() -> tuple[np.ndarray, np.ndarray]:
+def eye_below_a_lid():
     """An eyeball around the origin, and behind it a small plate at LID_HEIGHT whose normal is y."""
     ball = trimesh.creation.icosphere(4, EYE_RADIUS)
     place = trimesh.transformations.translation_matrix((0, 0.015, -0.004))
@@ -32,7 +33,7 @@ def eye_below_a_lid() -> tuple[np.ndarray, np.ndarray]:
     return np.array(both.vertices), np.array(both.faces, np.int32)
 
 
-def avatar_with(offset: tuple[float, float, float], color: float = 0.05) -> Avatar:
+def avatar_with(offset, color=0.05):
     """A gray splat in each triangle, and a card of 8 × 4 mm at `offset` from the lid's top."""
     vertices, faces = eye_below_a_lid()
     transfer, occlusion = transfer_of(vertices, faces, 64)
@@ -95,7 +96,7 @@ def test_the_viewport_draws_lashes_into_its_shadow_maps():
     layer = SceneLayer(avatar.splats, avatar.frames(mesh), np.eye(4), relit=relit)
     head, cards = relit_scene([layer]).maps[0].meshes
     assert head[0] is mesh
-    np.testing.assert_array_equal(cards[0], relit.relighter.lashes.caster(mesh).vertices)
+    assert_array_equal(cards[0], relit.relighter.lashes.caster(mesh).vertices)
     still = replace(relit, lighting=Lighting(lights=(SUN,), shadows=False))
     assert relit_scene([replace(layer, relit=still)]).maps == ()
 
@@ -135,4 +136,4 @@ def test_splats_are_at_the_nearest_point_of_the_mesh():
     assert (corners != ball).any(1).mean() > 0.5
     assert (away < 1.2 * least + 1e-4).mean() > 0.95
     assert (away <= own + 1e-9).all()
-    np.testing.assert_allclose(weights.sum(1), 1, atol=1e-6)
+    assert_allclose(weights.sum(1), 1, atol=1e-6)

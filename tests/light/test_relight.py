@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 from scipy.spatial.transform import Rotation
 
 from light.scenes import lit_avatar
@@ -21,11 +22,11 @@ TINT = np.array([1.4, 1.0, 0.6])
 
 
 @pytest.fixture(scope="module")
-def relighter() -> Relighter:
+def relighter():
     return Relighter(lit_avatar(ALBEDO))
 
 
-def turned(mesh: np.ndarray, degrees: float) -> tuple[np.ndarray, np.ndarray]:
+def turned(mesh, degrees):
     """The mesh turned about y and moved; and the rotation."""
     rotation = Rotation.from_euler("y", degrees, degrees=True).as_matrix()
     return mesh @ rotation.T + [0.3, 0.1, -0.2], rotation
@@ -34,7 +35,7 @@ def turned(mesh: np.ndarray, degrees: float) -> tuple[np.ndarray, np.ndarray]:
 def test_albedo_is_what_was_recorded_without_its_light(relighter):
     """Catches highlights in the albedo, and units other than Blender's: albedo E / π."""
     lit = relighter.light.occlusion[relighter.corners].min(1) > 0.3
-    np.testing.assert_allclose(relighter.albedo[lit], np.tile(ALBEDO, (lit.sum(), 1)), rtol=0.02)
+    assert_allclose(relighter.albedo[lit], np.tile(ALBEDO, (lit.sum(), 1)), rtol=0.02)
     sun = Light("sun", np.array([2.0, 2.0, 2.0]), direction=(0, 1, 0))
     lit = relighter.radiance(relighter.avatar.neutral, EYE, Lighting(lights=(sun,), specular=0))
     normals = normals_of(relighter)
@@ -42,7 +43,7 @@ def test_albedo_is_what_was_recorded_without_its_light(relighter):
     down = (normals[:, 1] < -0.3) & (radius < 0.101)
     assert down.sum() > 100
     expected = np.array(ALBEDO) * 2 * -normals[down, 1:2] / np.pi
-    np.testing.assert_allclose(lit[down], expected, rtol=0.03, atol=0.004)
+    assert_allclose(lit[down], expected, rtol=0.03, atol=0.004)
 
 
 def normals_of(relighter):
@@ -78,8 +79,8 @@ def test_a_still_head_under_still_light_does_not_flicker(relighter):
     lighting = Lighting(uniform((0.1, 0.1, 0.2)), (lamp,))
     first = relighter.colors(mesh, EYE, lighting)
     relighter.colors(turned(mesh, 20)[0], EYE, Lighting(uniform((1, 1, 1))))
-    np.testing.assert_array_equal(relighter.colors(mesh, EYE, lighting), first)
-    np.testing.assert_array_equal(Relighter(relighter.avatar).colors(mesh, EYE, lighting), first)
+    assert_array_equal(relighter.colors(mesh, EYE, lighting), first)
+    assert_array_equal(Relighter(relighter.avatar).colors(mesh, EYE, lighting), first)
 
 
 def test_recorded_and_mix(relighter):
@@ -89,11 +90,11 @@ def test_recorded_and_mix(relighter):
     lighting = Lighting(uniform((0.1, 0.02, 0.02)), (sun,))
     sh = relighter.avatar.splats.sh
     recorded = relighter.colors(mesh, EYE, replace(lighting, mode="recorded"))
-    np.testing.assert_allclose(recorded, sh_color(sh, np.tile(EYE, (len(sh), 1))), atol=1e-5)
+    assert_allclose(recorded, sh_color(sh, np.tile(EYE, (len(sh), 1))), atol=1e-5)
     scene = relighter.colors(mesh, EYE, lighting)
     mixed = relighter.colors(mesh, EYE, replace(lighting, mode="mix", mix=0.25))
     expected = 0.25 * srgb_to_linear(scene) + 0.75 * srgb_to_linear(recorded)
-    np.testing.assert_allclose(srgb_to_linear(mixed), expected, rtol=1e-3, atol=1e-4)
+    assert_allclose(srgb_to_linear(mixed), expected, rtol=1e-3, atol=1e-4)
 
 
 def test_only_recorded_colors_follow_the_normals(relighter):
@@ -108,17 +109,17 @@ def test_only_recorded_colors_follow_the_normals(relighter):
     sun = Lighting(lights=(Light("sun", np.full(3, 3.0), direction=(1, 0, 0)),))
     assert not relighter.distant_in_head(mesh, sun)[1].share
 
-    def colors(mode: str, *names: str) -> np.ndarray:
+    def colors(mode, *names):
         driven = replace(avatar, driven_offsets={name: values[name] for name in names})
         return Relighter(driven).colors(mesh, EYE, replace(sun, mode=mode))
 
     lit = colors("scene", *names)
-    np.testing.assert_array_equal(lit, colors("scene", "strain_color"))
+    assert_array_equal(lit, colors("scene", "strain_color"))
     assert np.abs(lit - colors("scene")).mean() > 0.01
     recorded = colors("recorded")
     frames = replace(avatar, driven_offsets=values).frames(mesh)
     expected = np.maximum(recorded + frames.color[avatar.splats.face], 0)
-    np.testing.assert_allclose(colors("recorded", *names), expected, atol=1e-5)
+    assert_allclose(colors("recorded", *names), expected, atol=1e-5)
     assert np.abs(expected - colors("recorded", "strain_color")).mean() > 0.01
 
 
@@ -131,9 +132,9 @@ def test_the_captures_own_light_gives_back_what_was_recorded(relighter, monkeypa
     recorded = relighter.radiance(mesh, EYE, replace(own, mode="recorded"))
     open_ = relighter.light.occlusion[relighter.corners].min(1) > 0.5
     seen = open_ & (normals_of(relighter)[:, 2] > 0.8)
-    np.testing.assert_allclose(lit[seen], recorded[seen], rtol=0.06)
+    assert_allclose(lit[seen], recorded[seen], rtol=0.06)
     bright = relighter.radiance(mesh, EYE, replace(own, exposure=1.0, white=(1.0, 2.0, 0.5)))
-    np.testing.assert_allclose(bright, lit * np.float32([2, 1, 4]), rtol=1e-5)
+    assert_allclose(bright, lit * np.float32([2, 1, 4]), rtol=1e-5)
 
 
 def test_recorded_color_is_a_mean_over_the_directions_that_see_a_splat():
@@ -146,20 +147,19 @@ def test_recorded_color_is_a_mean_over_the_directions_that_see_a_splat():
     for normal, coefficients, found in rows:
         seen = directions[directions @ normal > 0.3]
         colors = sh_color(np.broadcast_to(coefficients, (len(seen), *coefficients.shape)), -seen)
-        np.testing.assert_allclose(found, colors.mean(0), atol=1e-3)
+        assert_allclose(found, colors.mean(0), atol=1e-3)
 
 
-def studio() -> np.ndarray:
+def studio():
     """(9, 3) harmonics that are brighter from the front and above."""
     light = uniform((0.5, 0.45, 0.4))
     light[1:3] = [[0.3] * 3, [0.5, 0.4, 0.4]]
     return light
 
 
-def relighter_of(light: np.ndarray) -> Relighter:
+def relighter_of(light):
     """Of the ball as it would have been recorded in a light (9, 3)."""
     avatar = lit_avatar(degree=1)
-    assert avatar.light is not None
     relighter = Relighter(avatar)
     arriving = avatar.light.transfer @ light
     arriving = (arriving + relighter.bounce.light(arriving)).astype(np.float32)
@@ -174,14 +174,14 @@ def test_what_is_kept_of_recorded_colors():
     mesh = relighter.avatar.neutral.astype(np.float64)
     recorded = relighter.radiance(mesh, EYE, Lighting(mode="recorded"))
     tinted = relighter.radiance(mesh, EYE, Lighting(studio() * TINT))
-    np.testing.assert_allclose(tinted, recorded * TINT, rtol=0.03)
+    assert_allclose(tinted, recorded * TINT, rtol=0.03)
     aside, turn = turned(mesh, 90)
     along = Lighting(rotated(studio(), turn))
     there = relighter.radiance(aside, EYE, replace(along, mode="recorded"))
-    np.testing.assert_allclose(relighter.radiance(aside, EYE, along), there, rtol=0.03)
+    assert_allclose(relighter.radiance(aside, EYE, along), there, rtol=0.03)
     assert share_kept(relighter, studio()) > 0.99
     assert relighter.distant_in_head(aside, Lighting(studio()))[1].share < 0.1
-    np.testing.assert_allclose(relighter.recorded_light, studio(), atol=0.01)
+    assert_allclose(relighter.recorded_light, studio(), atol=0.01)
     lamps = [Light("sun", np.full(3, x), direction=(1, 0.2, 0)) for x in np.linspace(0, 3, 61)]
     shares = [share_kept(relighter, studio(), lamp) for lamp in lamps]
     steps = -np.diff(shares)
@@ -193,7 +193,7 @@ def test_what_is_kept_of_recorded_colors():
     assert share_kept(relighter, studio(), roughness=0.9) == 0
 
 
-def share_kept(relighter: Relighter, world: np.ndarray, *lights: Light, **options: float) -> float:
+def share_kept(relighter, world, *lights, **options):
     lighting = Lighting(world, lights, **options)
     return relighter.distant_in_head(relighter.avatar.neutral, lighting)[1].share
 
@@ -203,4 +203,4 @@ def test_shadows_of_other_objects_stay():
     same = kept(studio(), 2 * studio())
     irradiance = np.maximum(basis(np.eye(3)) @ studio(), 0.1).astype(np.float32)
     arriving = irradiance * np.float32([[2], [1.9], [0.3]])
-    np.testing.assert_allclose(kept_shares(same, arriving, irradiance), [1, 1, 0], atol=1e-6)
+    assert_allclose(kept_shares(same, arriving, irradiance), [1, 1, 0], atol=1e-6)

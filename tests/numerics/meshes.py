@@ -7,7 +7,7 @@ WHOLE = np.array([[0.0, 0, 0], [0.009, 0.001, 0.002], [0.002, 0.008, -0.001]])
 """A sound triangle, for the frames in which the others are sound."""
 
 
-def _line(direction: list[float], places: list[float]) -> np.ndarray:
+def _line(direction, places):
     """Corners on a line through a point that float32 cannot hold exactly."""
     unit = np.array(direction) / np.linalg.norm(direction)
     return np.array([0.0371, -0.0213, 0.0555]) + np.array(places)[:, None] * 0.01 * unit
@@ -28,14 +28,14 @@ DEGENERATE = {
 """Degenerate triangles by name, as corners (3, 3) at the scale of a head's, in meters."""
 
 
-def mesh_of(triangles: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+def mesh_of(triangles):
     """Vertices (3·F, 3), as a float32 file would hold them, and faces (F, 3) int32 of separate
     triangles."""
     vertices = np.concatenate(triangles).astype(np.float32).astype(np.float64)
     return vertices, np.arange(len(vertices), dtype=np.int32).reshape(-1, 3)
 
 
-def bent_ball() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def bent_ball():
     """Posed and neutral vertices (V, 3) of a ball, and its faces."""
     sphere = trimesh.creation.icosphere(2, 0.1)
     neutral = np.array(sphere.vertices)
@@ -43,7 +43,7 @@ def bent_ball() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return neutral * [1.1, 0.9, 1] + noise, neutral, np.array(sphere.faces, np.int32)
 
 
-def collapsed() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def collapsed():
     """Triangles that become lines and points."""
     posed, faces = mesh_of([*DEGENERATE.values()])
     return posed, mesh_of([WHOLE] * len(DEGENERATE))[0], faces

@@ -36,11 +36,11 @@ def facing(count, seed=0, size=(37, 29), focal=40.0, degree=1, **changes):
     )
 
 
-def rows(scene: Scene, keep: np.ndarray) -> Scene:
+def rows(scene, keep):
     return replace(scene, splats={name: value[keep] for name, value in scene.splats.items()})
 
 
-def steady_pixels(scene: Scene, margin: float = 1e-3) -> np.ndarray:
+def steady_pixels(scene, margin=1e-3):
     """(H, W) bool: pixels where no splat is within `margin` (relative) of one of the renderer's
     jumps.
 
@@ -117,7 +117,7 @@ def _named(images, gradients, steady):
     return dict(zip(IMAGES, shown, strict=True)) | gradients
 
 
-def rounded(scene: Scene, seed: int) -> Scene:
+def rounded(scene, seed):
     """The scene with every other number one unit in the last place farther from zero."""
     rng = np.random.default_rng(seed)
     moved = {
@@ -129,7 +129,7 @@ def rounded(scene: Scene, seed: int) -> Scene:
     return replace(scene, splats=moved)
 
 
-def assert_close(errors: dict[str, float], image: float, gradient: float) -> None:
+def assert_close(errors, image, gradient):
     """Every error below its tolerance; the message names those that are not."""
     limits = dict.fromkeys(IMAGES, image)
     bad = {name: f"{e:.1e}" for name, e in errors.items() if not e < limits.get(name, gradient)}

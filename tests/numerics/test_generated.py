@@ -12,7 +12,6 @@ from raster import reference
 
 from .scenes import (
     NAMES,
-    Scene,
     assert_close,
     compare,
     facing,
@@ -31,11 +30,11 @@ BOUNDED = {
 
 
 @st.composite
-def scenes(draw: st.DrawFn) -> Scene:
+def scenes(draw):
     """Up to 30 splats, each quantity from nothing to far beyond what training produces, in images
     up to 40 pixels."""
 
-    def between(low: float, high: float) -> float:
+    def between(low, high):
         return draw(st.floats(low, high, width=32))
 
     count = draw(st.integers(1, 30))
@@ -61,7 +60,7 @@ def scenes(draw: st.DrawFn) -> Scene:
     )
 
 
-def steady_colors(scene: Scene) -> bool:
+def steady_colors(scene):
     """Whether no color lies so near zero, where it is cut, that float32 may take the other side."""
     direction = torch.from_numpy(scene.splats["xyz"]).double()
     basis = reference.sh_basis(torch.nn.functional.normalize(direction, dim=-1))[
@@ -72,7 +71,7 @@ def steady_colors(scene: Scene) -> bool:
     return bool((color.abs() > 1e-5 * (0.5 + sh.abs().sum((1,)))).all())
 
 
-def steady_order(scene: Scene) -> bool:
+def steady_order(scene):
     """Whether no two depths round to neighboring float32 values in another order."""
     depths = np.sort(scene.splats["xyz"][:, 2].astype(np.float64))
     return bool((np.diff(depths) > 1e-6 * depths[1:]).all())

@@ -3,6 +3,7 @@ rendered of them."""
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
 from stga_addon.avatar.embedding import CONVENTIONS, face_frames, to_local, to_world
@@ -16,13 +17,13 @@ from .scenes import NAMES, Scene, kernel_gradients, random_cotangents, reference
 FACES = np.array([[0, 1, 2]])
 
 
-def assert_proper(rotation: np.ndarray) -> None:
-    np.testing.assert_allclose(
+def assert_proper(rotation):
+    assert_allclose(
         rotation.transpose(0, 2, 1) @ rotation,
         np.tile(np.eye(3), (len(rotation), 1, 1)),
         atol=1e-12,
     )
-    np.testing.assert_allclose(np.linalg.det(rotation), 1, atol=1e-12)
+    assert_allclose(np.linalg.det(rotation), 1, atol=1e-12)
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
@@ -74,9 +75,7 @@ def test_rounding_does_not_turn_a_line(convention, name):
     vertices = np.concatenate(triangles)
     faces = np.arange(63).reshape(-1, 3)
     frames = face_frames(vertices, faces, np.tile(WHOLE, (21, 1)), convention)
-    np.testing.assert_allclose(
-        frames.rotation[1:], np.broadcast_to(frames.rotation[0], (20, 3, 3)), atol=2e-5
-    )
+    assert_allclose(frames.rotation[1:], np.broadcast_to(frames.rotation[0], (20, 3, 3)), atol=2e-5)
 
 
 def test_collapsed_triangles_render_and_train_in_float32():
@@ -101,10 +100,10 @@ def test_collapsed_triangles_render_and_train_in_float32():
         expected_images, expected = reference_gradients(scene, cotangents, frames, splats.face)
         assert expected_images[1].max() > 0.3
         for image, want in zip(images, expected_images, strict=True):
-            np.testing.assert_allclose(image, want, atol=5e-6)
+            assert_allclose(image, want, atol=5e-6)
         for name, want in expected.items():
             largest = np.abs(want).max()
-            np.testing.assert_allclose(gradients[name], want, atol=2e-5 * largest, err_msg=name)
+            assert_allclose(gradients[name], want, atol=2e-5 * largest, err_msg=name)
 
 
 def test_quaternions_near_half_turns_from_float32_matrices():

@@ -3,6 +3,7 @@ a finite one."""
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 bpy = pytest.importorskip("bpy")
 
@@ -23,7 +24,7 @@ def _empty_scene():
     bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
 
 
-def shown_and_expected(posed: list[np.ndarray], neutral: list[np.ndarray], convention: str):
+def shown_and_expected(posed, neutral, convention):
     """Evaluated (xyz, rotation, scale) of a few splats a triangle, and `to_world` on the evaluated
     vertices."""
     vertices, faces = mesh_of(posed)
@@ -61,12 +62,12 @@ def test_degenerate_triangles_are_numpys(convention, when):
     (xyz, rotation, scale), expected = shown_and_expected(posed, neutral, convention)
     for n, name in enumerate(DEGENERATE):
         splats = slice(PER_FACE * n, PER_FACE * (n + 1))
-        np.testing.assert_allclose(xyz[splats], expected.xyz[splats], atol=2e-6, err_msg=name)
+        assert_allclose(xyz[splats], expected.xyz[splats], atol=2e-6, err_msg=name)
         assert np.abs(expected.xyz[splats]).max() < 1, name
         assert same_rotation(rotation[splats], expected.rotation[splats]) < 1e-3, name
         # A line's area is rounding; its splats are too small to be seen, whatever its square root
         # is.
-        np.testing.assert_allclose(
+        assert_allclose(
             scale[splats], np.exp(expected.log_scale[splats]), rtol=2e-3, atol=2e-5, err_msg=name
         )
 
@@ -79,5 +80,5 @@ def test_half_turns_and_flips(convention):
     (xyz, rotation, _), expected = shown_and_expected(
         [WHOLE @ turn for turn in turns] + [WHOLE[[0, 2, 1]]], [WHOLE] * 5, convention
     )
-    np.testing.assert_allclose(xyz, expected.xyz, atol=2e-6)
+    assert_allclose(xyz, expected.xyz, atol=2e-6)
     assert same_rotation(rotation, expected.rotation) < 1e-3

@@ -6,13 +6,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from numpy.testing import assert_allclose, assert_array_equal
 
 from stga_addon.avatar.embedding import face_frames
 from stga_addon.capture.camera import Camera
 
 from .scenes import (
     NAMES,
-    Scene,
     assert_close,
     compare,
     facing,
@@ -27,12 +27,12 @@ RNG = np.random.default_rng(0)
 TAN_89 = np.tan(np.radians(89))
 
 
-def log_normal(count: int, scale: float, seed: int = 1) -> np.ndarray:
+def log_normal(count, scale, seed=1):
     """Anisotropic, because the rotation of a ball has no gradient to compare."""
     return np.random.default_rng(seed).normal(np.log(scale), 0.4, (count, 3))
 
 
-def beside(count: int, reach: float) -> np.ndarray:
+def beside(count, reach):
     """Positions 89° off the axis, left and right, 2 to 20 cm ahead."""
     z = RNG.uniform(0.02, 0.2, count)
     return np.c_[
@@ -40,11 +40,11 @@ def beside(count: int, reach: float) -> np.ndarray:
     ]
 
 
-def needle(longest: float, count: int = 60) -> np.ndarray:
+def needle(longest, count=60):
     return np.tile(np.log([longest, longest * 1e-6, longest * 1e-6]), (count, 1))
 
 
-def with_depths(depths: np.ndarray) -> Scene:
+def with_depths(depths):
     scene = facing(len(depths))
     scene.splats["xyz"][:, 2] = depths
     return scene
@@ -134,12 +134,12 @@ def test_quaternions_of_any_length(back_end, norm):
     images, gradients = kernel_gradients(extreme, cotangents)
     expected_images, expected = reference_gradients(scene, cotangents)
     for image, want in zip(images, expected_images, strict=True):
-        np.testing.assert_allclose(image, want, atol=5e-6)
+        assert_allclose(image, want, atol=5e-6)
     expected["rotation"] *= min(1 / norm, 1e12) if norm else 0
     lost = 2 * np.finfo(np.float32).tiny if back_end == "gpu" else 0  # of a sum of subnormal ones
     for name in NAMES:
         atol = 1e-5 * np.abs(expected[name]).max() + lost
-        np.testing.assert_allclose(gradients[name], expected[name], atol=atol, rtol=1e-4)
+        assert_allclose(gradients[name], expected[name], atol=atol, rtol=1e-4)
 
 
 BROKEN = {name: (name, np.nan) for name in NAMES} | {
@@ -165,11 +165,9 @@ def test_a_broken_splat_is_dropped(back_end, name):
     images, gradients = kernel_gradients(scene, cotangents)
     expected_images, expected = kernel_gradients(rows(scene, others), cotangents)
     for image, want in zip(images, expected_images, strict=True):
-        np.testing.assert_array_equal(image, want)
+        assert_array_equal(image, want)
     for parameter in NAMES:
-        np.testing.assert_array_equal(
-            gradients[parameter][others], expected[parameter], err_msg=parameter
-        )
+        assert_array_equal(gradients[parameter][others], expected[parameter], err_msg=parameter)
         assert not gradients[parameter][3].any(), parameter
 
 
@@ -197,16 +195,16 @@ def test_ten_thousand_opaque_layers(back_end):
     expected_images, expected = reference_gradients(front, cotangents)
     assert expected_images[1].min() > 0.99
     for image, want in zip(images, expected_images, strict=True):
-        np.testing.assert_allclose(image * steady.numpy(), want * steady.numpy(), atol=1e-5)
+        assert_allclose(image * steady.numpy(), want * steady.numpy(), atol=1e-5)
     for name in NAMES:
         assert np.isfinite(gradients[name]).all(), name
-        np.testing.assert_allclose(
+        assert_allclose(
             gradients[name][:300], expected[name], atol=1e-4 * np.abs(expected[name]).max()
         )
         assert not gradients[name][300:].any(), name
 
 
-def triangles(seed: int = 3, count: int = 12) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def triangles(seed=3, count=12):
     """Posed and neutral vertices (V, 3) of a head-sized soup of triangles, and its faces."""
     rng = np.random.default_rng(seed)
     faces = np.arange(3 * count).reshape(-1, 3)
@@ -215,14 +213,14 @@ def triangles(seed: int = 3, count: int = 12) -> tuple[np.ndarray, np.ndarray, n
     return neutral + rng.normal(0, 0.003, neutral.shape), neutral, faces
 
 
-def embedded(camera: Camera) -> tuple[Scene, np.ndarray]:
+def embedded(camera):
     """Splats in the frames of the triangles, and face (N,) int32."""
     rng = np.random.default_rng(4)
     scene = facing(60, 4, xyz=rng.normal(0, 0.005, (60, 3)), log_scale=log_normal(60, 0.008))
     return replace(scene, camera=camera), rng.integers(0, 12, 60).astype(np.int32)
 
 
-def head_camera(distance: float = 0.8, focal: float = 90.0) -> Camera:
+def head_camera(distance=0.8, focal=90.0):
     pose = np.eye(4)
     pose[:3, 3] = [0.01, -0.02, distance]
     return Camera(41, 35, focal, focal, 20.0, 18.0, pose)
@@ -246,9 +244,9 @@ def test_a_head_far_from_the_origin_is_the_same_head(back_end, shift):
     far_images, far_gradients = kernel_gradients(far, cotangents, frames, face)
     assert images[1].max() > 0.5
     for image, other in zip(images, far_images, strict=True):
-        np.testing.assert_allclose(other, image, atol=2e-6)
+        assert_allclose(other, image, atol=2e-6)
     for name in NAMES:
-        np.testing.assert_allclose(
+        assert_allclose(
             far_gradients[name],
             gradients[name],
             atol=1e-5 * np.abs(gradients[name]).max(),
@@ -276,7 +274,7 @@ def test_a_mesh_a_thousand_times_too_large_or_small(back_end, size, distance, fo
     expected_images, expected = reference_gradients(*given)
     assert images[1].max() > 0.5
     for image, want in zip(images, expected_images, strict=True):
-        np.testing.assert_allclose(image, want, atol=5e-6 * max(1, want.max()))
+        assert_allclose(image, want, atol=5e-6 * max(1, want.max()))
     for name, want in expected.items():
         largest = np.abs(want).max()
-        np.testing.assert_allclose(gradients[name], want, atol=2e-5 * largest, err_msg=name)
+        assert_allclose(gradients[name], want, atol=2e-5 * largest, err_msg=name)

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 from training.test_losses import reference as loss_reference
 from training.toys import random_splats
 
@@ -16,7 +17,7 @@ WIDTH = 33
 RATE = dict.fromkeys((*Parameters._fields, "sh_rest"), 1e-3)
 
 
-def image_of(kind: str, value: float) -> np.ndarray:
+def image_of(kind, value):
     rng = np.random.default_rng(0)
     noise = rng.random((3, HEIGHT, WIDTH))
     if kind == "constant":
@@ -28,7 +29,7 @@ def image_of(kind: str, value: float) -> np.ndarray:
     return (value * noise).astype(np.float32)
 
 
-def loss_errors(image: np.ndarray, target: np.ndarray) -> tuple[float, float]:
+def loss_errors(image, target):
     """Errors of the gradient, relative to its largest entry, and of SSIM."""
     out = np.full_like(image, np.nan)
     _, ssim = image_gradient(image, target, whole_image(HEIGHT, WIDTH), 0.2, out)
@@ -39,7 +40,7 @@ def loss_errors(image: np.ndarray, target: np.ndarray) -> tuple[float, float]:
     )
 
 
-def random_target() -> np.ndarray:
+def random_target():
     return np.random.default_rng(1).integers(0, 256, (HEIGHT, WIDTH, 3)).astype(np.uint8)
 
 
@@ -91,10 +92,10 @@ def test_limit_of_one_enormous_splat():
     scale = np.exp(log_scale.astype(np.float64))
     expected = np.linalg.norm(scale - 0.5)
     assert norm == pytest.approx(expected, rel=1e-6)
-    np.testing.assert_allclose(gradient, (scale - 0.5) / expected * scale, rtol=1e-5)
+    assert_allclose(gradient, (scale - 0.5) / expected * scale, rtol=1e-5)
 
 
-def float64_adam(gradients: np.ndarray, steps: int = 0) -> np.ndarray:
+def float64_adam(gradients, steps=0):
     """Total movement, in units of the rate, after each gradient of one entry's history."""
     mean = square = moved = 0.0
     path = []
@@ -106,7 +107,7 @@ def float64_adam(gradients: np.ndarray, steps: int = 0) -> np.ndarray:
     return np.array(path)
 
 
-def adam_path(gradients: np.ndarray, steps: int = 0) -> np.ndarray:
+def adam_path(gradients, steps=0):
     """The same for the opacity of one of three rows, by the kernel; the other two have gradients of
     one."""
     state = new_state(random_splats(3, 3))
@@ -124,7 +125,7 @@ def adam_path(gradients: np.ndarray, steps: int = 0) -> np.ndarray:
     return np.array(path)
 
 
-def histories() -> dict[str, tuple[np.ndarray, int, float]]:
+def histories():
     """Gradients, steps before them, and a tolerance in units of the rate."""
     noise = np.random.default_rng(2).normal(size=40)
     # Where squares are subnormal, only their order of magnitude is left, beside an ε that outweighs
@@ -147,7 +148,7 @@ def test_adam_is_float64s(history):
     gradients, steps, tolerance = histories()[history]
     found = adam_path(gradients, steps)
     expected = float64_adam(gradients, steps)
-    np.testing.assert_allclose(found, expected, atol=tolerance, rtol=1e-5 if steps else 1e-7)
+    assert_allclose(found, expected, atol=tolerance, rtol=1e-5 if steps else 1e-7)
 
 
 @pytest.mark.parametrize("spike", [1e20, 1e30, -3e38])

@@ -12,7 +12,7 @@ import sys
 import llvmlite.binding as llvm
 
 
-def assembly(ir: str, cpu: str, triple: str) -> str | None:
+def assembly(ir, cpu, triple):
     """The IR compiled for a processor; the passes are those of `numba.core.codegen.CPUCodegen`."""
     try:
         target = llvm.Target.from_triple(triple)

@@ -2,7 +2,6 @@
 back."""
 
 from functools import cache
-from typing import Any
 
 import numpy as np
 import torch
@@ -31,7 +30,7 @@ def render_differentiable(splats, camera, frames=WORLD, face=None, degree=3, ant
 
 
 @cache
-def shared_rasterizer() -> Rasterizer:
+def shared_rasterizer():
     """One for all tests, whose kernels stay compiled."""
     return Rasterizer(Device())
 
@@ -45,7 +44,7 @@ class _Blend(torch.autograd.Function):
         return torch.from_numpy(image), torch.from_numpy(transmittance)
 
     @staticmethod
-    def backward(ctx: Any, v_image: torch.Tensor, v_transmittance: torch.Tensor) -> Any:
+    def backward(ctx, v_image, v_transmittance):
         cotangents = v_image.contiguous().numpy(), v_transmittance.contiguous().numpy()
         options, camera_frames, face, splats = ctx.saved
         _, _, gradients = render(options, camera_frames, face, splats, cotangents)

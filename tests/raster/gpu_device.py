@@ -10,7 +10,7 @@ from stga_addon.raster.gpu.device import Device  # noqa: E402
 
 
 @cache
-def device() -> Device:
+def device():
     """The first adapter's device, whose kernels stay compiled, for tests marked
     `needs("adapter")`."""
     return Device()

@@ -9,10 +9,7 @@ Stages: `embed` (triangles to world space), `project`, `sh_color`, `splat_alpha`
 from math import pi, sqrt
 
 import torch
-from torch import Tensor
 from torch.nn.functional import conv2d, normalize
-
-from stga_addon.capture.camera import Camera
 
 MAX_ALPHA = 0.999
 MIN_ALPHA = 1 / 255
@@ -67,7 +64,7 @@ def embed(xyz, rotation, log_scale, frames, face):
     return world, torch.einsum("nij,nj->ni", product, rotation), log_scale + scale.log()[:, None]
 
 
-def camera_space(xyz: Tensor, camera: Camera) -> Tensor:
+def camera_space(xyz, camera):
     """World points (N, 3) in camera space (N, 3)."""
     assert xyz.shape == (len(xyz), 3), xyz.shape
     view = torch.as_tensor(camera.world_to_camera, dtype=xyz.dtype, device=xyz.device)
@@ -106,14 +103,14 @@ def project(xyz, rotation, log_scale, camera):
     return center, covariance, z, compensation
 
 
-def clamp_to_frustum(slope: Tensor, size: int, focal: float, principal: float) -> Tensor:
+def clamp_to_frustum(slope, size, focal, principal):
     """Slopes x/z or y/z (N,) kept near the image's borders: the linearized projection explodes far
     outside it."""
     margin = FRUSTUM_MARGIN * 0.5 * size / focal
     return slope.clamp(-principal / focal - margin, (size - principal) / focal + margin)
 
 
-def rotation_matrix(quaternion: Tensor) -> Tensor:
+def rotation_matrix(quaternion):
     """Rotation matrices (N, 3, 3) of quaternions wxyz (N, 4) of any length."""
     assert quaternion.shape == (len(quaternion), 4), quaternion.shape
     w, x, y, z = normalize(quaternion, dim=-1).unbind(-1)
@@ -125,7 +122,7 @@ def rotation_matrix(quaternion: Tensor) -> Tensor:
     return torch.stack([torch.stack(row, dim=-1) for row in rows], dim=-2)
 
 
-def sh_color(sh: Tensor, direction: Tensor, degree: int) -> Tensor:
+def sh_color(sh, direction, degree):
     """Color (N, 3) ≥ 0 of coefficients sh (N, K, 3) seen along `direction` (N, 3), of any
     length."""
     count = (degree + 1) ** 2
@@ -136,7 +133,7 @@ def sh_color(sh: Tensor, direction: Tensor, degree: int) -> Tensor:
     return (0.5 + torch.einsum("nk,nkc->nc", basis, sh[:, :count])).clamp_min(0)
 
 
-def sh_basis(direction: Tensor) -> Tensor:
+def sh_basis(direction):
     """Real spherical harmonics (N, 16) up to degree 3 of unit directions (N, 3), 3D Gaussian
     Splatting's signs."""
     assert direction.shape == (len(direction), 3), direction.shape
@@ -167,7 +164,7 @@ def sh_basis(direction: Tensor) -> Tensor:
     )
 
 
-def splat_alpha(center: Tensor, covariance: Tensor, opacity: Tensor, camera: Camera) -> Tensor:
+def splat_alpha(center, covariance, opacity, camera):
     """Alpha (N, H, W) of projected splats at every pixel's center: center (N, 2), covariance (N, 2,
     2), opacity (N,)."""
     n = len(center)
@@ -184,7 +181,7 @@ def splat_alpha(center: Tensor, covariance: Tensor, opacity: Tensor, camera: Cam
     return torch.where(alpha >= MIN_ALPHA, alpha, 0)
 
 
-def blend(alpha: Tensor, color: Tensor, depth: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def blend(alpha, color, depth):
     """Blend splats given front to back: alpha (N, H, W), color (N, 3), depth (N,), to the three
     images of `render`.
 
@@ -207,7 +204,7 @@ def blend(alpha: Tensor, color: Tensor, depth: Tensor) -> tuple[Tensor, Tensor, 
     return rgb, 1 - transmittance, distance
 
 
-def image_loss(image: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
+def image_loss(image, target):
     """Maps (3, H, W) of |difference| and SSIM of two images (3, H, W) in 0…1; the loss mixes 1 −
     SSIM and the other.
 
@@ -218,7 +215,7 @@ def image_loss(image: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
     line = torch.exp(-(torch.arange(-5.0, 6.0, dtype=image.dtype) ** 2) / (2 * 1.5**2))
     window = torch.outer(line, line) / line.sum() ** 2
 
-    def blur(values: Tensor) -> Tensor:
+    def blur(values):
         return conv2d(values[:, None], window[None, None], padding=5)[:, 0]
 
     x = blur(image)

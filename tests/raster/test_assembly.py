@@ -9,7 +9,6 @@ import json
 import re
 import subprocess
 import sys
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -57,7 +56,7 @@ PROCESSORS = {"znver3": AVX2, "znver4": AVX512, "sapphirerapids": AVX2, "apple-m
 """LLVM prefers 256 bits on Sapphire Rapids, whose wider instructions lower the clock."""
 
 
-def unoptimized_ir(function: Callable, signature: object, monkeypatch: pytest.MonkeyPatch) -> str:
+def unoptimized_ir(function, signature, monkeypatch):
     """Numba's LLVM IR of a function, compiled as the kernels are but for the optimization.
 
     What it calls must be inlined by Numba (`inline_jit`): other functions would be kept,
@@ -73,7 +72,7 @@ def unoptimized_ir(function: Callable, signature: object, monkeypatch: pytest.Mo
     return re.sub(r"(?ms)^define linkonce_odr (\w+ @NRT_\w+)\(.*?^\}", r"declare \1(ptr)", ir)
 
 
-def assemblies(ir: str) -> dict[str, str]:
+def assemblies(ir):
     """Processor -> the IR compiled for it. Skips where this llvmlite was built without one of
     them."""
     asked = json.dumps(
@@ -88,7 +87,7 @@ def assemblies(ir: str) -> dict[str, str]:
     return found
 
 
-def inner_loops(text: str) -> list[list[str]]:
+def inner_loops(text):
     """The instructions of each loop that holds no other loop."""
     lines = text.splitlines()
     labels = {
@@ -102,11 +101,11 @@ def inner_loops(text: str) -> list[list[str]]:
     return [[line for line in lines[a : b + 1] if re.match(r"\s+[a-z]", line)] for a, b in inner]
 
 
-def count(pattern: str, loop: list[str]) -> int:
+def count(pattern, loop):
     return sum(bool(re.search(pattern, line)) for line in loop)
 
 
-def faults(text: str, cpu: str, loops: int, spills: int) -> str:
+def faults(text, cpu, loops, spills):
     """What is wrong with the assembly of a function that should have so many vectorized inner
     loops, or nothing.
 

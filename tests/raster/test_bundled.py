@@ -25,7 +25,7 @@ print("RESULT", USES_BUNDLED_KERNELS, out.min(), out.max())
 """
 
 
-def run(folder: Path, cache: Path, package: str = "stga_addon", **variables: str) -> str:
+def run(folder, cache, package="stga_addon", **variables):
     environment = {k: v for k, v in os.environ.items() if not k.startswith("NUMBA_")}
     environment |= {
         "NUMBA_CACHE_DIR": str(cache),
@@ -39,7 +39,7 @@ def run(folder: Path, cache: Path, package: str = "stga_addon", **variables: str
     ).stdout
 
 
-def loads(output: str) -> bool:
+def loads(output):
     """Whether the kernel came from the cache."""
     kernel = [
         line for line in output.splitlines() if "change_background" in line and "data " in line

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from numpy.testing import assert_array_equal
 
 from raster import gpu_device
 from stga_addon.errors import StgaError
@@ -22,7 +23,7 @@ fn main(thread: Thread) {
 
 
 @pytest.fixture(scope="module")
-def device() -> Device:
+def device():
     return gpu_device.device()
 
 
@@ -32,7 +33,7 @@ def test_arrays_arrive_whole(device, dtype, count):
     """Catches the last bytes of an image that is no multiple of a word left behind."""
     values = (np.arange(count) * 7 % 251).astype(dtype)
     buffer = device.upload(f"values {np.dtype(dtype)}", values)
-    np.testing.assert_array_equal(device.read(buffer, values.shape, dtype), values)
+    assert_array_equal(device.read(buffer, values.shape, dtype), values)
 
 
 def test_every_thread_of_a_long_dispatch_runs_once(device, monkeypatch):
@@ -50,7 +51,7 @@ def test_every_thread_of_a_long_dispatch_runs_once(device, monkeypatch):
         work.clear(buffer)
         work.dispatch("numbers.main", count, {"numbers": buffer})
     expected = np.arange(count, dtype=np.uint32)
-    np.testing.assert_array_equal(device.read(buffer, (count,), np.uint32), expected)
+    assert_array_equal(device.read(buffer, (count,), np.uint32), expected)
     with pytest.raises(KeyError, match="numbers"):
         device.record().dispatch("numbers.main", (1, 1, 1), {"others": buffer})
 

@@ -4,10 +4,10 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
 from raster import gpu_device
 from stga_addon.raster.cpu.layout import Parameters
-from stga_addon.raster.gpu.device import Device
 from stga_addon.raster.gpu.layout import split_rows
 from stga_addon.raster.gpu.optimizer import OptimizerTables, optimize, upload_step
 from stga_addon.training.optimize.adam import PLAIN
@@ -23,11 +23,11 @@ TABLES = ("splats", "gradients", "first", "second", "average")
 
 
 @pytest.fixture(scope="module")
-def device() -> Device:
+def device():
     return gpu_device.device()
 
 
-def random_state(count: int = 700, seed: int = 1) -> SimpleNamespace:
+def random_state(count=700, seed=1):
     """Tables (N, STRIDE) float32, one row a splat, of any age, and what belongs to a row; a third
     is not wanted."""
     rng = np.random.default_rng(seed)
@@ -85,7 +85,7 @@ def test_a_broken_gradient_leaves_its_field(device, value):
     for row, field in enumerate(columns):
         want = getattr(expected, field)
         want[row] = getattr(before, field)[row]
-        np.testing.assert_array_equal(getattr(got, field), want, err_msg=field)
+        assert_array_equal(getattr(got, field), want, err_msg=field)
 
 
 @pytest.mark.parametrize("ahead", [0.0, 0.1])
@@ -105,14 +105,14 @@ def test_a_step_at_any_age(device, steps, ahead):
     second = beta2 * state.second.astype(float) + (1 - beta2) * state.gradients.astype(float) ** 2
     correct = 1 / (1 - (1 - ahead) * beta1**n), 1 / np.sqrt(-np.expm1(n * np.log(beta2)))
     step = state.splats.astype(float) - got.splats
-    np.testing.assert_allclose(got.first, first, rtol=1e-5, atol=1e-6)
+    assert_allclose(got.first, first, rtol=1e-5, atol=1e-6)
     along = first + ahead * (state.gradients - first)
     expected = along * correct[0] / (np.sqrt(second) * correct[1])
     rate = RATES["rotation"]
-    np.testing.assert_allclose(step[:, 3:7], rate * expected[:, 3:7], rtol=2e-5, atol=1e-6)
+    assert_allclose(step[:, 3:7], rate * expected[:, 3:7], rtol=2e-5, atol=1e-6)
     share = 4 / (n + 3)
     moved = state.average + share * (got.splats - state.average.astype(float))
-    np.testing.assert_allclose(got.average, moved, atol=1e-6)
+    assert_allclose(got.average, moved, atol=1e-6)
 
 
 @pytest.mark.parametrize("log_scale", [10.0, 40.0, 43.0])
@@ -130,7 +130,7 @@ def test_limit_of_one_enormous_splat(device, log_scale):
     want[:, 7:10] = 0.3 * excess / np.linalg.norm(excess) * scale
     for row in (5, slice(None)):
         largest = np.abs(want[row]).max()
-        np.testing.assert_allclose(got[row], want[row], rtol=2e-5, atol=1e-6 * min(largest, 1e-3))
+        assert_allclose(got[row], want[row], rtol=2e-5, atol=1e-6 * min(largest, 1e-3))
 
 
 @pytest.mark.parametrize("wanted", ["none", "within the limits"])
@@ -142,4 +142,4 @@ def test_norms_of_zero(device, wanted):
     if wanted == "none":
         state.wanted[:] = False
     got = on_device(device, state, (0.3, 0.2, 0))
-    np.testing.assert_array_equal(got.gradients, state.gradients)
+    assert_array_equal(got.gradients, state.gradients)

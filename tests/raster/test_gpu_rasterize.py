@@ -3,6 +3,7 @@
 
 import numpy as np
 import pytest
+from numpy.testing import assert_array_equal
 
 from raster import gpu_device
 from raster.gpu_autograd import render
@@ -32,11 +33,11 @@ def test_the_same_bits_twice_and_from_used_buffers():
         (image, _, gradients), (same, _, others) = (
             render(*given, rasterizer) for rasterizer in (Rasterizer(Device()), used)
         )
-        np.testing.assert_array_equal(same, image, err_msg=name)
+        assert_array_equal(same, image, err_msg=name)
         for field in NAMES:
             want = getattr(gradients, field)
             got = getattr(others, field)
-            np.testing.assert_array_equal(got, want, err_msg=f"{name}: {field}")
+            assert_array_equal(got, want, err_msg=f"{name}: {field}")
 
 
 def test_a_trial_finds_wrong_numbers(monkeypatch):

@@ -1,11 +1,10 @@
 """Sorting, image loss, and frames and strain of a posed mesh on a WebGPU device, against numpy and
 the CPU."""
 
-from typing import Any
-
 import numpy as np
 import pytest
 from numerics.meshes import bent_ball, collapsed
+from numpy.testing import assert_allclose, assert_array_equal
 
 from raster import gpu_device
 from raster.test_kernels import SCENES
@@ -14,7 +13,6 @@ from stga_addon.avatar.offsets import SIGNALS
 from stga_addon.avatar.strain import MAX_STRAIN, strain_basis
 from stga_addon.capture.camera import Camera
 from stga_addon.raster.cpu.rasterize import frames_in_camera, tile_grid
-from stga_addon.raster.gpu.device import Device
 from stga_addon.raster.gpu.frames import Embedding
 from stga_addon.raster.gpu.layout import (
     COUNTS,
@@ -33,11 +31,11 @@ pytestmark = pytest.mark.needs("adapter")
 
 
 @pytest.fixture(scope="module")
-def device() -> Device:
+def device():
     return gpu_device.device()
 
 
-def view_of(device: Device, splats: int) -> Any:
+def view_of(device, splats):
     return device.uniform("View", splats=splats, capacity=1 << 16)
 
 
@@ -58,8 +56,8 @@ def test_sorted_keys_are_numpys(device, count, kind):
     with device.record() as work:
         found = sort_keys(work, device.upload("keys", keys), count, bits, view_of(device, count))
     order = np.argsort(keys, kind="stable")
-    np.testing.assert_array_equal(device.read(found[1], (count,), np.uint32), order)
-    np.testing.assert_array_equal(device.read(found[0], (count,), np.uint32), keys[order])
+    assert_array_equal(device.read(found[1], (count,), np.uint32), order)
+    assert_array_equal(device.read(found[0], (count,), np.uint32), keys[order])
 
 
 def test_a_count_beyond_32_bits_is_too_many(device):
@@ -100,7 +98,7 @@ def on_device(device, image, target, touched, **options):
     return device.read(v_image, image.shape), float(device.read(loss, (1,))[0])
 
 
-def pictures(width: int, height: int, seed: int = 1) -> tuple[np.ndarray, np.ndarray]:
+def pictures(width, height, seed=1):
     """A smooth image with noise, and bytes that resemble it."""
     rng = np.random.default_rng(seed)
     smooth = 0.5 + 0.4 * np.sin(np.linspace(0, 9, width) + np.linspace(0, 5, height)[:, None])
@@ -127,7 +125,7 @@ def test_loss_and_gradient_are_the_cpus(device, size, kind):
     gradient, loss = on_device(device, image, target, np.ones(tile_grid(*size)[::-1], bool))
     # In flat regions both lose digits to the same cancellation, each in its own order of summation.
     tolerance = 2e-5 if kind == "noise" else 5e-4
-    np.testing.assert_allclose(
+    assert_allclose(
         gradient, expected, atol=tolerance * max(np.abs(expected).max(), 0.1 / image.size)
     )
     assert loss == pytest.approx(
@@ -173,11 +171,11 @@ def test_frames_and_signals_are_numpys(device, convention, mesh):
     with device.record() as work:
         table = step.compose(work, {})
     frames = device.read(table, (len(faces), FRAME_STRIDE))
-    np.testing.assert_allclose(frames[:, :3], expected.origin, atol=FRAME_TOLERANCE)
+    assert_allclose(frames[:, :3], expected.origin, atol=FRAME_TOLERANCE)
     # The area of what is a line, whose root is the scale, is float32's rounding: 0 or, where a card
     # multiplies and adds at once, 6e-8 of the squared edges.
     tolerance = 3e-4 if mesh == "collapsed" else FRAME_TOLERANCE
-    np.testing.assert_allclose(frames[:, 3:12].reshape(-1, 3, 3), expected.matrix, atol=tolerance)
+    assert_allclose(frames[:, 3:12].reshape(-1, 3, 3), expected.matrix, atol=tolerance)
     assert not frames[:, FRAME_COLOR:].any()
     for name, signal in SIGNALS.items():
         found = device.read(step.signals[name], (len(faces), 3))
@@ -187,4 +185,4 @@ def test_frames_and_signals_are_numpys(device, convention, mesh):
             # A deformation per area that is hardly there; float64 has few digits of it, too.
             assert (np.abs(found) <= MAX_STRAIN).all()
         else:
-            np.testing.assert_allclose(found, wanted, atol=5e-6)
+            assert_allclose(found, wanted, atol=5e-6)

@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from numpy.testing import assert_allclose
 
 from raster import reference
 from stga_addon.capture.camera import Camera
@@ -27,11 +28,11 @@ CAMERA = Camera(*DATA["size"].tolist(), *DATA["intrinsics"].tolist(), DATA["worl
 TOLERANCE = 2e-5  # of float32 kernels, and of gsplat's images in shared data, which are float32
 
 
-def splats(dtype: torch.dtype) -> list[torch.Tensor]:
+def splats(dtype):
     return [torch.from_numpy(DATA[name]).to(dtype) for name in NAMES]
 
 
-def conics(covariance: np.ndarray) -> np.ndarray:
+def conics(covariance):
     """Inverse of 2D covariances (N, 2, 2) as gsplat stores it: xx, xy, yy."""
     inverse = np.linalg.inv(covariance)
     return np.stack([inverse[:, 0, 0], inverse[:, 0, 1], inverse[:, 1, 1]], axis=-1)
@@ -51,7 +52,7 @@ def test_reference_stages_are_gsplats():
         "colors": color,
     }
     for name, values in found.items():
-        np.testing.assert_allclose(values, DATA[name], rtol=1e-6, atol=1e-6, err_msg=name)
+        assert_allclose(values, DATA[name], rtol=1e-6, atol=1e-6, err_msg=name)
 
 
 @pytest.mark.parametrize("antialiased", [False, True])
@@ -59,12 +60,12 @@ def test_reference_image_is_gsplats(antialiased):
     """Catches a wrong density, cut or blending order."""
     rgb, alpha, _ = reference.render(*splats(torch.float64), CAMERA, antialiased=antialiased)
     kind = "antialiased" if antialiased else "classic"
-    np.testing.assert_allclose(rgb, DATA[f"image_{kind}"], atol=1e-6)
-    np.testing.assert_allclose(alpha, DATA[f"alpha_{kind}"], atol=1e-6)
+    assert_allclose(rgb, DATA[f"image_{kind}"], atol=1e-6)
+    assert_allclose(alpha, DATA[f"alpha_{kind}"], atol=1e-6)
 
 
 @pytest.fixture(params=["tiny_case", "basic_case"])
-def gsplat_case(request, shared_data) -> tuple[list[torch.Tensor], Camera, torch.Tensor]:
+def gsplat_case(request, shared_data):
     """Images that gsplat's CUDA kernels made; development data, not part of the project."""
     load_file = pytest.importorskip("safetensors.torch").load_file
     tensors = load_file(shared_data / "raster_reference" / f"{request.param}.safetensors")

@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 import torch
+from numpy.testing import assert_allclose, assert_array_equal
 
 from raster import reference
 from stga_addon.avatar.embedding import WORLD, face_frames
@@ -13,7 +14,6 @@ from stga_addon.capture.camera import Camera
 from stga_addon.raster.cpu.autograd import render_differentiable
 from stga_addon.raster.cpu.layout import Parameters
 from stga_addon.raster.cpu.rasterize import (
-    BufferPool,
     frames_in_camera,
     render_backward,
     render_forward,
@@ -38,7 +38,7 @@ class Scene:
     degree: int = 3
 
 
-def random_pose(rng: np.random.Generator) -> np.ndarray:
+def random_pose(rng):
     """(4, 4) world to camera: any rotation, the world's origin four meters ahead."""
     axes, upper = np.linalg.qr(rng.normal(size=(3, 3)))
     axes *= np.sign(np.diag(upper))
@@ -135,7 +135,7 @@ def kernel_gradients(scene, cotangents, frames=WORLD, face=None, antialiased=Fal
     return finish(images, cotangents, tensors)
 
 
-def finish(images, cotangents, tensors) -> tuple[Images, Gradients]:
+def finish(images, cotangents, tensors):
     loss = sum(
         (image * v.to(image.dtype)).sum() for image, v in zip(images, cotangents, strict=True)
     )
@@ -144,7 +144,7 @@ def finish(images, cotangents, tensors) -> tuple[Images, Gradients]:
     return [image.detach().numpy() for image in images], found
 
 
-def random_cotangents(camera: Camera, seed: int = 0) -> list[torch.Tensor]:
+def random_cotangents(camera, seed=0):
     generator = torch.Generator().manual_seed(seed)
     shape = (camera.height, camera.width)
     return [
@@ -153,13 +153,13 @@ def random_cotangents(camera: Camera, seed: int = 0) -> list[torch.Tensor]:
     ]
 
 
-def assert_images_agree(images: Images, expected: Images) -> None:
+def assert_images_agree(images, expected):
     tolerances = {"rgb": IMAGE_TOLERANCE, "alpha": IMAGE_TOLERANCE, "depth": DEPTH_TOLERANCE}
     for (name, tolerance), image, want in zip(tolerances.items(), images, expected, strict=True):
-        np.testing.assert_allclose(image, want, rtol=0, atol=tolerance, err_msg=name)
+        assert_allclose(image, want, rtol=0, atol=tolerance, err_msg=name)
 
 
-def assert_gradients_agree(gradients: Gradients, expected: Gradients) -> None:
+def assert_gradients_agree(gradients, expected):
     for name, want in expected.items():
         largest = np.abs(want).max()
         error = np.abs(gradients[name] - want).max() / max(largest, 1e-6)
@@ -197,7 +197,7 @@ def test_embedded_splats_render_and_train_in_their_frames(back_end, convention):
     assert_gradients_agree(gradients, expected)
 
 
-def raw_gradients(scene: Scene, fill: float = 0.0, buffers: BufferPool | None = None, **options):
+def raw_gradients(scene, fill=0.0, buffers=None, **options):
     """Forward and backward of numpy arrays: rendering, gradients whose untouched rows keep `fill`,
     and rows.
 
@@ -255,9 +255,7 @@ def test_screen_gradient_is_that_of_the_projected_center():
     expected[order] = np.hypot(gradient[:, 0] * 60 / 2, gradient[:, 1] * 35 / 2)
     _, _, rows, screen = raw_gradients(scene)
     assert len(rows) > 20
-    np.testing.assert_allclose(
-        screen[rows], expected[rows], atol=GRADIENT_TOLERANCE["xyz"] * expected.max()
-    )
+    assert_allclose(screen[rows], expected[rows], atol=GRADIENT_TOLERANCE["xyz"] * expected.max())
 
 
 def test_color_is_added_with_the_right_gradient(back_end):
@@ -315,7 +313,7 @@ def test_focused_rendering_gives_selected_rows_the_full_images_gradient(count):
     for name in NAMES:
         found = getattr(gradients, name)
         want = getattr(expected, name)
-        np.testing.assert_array_equal(found[focus], want[focus], err_msg=name)
+        assert_array_equal(found[focus], want[focus], err_msg=name)
         assert (found[~focus] == 123).all(), name
         assert (found[rows] != 123).any(), name
 
@@ -333,9 +331,9 @@ def test_results_do_not_depend_on_threads():
         set_threads(before)
     for images, gradients in many:
         for got, want in zip(images, single[0], strict=True):
-            np.testing.assert_array_equal(got, want)
+            assert_array_equal(got, want)
         for name in NAMES:
-            np.testing.assert_array_equal(gradients[name], single[1][name], err_msg=name)
+            assert_array_equal(gradients[name], single[1][name], err_msg=name)
 
 
 @pytest.mark.parametrize("case", ["no splats", "behind the camera", "below 1/255"])

@@ -5,10 +5,10 @@ import os
 import signal
 import threading
 import time
-from collections.abc import Iterator
 
 import numpy as np
 import pytest
+from numpy.testing import assert_array_equal, assert_equal
 
 pytest.importorskip("numba")
 
@@ -28,7 +28,7 @@ from .test_kernels import SCENES, kernel_gradients, random_cotangents
 
 
 @pytest.fixture(autouse=True)
-def as_many_as_before() -> Iterator[None]:
+def as_many_as_before():
     before = threads()
     yield
     set_threads(before)
@@ -96,7 +96,7 @@ def test_a_stage_begins_when_the_one_before_is_done(count):
         for _ in range(20):
             sums[1:] = 0
             add_neighbors(sums)
-            np.testing.assert_array_equal(sums[-1], expected)
+            assert_array_equal(sums[-1], expected)
 
 
 @pytest.mark.parametrize("fail", [fail, fail_in_a_stage])
@@ -168,7 +168,7 @@ def test_several_callers_at_a_time():
         caller.join()
     assert len(found) == 15
     for gradients in found:
-        np.testing.assert_equal(expected, gradients)
+        assert_equal(expected, gradients)
 
 
 def test_the_thread_count_changes_meanwhile():

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from numpy.testing import assert_array_equal
 
 pytest.importorskip("numba")
 
@@ -32,20 +33,20 @@ def test_depths_are_sorted_whatever_their_range(least, most):
     projection.rect[:] = rect
     for _ in range(2):  # with too little room for the pairs, and with enough
         lists, tiles = sort_into_tiles(projection, TILES, whole_tiles(TILES * TILES), buffers)
-        np.testing.assert_array_equal(np.sort(tiles), np.arange(TILES * TILES))
-        np.testing.assert_array_equal(lists.visible, seen)
+        assert_array_equal(np.sort(tiles), np.arange(TILES * TILES))
+        assert_array_equal(lists.visible, seen)
         count = ((rect[:, 2] - rect[:, 0]) * (rect[:, 3] - rect[:, 1]))[seen]
-        np.testing.assert_array_equal(lists.pairs[seen], count)
-        np.testing.assert_array_equal(lists.first_pair[seen], np.cumsum(count) - count)
+        assert_array_equal(lists.pairs[seen], count)
+        assert_array_equal(lists.first_pair[seen], np.cumsum(count) - count)
         order = seen[np.argsort(depth[seen], kind="stable")]
         x0, y0, x1, y1 = rect[order].T
         expected = [
             order[(x0 <= n % TILES) & (n % TILES < x1) & (y0 <= n // TILES) & (n // TILES < y1)]
             for n in range(TILES * TILES)
         ]
-        np.testing.assert_array_equal(lists.pair_splat, np.concatenate(expected))
-        np.testing.assert_array_equal(np.diff(lists.start), [len(found) for found in expected])
-        np.testing.assert_array_equal(lists.pair_splat[lists.splat_pairs], np.repeat(seen, count))
+        assert_array_equal(lists.pair_splat, np.concatenate(expected))
+        assert_array_equal(np.diff(lists.start), [len(found) for found in expected])
+        assert_array_equal(lists.pair_splat[lists.splat_pairs], np.repeat(seen, count))
 
 
 @pytest.mark.parametrize("count", [1, 7, 8, 1785])
@@ -56,7 +57,7 @@ def test_runs_of_tiles_begin_with_the_fullest(count):
     pairs = rng.integers(0, 400, 1785)
     given = np.sort(rng.choice(1785, count, replace=False)).astype(np.int32)
     tiles = heaviest_first(given, np.append(0, np.cumsum(pairs)))
-    np.testing.assert_array_equal(np.sort(tiles), given)
+    assert_array_equal(np.sort(tiles), given)
     whole = count // RUN_TILES * RUN_TILES
     runs = tiles[:whole].reshape(-1, RUN_TILES)
     assert {tuple(run) for run in runs.tolist()} == {

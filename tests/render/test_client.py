@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from avatar.conftest import splats_of
 from numpy.random import default_rng
+from numpy.testing import assert_allclose, assert_array_equal
 from refusal import refusal
 
 from stga_addon.avatar.embedding import WORLD, face_frames
-from stga_addon.avatar.splats import Splats
 from stga_addon.capture.camera import Camera
 from stga_addon.errors import StgaError
 from stga_addon.raster.cpu.compose import compose
@@ -26,7 +26,7 @@ AHEAD = np.array([0, 0, 1.2])
 CAMERA = Camera(50, 40, 60.0, 60.0, 25.0, 20.0, HERE)
 
 
-def cloud(count: int = 200, seed: int = 0, face: int = 1) -> Splats:
+def cloud(count=200, seed=0, face=1):
     rng = default_rng(seed)
     return splats_of(
         rng.normal(0, 0.2, (count, 3)) + AHEAD,
@@ -38,11 +38,11 @@ def cloud(count: int = 200, seed: int = 0, face: int = 1) -> Splats:
     )
 
 
-def world(splats: Splats, place: np.ndarray = HERE) -> PosedSplats:
+def world(splats, place=HERE):
     return PosedSplats(splats, WORLD, place)
 
 
-def embedded() -> PosedSplats:
+def embedded():
     rng = default_rng(1)
     faces = np.array([[0, 1, 2], [1, 3, 2]])
     neutral = rng.normal(0, 0.2, (4, 3)) + AHEAD
@@ -58,7 +58,7 @@ def test_one_layer_gives_the_pixels_of_render():
     picture = compose([world(splats)], CAMERA)
     expected = render(splats, CAMERA, (1.0, 0.5, 0.0))
     behind = (1 - picture.alpha) * np.array([1.0, 0.5, 0.0])[:, None, None]
-    np.testing.assert_allclose(np.clip(picture.rgb + behind, 0, 1), expected, atol=2e-6)
+    assert_allclose(np.clip(picture.rgb + behind, 0, 1), expected, atol=2e-6)
     assert picture.depth is None
     turn = np.eye(4)
     turn[:3, :3] = np.linalg.qr(default_rng(3).normal(size=(3, 3)))[0]
@@ -69,7 +69,7 @@ def test_one_layer_gives_the_pixels_of_render():
         log_scale = splats.log_scale - np.float32(np.log(size))
         small = replace(splats, xyz=splats.xyz / np.float32(size), log_scale=log_scale)
         picture = compose([world(small, turn @ np.diag([size, size, size, 1]))], camera)
-        np.testing.assert_allclose(picture.rgb, compose([world(splats)], CAMERA).rgb, atol=1e-4)
+        assert_allclose(picture.rgb, compose([world(splats)], CAMERA).rgb, atol=1e-4)
 
 
 def test_layers_are_sorted_together():
@@ -81,17 +81,16 @@ def test_layers_are_sorted_together():
         compose(layers, CAMERA, True)
         for layers in ([world(splats)], [world(splats.rows(half)), world(splats.rows(~half))])
     )
-    np.testing.assert_allclose(halves.rgb, whole.rgb, atol=2e-6)
-    np.testing.assert_allclose(halves.depth, whole.depth, atol=1e-5)
+    assert_allclose(halves.rgb, whole.rgb, atol=2e-6)
+    assert_allclose(halves.depth, whole.depth, atol=1e-5)
     green = 0.2, 0.9, 0.4
     found = render_layers([world(splats.rows(half)), world(splats.rows(~half))], CAMERA, green)
-    np.testing.assert_allclose(found, render(splats, CAMERA, green), atol=2e-6)
+    assert_allclose(found, render(splats, CAMERA, green), atol=2e-6)
     xyz = np.array([[0, 0, 3]], np.float32)
     log_scale = np.full((1, 3), -1, np.float32)
     splats = replace(cloud(1), xyz=xyz, log_scale=log_scale)
     depth = compose([world(splats)], CAMERA, True).depth
-    assert depth is not None
-    np.testing.assert_allclose(depth[depth > 0], 3, rtol=1e-5)
+    assert_allclose(depth[depth > 0], 3, rtol=1e-5)
     assert compose([], CAMERA, True).alpha.max() == 0
 
 
@@ -105,7 +104,7 @@ def test_the_server_renders_the_same(monkeypatch):
         here = compose(layers, camera, True)
         there = remote.compose(layers, camera, True)
         for name in ("rgb", "alpha", "depth"):
-            np.testing.assert_array_equal(getattr(there, name), getattr(here, name))
+            assert_array_equal(getattr(there, name), getattr(here, name))
     assert remote._server is not None
     _, server = remote._server
     with refusal("could not render"):
@@ -122,7 +121,7 @@ def test_the_server_renders_the_same(monkeypatch):
 def test_what_cannot_render_is_one_sentence(monkeypatch):
     """Catches a traceback without numba, and a wait for ever for foreign output."""
 
-    def nobody() -> str:
+    def nobody():
         raise StgaError("no training Python")
 
     monkeypatch.setattr(render_client, "missing_packages", lambda: ["numba", "platformdirs"])

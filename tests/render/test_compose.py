@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 from raster import gpu_device
 from refusal import refusal
 
@@ -14,7 +15,6 @@ from render.test_client import CAMERA, cloud, embedded, world
 from stga_addon.errors import DeviceError
 from stga_addon.raster.cpu.compose import compose
 from stga_addon.raster.gpu import compose as gpu
-from stga_addon.raster.posed_splats import ComposedImage, PosedSplats
 from stga_addon.render import client as render_client
 from stga_addon.render import device as compose_module
 from stga_addon.render.client import RenderClient
@@ -24,11 +24,11 @@ TOLERANCE = 2e-5
 
 
 @pytest.fixture(scope="module")
-def adapter() -> str:
+def adapter():
     return gpu_device.device().name
 
 
-def scene() -> list[PosedSplats]:
+def scene():
     """Layers of different degrees, places, colors and antialiasing."""
     place = np.diag([1.2, 1.2, 1.2, 1.0])
     place[:3, :3] = place[:3, :3] @ [[0.8, -0.6, 0], [0.6, 0.8, 0], [0, 0, 1]]
@@ -36,14 +36,14 @@ def scene() -> list[PosedSplats]:
     return [embedded(), world(cloud()), world(replace(gray, sh=gray.sh[:, :1]), place)]
 
 
-def assert_same_picture(got: ComposedImage, want: ComposedImage) -> None:
-    np.testing.assert_allclose(got.rgb, want.rgb, atol=TOLERANCE)
-    np.testing.assert_allclose(got.alpha, want.alpha, atol=TOLERANCE)
+def assert_same_picture(got, want):
+    assert_allclose(got.rgb, want.rgb, atol=TOLERANCE)
+    assert_allclose(got.alpha, want.alpha, atol=TOLERANCE)
     assert (got.depth is None) == (want.depth is None)
     if want.depth is not None and got.depth is not None:
         seen = want.alpha > 0.05  # elsewhere a rounded depth is divided by next to nothing
         assert seen.any()
-        np.testing.assert_allclose(got.depth[seen], want.depth[seen], rtol=1e-3)
+        assert_allclose(got.depth[seen], want.depth[seen], rtol=1e-3)
 
 
 @pytest.mark.parametrize("with_depth", [False, True])
@@ -62,7 +62,7 @@ def test_a_gpu_composes_the_same_picture(adapter, layers, with_depth):
 
 
 @pytest.mark.needs("adapter")
-def test_more_pairs_than_there_is_room_for(adapter: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_more_pairs_than_there_is_room_for(adapter, monkeypatch):
     """Catches an empty picture where pairs did not fit, and a lost device that is kept."""
     monkeypatch.setattr("stga_addon.raster.gpu.rasterize.INITIAL_PAIR_CAPACITY", 10)
     gpu._rasterizer.cache_clear()
@@ -73,7 +73,7 @@ def test_more_pairs_than_there_is_room_for(adapter: str, monkeypatch: pytest.Mon
     assert not gpu._rasterizer.cache_info().currsize, "the lost device is kept"
 
 
-def lost(*_: object) -> ComposedImage:
+def lost(*_):
     raise DeviceError("Card 9000 was lost", "try again")
 
 
@@ -87,7 +87,7 @@ def test_the_cpu_takes_over_where_a_gpu_fails(monkeypatch, caplog):
     with caplog.at_level(logging.WARNING):
         for _ in range(2):
             found = composer.compose(scene(), CAMERA).rgb
-            np.testing.assert_array_equal(found, compose(scene(), CAMERA).rgb)
+            assert_array_equal(found, compose(scene(), CAMERA).rgb)
     assert len(calls) == 1
     assert composer.failure == "Card 9000 was lost; the CPU renders instead"
     assert caplog.messages == [composer.failure]
@@ -101,13 +101,13 @@ def test_the_cpu_takes_over_where_a_gpu_fails(monkeypatch, caplog):
 
 
 @pytest.mark.needs("adapter")
-def test_software_renders_by_name_only(adapter: str) -> None:
+def test_software_renders_by_name_only(adapter):
     """Catches pictures by software Vulkan instead of the CPU, bit for bit."""
     if not gpu_device.device().is_software:
         pytest.skip("the first adapter is a GPU")
     composer = Composer()
     found = composer.compose(scene(), CAMERA).rgb
-    np.testing.assert_array_equal(found, compose(scene(), CAMERA).rgb)
+    assert_array_equal(found, compose(scene(), CAMERA).rgb)
     assert composer.device == "cpu"
     assert Composer("gpu").choose() == f"gpu:{adapter}"
 
@@ -127,7 +127,7 @@ def test_the_server_renders_on_the_wanted_device(adapter, monkeypatch):
     assert_same_picture(on_gpu, want)
     assert not np.array_equal(on_gpu.rgb, want.rgb)  # rounding: it was not the CPU
     device[0] = "auto" if gpu_device.device().is_software else "cpu"
-    np.testing.assert_array_equal(remote.compose(layers, CAMERA, True).rgb, want.rgb)
+    assert_array_equal(remote.compose(layers, CAMERA, True).rgb, want.rgb)
     assert subprocess.Popen.poll(first) is not None
     device[0] = "gpu:Voodoo 2"
     with refusal(r"could not render the image \(--device gpu:Voodoo 2: no adapter"):

@@ -23,7 +23,7 @@ SOFTWARE = "llvmpipe (Vulkan)"
 
 
 @pytest.fixture
-def trials(monkeypatch: pytest.MonkeyPatch) -> dict[str, Trial]:
+def trials(monkeypatch):
     """Two names of a card and a software adapter; what a trial of each finds."""
     kinds = {CARD: "DiscreteGPU", OTHER: "DiscreteGPU", SOFTWARE: "CPU"}
     adapters = {name: SimpleNamespace(info={"adapter_type": kind}) for name, kind in kinds.items()}
@@ -66,7 +66,7 @@ def test_software_is_only_taken_by_name(trials, monkeypatch):
 
 
 @pytest.mark.parametrize("error", [0.02, float("nan")])
-def test_wrong_gradients_are_refused(trials: dict[str, Trial], error: float) -> None:
+def test_wrong_gradients_are_refused(trials, error):
     """Catches training on a driver that computes something else."""
     for name in trials:
         trials[name] = Trial(error, 0.002, 0.02)
@@ -86,7 +86,7 @@ def test_names_that_fit_none_or_several(trials):
     assert not any(map(is_device, wrong))
 
 
-def raises(name: str) -> None:
+def raises(name):
     raise RuntimeError("device lost\nand more lines")
 
 
@@ -120,7 +120,7 @@ def test_a_driver_that_fails_leaves_the_cpu(trials, monkeypatch):
     assert choose_device("auto") == ("cpu", f"Training on the CPU: {reasons}")
 
 
-def test_wgpu_is_imported_only_where_it_works() -> None:
+def test_wgpu_is_imported_only_where_it_works():
     """Catches a run on the CPU that needs wgpu, or waits for a driver."""
     script = (
         "import sys; from stga_addon.render import device; "

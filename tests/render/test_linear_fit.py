@@ -1,18 +1,17 @@
 """What is fitted for renderers that blend in linear light, by pictures that are blended so here."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 from capture.factory import ball, write_mesh_capture
+from numpy.testing import assert_allclose, assert_array_equal
 from refusal import refusal
 
 from stga_addon.avatar.embedding import to_world
 from stga_addon.avatar.file import Avatar, read_avatar, write_avatar
 from stga_addon.avatar.lattice import lattice_splats
 from stga_addon.avatar.splats import SH_C0, sh_color
-from stga_addon.capture.camera import Camera
 from stga_addon.capture.color import linear_to_srgb, srgb_to_linear
 from stga_addon.capture.open import open_capture
 from stga_addon.export.formats import export_avatar
@@ -22,7 +21,7 @@ from stga_addon.render.linear_fit import fit_linear
 from stga_addon.render.render import render, render_avatar
 
 
-def hairy_avatar() -> Avatar:
+def hairy_avatar():
     """A ball of translucent splats, light over dark, whose colors depend on the view."""
     vertices, faces = ball()
     splats = lattice_splats(vertices, faces.astype(np.int32), sh_degree=1)
@@ -35,7 +34,7 @@ def hairy_avatar() -> Avatar:
     return Avatar(splats, "stga", vertices.astype(np.float32), faces.astype(np.int32))
 
 
-def blended_linearly(avatar: Avatar, mesh: np.ndarray, camera: Camera, gray: float) -> np.ndarray:
+def blended_linearly(avatar, mesh, camera, gray):
     """(3, H, W) sRGB: what Cycles would see without noise."""
     frames = avatar.frames(mesh)
     world = to_world(avatar.splats, frames)
@@ -48,7 +47,7 @@ def blended_linearly(avatar: Avatar, mesh: np.ndarray, camera: Camera, gray: flo
     return np.asarray(linear_to_srgb(picture))
 
 
-def test_blending_linearly_shows_what_was_trained(tmp_path: Path) -> None:
+def test_blending_linearly_shows_what_was_trained(tmp_path):
     """Catches a fit that is worse on one background or in a view that it has not seen, that turns
     harmonics or a head's pose, changes what was trained, or goes on after *Cancel*."""
     root = write_mesh_capture(tmp_path / "capture")
@@ -66,7 +65,7 @@ def test_blending_linearly_shows_what_was_trained(tmp_path: Path) -> None:
                 errors.append(np.square(found - trained).mean())
         before, after = np.reshape(errors, (2, -1)).mean(1)
         assert 10 * np.log10(before / after) > 4, gray
-    np.testing.assert_array_equal(fitted.for_linear_light.splats.sh[:, 1:], avatar.splats.sh[:, 1:])
+    assert_array_equal(fitted.for_linear_light.splats.sh[:, 1:], avatar.splats.sh[:, 1:])
     with refusal("has no training views"):
         fit_linear(avatar, replace(capture, views={}))
     told = []
@@ -75,7 +74,7 @@ def test_blending_linearly_shows_what_was_trained(tmp_path: Path) -> None:
     assert len(told) == 3
 
 
-def test_files_keep_both(tmp_path: Path) -> None:
+def test_files_keep_both(tmp_path):
     """Catches a fit that is lost in the file, of the wrong shape, in a file for viewers that blend
     as trained, or missing in USD, whose renderers do not."""
     avatar = hairy_avatar()
@@ -83,13 +82,13 @@ def test_files_keep_both(tmp_path: Path) -> None:
     avatar = replace(avatar, linear_base=base)
     write_avatar(tmp_path / "a.npz", avatar)
     read = read_avatar(tmp_path / "a.npz")
-    np.testing.assert_array_equal(read.linear_base, base)
+    assert_array_equal(read.linear_base, base)
     with refusal("linear_base is float32"):
         write_avatar(tmp_path / "b.npz", replace(avatar, linear_base=base[1:]))
     export_avatar(tmp_path / "a.ply", read, "ply", [(0, avatar.neutral)])
-    np.testing.assert_array_equal(read_ply(tmp_path / "a.ply").opacity, avatar.splats.opacity)
+    assert_array_equal(read_ply(tmp_path / "a.ply").opacity, avatar.splats.opacity)
     usd = pytest.importorskip("pxr.Usd", reason="the package usd-core is not installed")
     export_avatar(tmp_path / "a.usdc", read, "usd", [(0, avatar.neutral)])
     stage = usd.Stage.Open(str(tmp_path / "a.usdc"))
     opacity = stage.GetPrimAtPath("/Avatar/Splats").GetAttribute("opacities").Get(0)
-    np.testing.assert_allclose(opacity, 1 / (1 + np.exp(-base[:, 3])), atol=1e-6)
+    assert_allclose(opacity, 1 / (1 + np.exp(-base[:, 3])), atol=1e-6)

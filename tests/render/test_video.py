@@ -8,6 +8,7 @@ import av
 import numpy as np
 import pytest
 from avatar.conftest import splats_of
+from numpy.testing import assert_array_equal
 from PIL import Image
 
 from stga_addon.avatar.embedding import WORLD
@@ -26,7 +27,7 @@ from .test_client import embedded
 FPS = 12.5
 
 
-def images(height: int = 61, width: int = 80, count: int = 10) -> list[np.ndarray]:
+def images(height=61, width=80, count=10):
     """Red above, blue below, and a gray stripe that moves down."""
     picture = np.zeros((height, width, 3), np.uint8)
     picture[: height // 2, :, 0] = picture[height // 2 :, :, 2] = 255
@@ -36,7 +37,7 @@ def images(height: int = 61, width: int = 80, count: int = 10) -> list[np.ndarra
     return moving
 
 
-def test_a_video_is_what_was_written(tmp_path: Path) -> None:
+def test_a_video_is_what_was_written(tmp_path):
     """Catches lost or doubled frames, a wrong rate, and colors tagged as of another matrix."""
     path = tmp_path / "a" / "video.mp4"
     written = images()
@@ -57,7 +58,7 @@ def test_a_video_is_what_was_written(tmp_path: Path) -> None:
     assert [item.name for item in path.parent.iterdir()] == ["video.mp4"]
 
 
-def test_nothing_is_left_of_an_unfinished_video(tmp_path: Path) -> None:
+def test_nothing_is_left_of_an_unfinished_video(tmp_path):
     """Catches half a video after an error, and an older one that it destroyed."""
     path = tmp_path / "video.mp4"
     path.write_bytes(b"older")
@@ -69,7 +70,7 @@ def test_nothing_is_left_of_an_unfinished_video(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("fps", [0.0, 1e9, float("nan")])
-def test_frame_rates_no_video_has(tmp_path: Path, fps: float) -> None:
+def test_frame_rates_no_video_has(tmp_path, fps):
     """Catches FFmpeg's own message, or a video without duration."""
     with pytest.raises(StgaError, match="frame rate"), video_writer(tmp_path / "video.mp4", fps):
         pass
@@ -85,25 +86,25 @@ def test_image_sequence(tmp_path):
     names = ["0001.png", "0002.png", "0003.png"]
     assert sorted(path.name for path in (tmp_path / "images").glob("*.*g")) == names
     for name, image in zip(names, written, strict=True):
-        np.testing.assert_array_equal(np.asarray(Image.open(tmp_path / "images" / name)), image)
+        assert_array_equal(np.asarray(Image.open(tmp_path / "images" / name)), image)
     before = contents(tmp_path / "images")
     with suppress(KeyboardInterrupt), sequence_writer(tmp_path / "images"):
         raise KeyboardInterrupt
     assert contents(tmp_path / "images") == before
 
 
-def write_sequence(folder: Path, count: int) -> None:
+def write_sequence(folder, count):
     with sequence_writer(folder) as write:
         for image in images(count=count):
             write(image)
 
 
-def contents(folder: Path) -> dict[str, bytes]:
+def contents(folder):
     return {path.name: path.read_bytes() for path in folder.iterdir()}
 
 
 @pytest.mark.parametrize("cut_short", [False, True])
-def test_a_sequence_replaces_an_earlier_one(tmp_path: Path, cut_short: bool) -> None:
+def test_a_sequence_replaces_an_earlier_one(tmp_path, cut_short):
     """Catches images of a longer, killed sequence that stay, and others' that do not."""
     write = sequence_writer(tmp_path).__enter__()  # of a process that was killed
     for image in images(count=4):
@@ -116,11 +117,11 @@ def test_a_sequence_replaces_an_earlier_one(tmp_path: Path, cut_short: bool) -> 
             raise KeyboardInterrupt
     left = ["0001.png", "12.png", "texture_0001.png"]
     assert sorted(path.name for path in tmp_path.glob("*.png")) == left
-    np.testing.assert_array_equal(np.asarray(Image.open(tmp_path / "0001.png")), images()[0])
+    assert_array_equal(np.asarray(Image.open(tmp_path / "0001.png")), images()[0])
 
 
 @pytest.mark.parametrize("name", ["0001.png", "0002.png", "0044.png", "0044.PNG"])
-def test_images_of_others_are_kept(tmp_path: Path, name: str) -> None:
+def test_images_of_others_are_kept(tmp_path, name):
     """Catches footage or retouched images lost, and a refusal that comes too late."""
     write_sequence(tmp_path, 2)
     (tmp_path / name).write_bytes(b"of others")
@@ -136,9 +137,7 @@ IMAGES = "recording.bin"
 CAMERA = look_at((0, 0, 2), (0, 0, 0), 32, 24, 40.0)
 
 
-def record(
-    folder: Path, output: Path, images: list[list[PosedSplats]], count: int | None = None
-) -> None:
+def record(folder, output, images, count=None):
     """Record images and ask for them; count: how many, if others than there are."""
     folder.mkdir()
     recorder = Recorder(folder / IMAGES)
@@ -150,7 +149,7 @@ def record(
     write_request(folder, RenderRecording(folder / IMAGES, output, count, 25.0, background))
 
 
-def layer(seed: int, to_world: np.ndarray | None = None, count: int = 40) -> PosedSplats:
+def layer(seed, to_world=None, count=40):
     rng = np.random.default_rng(seed)
     xyz = rng.normal(0, 0.3, (count, 3))
     sh = rng.normal(size=(count, 1, 3))
@@ -158,13 +157,13 @@ def layer(seed: int, to_world: np.ndarray | None = None, count: int = 40) -> Pos
     return PosedSplats(splats, WORLD, np.eye(4) if to_world is None else to_world)
 
 
-def moved(x: float) -> np.ndarray:
+def moved(x):
     matrix = np.eye(4)
     matrix[0, 3] = x
     return matrix
 
 
-def test_layers_without_what_the_reader_has() -> None:
+def test_layers_without_what_the_reader_has():
     """Catches splats sent again with each image, taken for others, and a field that is not sent."""
     before = [layer(0), layer(1)]
     after = [replace(layer(0), to_world=moved(1)), layer(2), embedded()]
@@ -174,12 +173,12 @@ def test_layers_without_what_the_reader_has() -> None:
     for given, again in zip(after, unpack_layers(packed, before), strict=True):
         for one, other in ((given.splats, again.splats), (given.frames, again.frames)):
             for name, value in vars(one).items():
-                np.testing.assert_array_equal(getattr(other, name), value, err_msg=name)
-        np.testing.assert_array_equal(again.to_world, given.to_world)
+                assert_array_equal(getattr(other, name), value, err_msg=name)
+        assert_array_equal(again.to_world, given.to_world)
         assert again.antialiased == given.antialiased
 
 
-def test_images_are_those_recorded(tmp_path: Path) -> None:
+def test_images_are_those_recorded(tmp_path):
     """Catches images of other splats, poses or cameras than recorded, and a recording left."""
     folder = tmp_path / "job"
     out = tmp_path / "out"
@@ -191,10 +190,10 @@ def test_images_are_those_recorded(tmp_path: Path) -> None:
     for index, layers in enumerate(images):
         expected = finished(compose(layers, CAMERA), (1.0, 0.5, 0.0), opaque=False)
         with Image.open(out / f"{index + 1:04d}.png") as image:
-            np.testing.assert_array_equal(np.asarray(image), expected)
+            assert_array_equal(np.asarray(image), expected)
 
 
-def test_a_cancelled_video_is_not_written(tmp_path: Path) -> None:
+def test_a_cancelled_video_is_not_written(tmp_path):
     """Catches half a video under the name of a whole one, and a cancel that counts as a failure."""
     pytest.importorskip("av")
     folder = tmp_path / "job"
@@ -205,7 +204,7 @@ def test_a_cancelled_video_is_not_written(tmp_path: Path) -> None:
     assert [path.name for path in tmp_path.iterdir()] == ["job"]
 
 
-def test_backgrounds() -> None:
+def test_backgrounds():
     """Catches premultiplied color in a PNG with alpha, and a background before the splats."""
     rgb = np.full((3, 1, 1), 0.25, np.float32)
     alpha = np.full((1, 1), 0.5, np.float32)

@@ -3,11 +3,11 @@
 from dataclasses import replace
 from io import BytesIO
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 from command_line import refused, stga
+from numpy.testing import assert_array_equal
 from PIL import Image
 
 from stga_addon import report
@@ -21,10 +21,10 @@ from stga_addon.training import preset_timing
 from stga_addon.training.evaluate.forecast import describe_forecast
 from stga_addon.training.run.folder import Run, read_run
 from stga_addon.training.run.session import train_run
-from stga_addon.training.settings import TrainingSettings, make_settings
+from stga_addon.training.settings import make_settings
 
 
-def metrics(values: list[float], **more: Any) -> list[dict[str, Any]]:
+def metrics(values, **more):
     return [
         {
             "seconds": 10.0 * n,
@@ -39,7 +39,7 @@ def metrics(values: list[float], **more: Any) -> list[dict[str, Any]]:
     ]
 
 
-def aiming(target: float | None) -> TrainingSettings:
+def aiming(target):
     return make_settings(iterations=1, target_psnr=target)
 
 
@@ -82,7 +82,7 @@ def test_summary_of_a_run():
     assert summarize_run(late, aiming(30.0))[0].startswith("held-out views: 31.00 dB")
 
 
-def test_both_qualities_are_named() -> None:
+def test_both_qualities_are_named():
     """Catches heads fitted to the very images that are scored and not called so, and tracking that
     nothing has checked without a warning."""
     values = metrics([20.0, 23.0])
@@ -102,7 +102,7 @@ def test_both_qualities_are_named() -> None:
     assert "the avatar has fitted those of unseen timesteps to the images" in table
 
 
-def test_summary_of_a_continuation() -> None:
+def test_summary_of_a_continuation():
     """Catches before and after exchanged, and a fitted PSNR that is not called so."""
     before, after = metrics([30.0, 32.0], psnr_take_2=20.0, psnr_unmatched=15.0, splats=9)
     lines = report.summarize_continuation([before, {**after, "psnr_take_2": 19.5, "splats": 12}])
@@ -130,12 +130,12 @@ def test_report_of_a_finished_run(toy, tmp_path, monkeypatch):
     assert report_run(tmp_path / "run")[-1] == f"{why}matplotlib is not installed"
 
 
-def test_the_curve_is_drawn_while_training(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_curve_is_drawn_while_training(tmp_path, monkeypatch):
     """Catches a picture only at the end, drawn without need, or that takes more than its share."""
     now = [0.0]
     drawn = []
 
-    def draw(folder: Path) -> None:
+    def draw(folder):
         drawn.append(now[0])
         now[0] += 0.05
 
@@ -151,7 +151,7 @@ def test_the_curve_is_drawn_while_training(tmp_path: Path, monkeypatch: pytest.M
     assert drawn == [30.0, 36.0, 46.0]
 
 
-def evaluations(count: int) -> list[dict[str, Any]]:
+def evaluations(count):
     return [
         {"seconds": 2.0 + n, "psnr": 20.0 + n, "psnr_mask": 18.0, "psnr_moving": 17.0}
         for n in range(count)
@@ -166,8 +166,8 @@ def test_chart_of_a_run():
     (axes,) = run_chart(lines).axes
     drawn = {str(line.get_label()): np.asarray(line.get_xydata()) for line in axes.lines}
     assert list(drawn) == ["whole image", "head mask", "moving region", "forecast"]
-    np.testing.assert_array_equal(drawn["whole image"], [[2, 20], [3, 21], [4, 22], [5, 23]])
-    np.testing.assert_array_equal(drawn["forecast"], [[5, 23], [8, 24]])
+    assert_array_equal(drawn["whole image"], [[2, 20], [3, 21], [4, 22], [5, 23]])
+    assert_array_equal(drawn["forecast"], [[5, 23], [8, 24]])
     band = axes.collections[0].get_paths()[0].vertices
     assert {(8.0, 23.5), (8.0, 24.5)} <= set(map(tuple, band))
     bare = [{"seconds": 2.0, "psnr": 20.0}, {"seconds": 3.0, "psnr": 21.0}]
@@ -201,7 +201,7 @@ def test_chart_of_a_benchmark():
 
 
 @pytest.fixture(autouse=True)
-def _quick(monkeypatch: pytest.MonkeyPatch) -> None:
+def _quick(monkeypatch):
     """Every preset takes a millisecond an iteration."""
     monkeypatch.setattr(preset_timing, "seconds_per_iteration", lambda *_: 0.001)
 

@@ -38,12 +38,12 @@ REACHED = mmap.mmap(-1, 8)
 """The child's last iteration, readable after its death."""
 
 
-def train(run: Run, out: Path) -> None:
+def train(run, out):
     ticks = count()
     run_module.perf_counter = lambda: float(next(ticks))
     run_module.CHECKPOINT_S = INTERVAL
 
-    def report(progress: run_module.Progress) -> bool:
+    def report(progress):
         REACHED[:] = struct.pack("q", int(progress.figures().get("iteration", 0)))
         return False
 
@@ -51,7 +51,7 @@ def train(run: Run, out: Path) -> None:
     run_module.train_run(open_capture(run.capture), out, run, resume=resume, report=report)
 
 
-def spawn(run: Run, out: Path) -> int:
+def spawn(run, out):
     """A forked child that trains; exits with 0 when the run is finished."""
     REACHED[:] = bytes(8)
     child = os.fork()
@@ -64,7 +64,7 @@ def spawn(run: Run, out: Path) -> int:
     return child
 
 
-def last_iteration(out: Path, faces: int) -> int:
+def last_iteration(out, faces):
     """Read everything that a run folder may hold; the iteration of its checkpoint."""
     if (out / "run.json").exists():
         read_run(out)
@@ -77,7 +77,7 @@ def last_iteration(out: Path, faces: int) -> int:
     return checkpoints.read_checkpoint(out).iteration
 
 
-def main(root: Path, kills: int) -> None:
+def main(root, kills):
     capture = open_capture(factory.write_mesh_capture(root / "capture", (0, 1, 3, 4), range(4)))
     settings = quick_settings(
         iterations=ITERATIONS,

@@ -4,7 +4,6 @@ import errno
 import os
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 from capture import factory
@@ -25,7 +24,7 @@ FULL_AT = 8  # the next step writes a checkpoint and no avatar
 
 
 @pytest.fixture(scope="module")
-def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def root(tmp_path_factory):
     return factory.write_mesh_capture(tmp_path_factory.mktemp("disk"), (0, 1, 3), range(3))
 
 

@@ -34,7 +34,7 @@ class Soak:
     broken: list[str] = field(default_factory=list)
 
 
-def resident() -> int:
+def resident():
     """Bytes of this process in memory; 0 where the system does not say."""
     if not os.path.exists("/proc/self/statm"):
         return 0
@@ -42,7 +42,7 @@ def resident() -> int:
         return int(file.read().split()[1]) * os.sysconf("SC_PAGE_SIZE")
 
 
-def soak(capture) -> Soak:
+def soak(capture):
     """Train, in each step another view and another random choice of triangles."""
     settings = quick_settings(
         "selective",

@@ -1,7 +1,5 @@
 """A video of a generated head whose face the networks find."""
 
-from pathlib import Path
-
 import numpy as np
 from flame.small_head import small_head
 
@@ -9,7 +7,7 @@ from stga_addon.render.video import video_writer
 from stga_addon.tracking.correspondence import picture_cameras, shaded_image
 
 
-def write_head_video(path: Path, frames: int, size: int = 256) -> None:
+def write_head_video(path, frames, size=256):
     """The head turns from side to side before a camera that stands still."""
     model = small_head(0)
     front = picture_cameras(model.v_template)[0]

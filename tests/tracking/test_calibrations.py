@@ -6,6 +6,7 @@ import re
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 from refusal import refusal
 
 from stga_addon.tracking.footage.metashape import read_metashape
@@ -49,7 +50,7 @@ def test_a_capture_is_footage(tmp_path):
     assert footage.cameras[0].camera.cy == HEIGHT - 12.0
     found = footage.cameras[1].camera
     expected = rig(2)[1]
-    np.testing.assert_allclose(found.world_to_camera, expected.world_to_camera, atol=1e-9)
+    assert_allclose(found.world_to_camera, expected.world_to_camera, atol=1e-9)
 
 
 def test_one_image_per_pose_is_one_timestep(tmp_path):
@@ -229,10 +230,10 @@ def test_projections_are_metashapes(tmp_path, kind, angle_of):
     local = np.c_[random.uniform(-0.4, 0.4, (20, 2)), np.ones(20)] * 2.0
     for shot, expected in zip(shots, rig(), strict=True):
         camera = shot.camera
-        np.testing.assert_allclose(camera.world_to_camera, expected.world_to_camera, atol=1e-9)
+        assert_allclose(camera.world_to_camera, expected.world_to_camera, atol=1e-9)
         distorted = shot.lens.distort(local[:, :2] / local[:, 2:])
         found = distorted * [camera.fl_x, camera.fl_y] + [camera.cx, camera.cy]
-        np.testing.assert_allclose(found, projected(local, angle_of), atol=1e-9)
+        assert_allclose(found, projected(local, angle_of), atol=1e-9)
 
 
 def test_labels_are_image_names_or_paths(tmp_path):
@@ -320,12 +321,12 @@ def test_xmp(tmp_path, as_attributes):
     files = tmp_path.glob("*.xmp")
     (shot,), left_out = read_realitycapture_xmp(files, lambda label: (30, 40), tmp_path)
     assert (shot.label, left_out) == ("b", ())
-    np.testing.assert_allclose(shot.camera.world_to_camera, camera.world_to_camera, atol=1e-12)
+    assert_allclose(shot.camera.world_to_camera, camera.world_to_camera, atol=1e-12)
     focal = 24.3765359225552 / 36 * 40
     found = intrinsics(shot.camera)
-    np.testing.assert_allclose(found, [focal, focal, 15 - 0.0046 * 40, 20 + 0.0082 * 40])
+    assert_allclose(found, [focal, focal, 15 - 0.0046 * 40, 20 + 0.0082 * 40])
     expected = brown(0.3, -0.2, map(float, XMP_COEFFICIENTS.split()))
-    np.testing.assert_allclose(shot.lens.distort(np.array([0.3, -0.2])), expected, atol=1e-12)
+    assert_allclose(shot.lens.distort(np.array([0.3, -0.2])), expected, atol=1e-12)
 
 
 def csv_line(name, camera, rest="18,0.01,-0.02,0,0,0,0,0,0"):
@@ -347,8 +348,8 @@ def test_level_camera_of_a_csv(tmp_path):
         (tmp_path / name).write_text(text, encoding="utf-8")
     (shot,), _ = read_realitycapture_csv(tmp_path / "first.csv", lambda label: (40, 30))
     expected = [[0, -1, 0], [0, 0, -1], [1, 0, 0]]  # right, down, forward
-    np.testing.assert_allclose(shot.camera.world_to_camera[:3, :3], expected, atol=1e-12)
-    np.testing.assert_allclose(shot.camera.position, [1, 2, 3], atol=1e-12)
+    assert_allclose(shot.camera.world_to_camera[:3, :3], expected, atol=1e-12)
+    assert_allclose(shot.camera.position, [1, 2, 3], atol=1e-12)
     write_image(tmp_path / "a.png")
     with refusal(r"first.csv and second.csv are calibrations; choose one"):
         open_footage(tmp_path)

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from command_line import stga
 from flame.small_head import small_head
+from numpy.testing import assert_allclose, assert_array_equal
 from refusal import refusal
 
 from stga_addon.capture.open import open_capture
@@ -46,9 +47,9 @@ def test_a_key_moves_its_neighbors_and_nothing_else():
     """Catches a correction that pops for one frame, spreads over the take, or is pulled back by the
     landmarks; also by those that an interpolated frame does not have."""
     change = correct({12: opened(12, 0.3)}) - TAKE
-    np.testing.assert_allclose(change[12], np.eye(TAKE.shape[1])[JAW] * 0.3, atol=1e-12)
-    np.testing.assert_array_equal(change[:7], 0)
-    np.testing.assert_array_equal(change[18:], 0)
+    assert_allclose(change[12], np.eye(TAKE.shape[1])[JAW] * 0.3, atol=1e-12)
+    assert_array_equal(change[:7], 0)
+    assert_array_equal(change[18:], 0)
     jaw = change[7:18, JAW]
     assert 0.03 < jaw[4] < 0.3
     assert 0.03 < jaw[6] < 0.3
@@ -71,7 +72,7 @@ def test_the_world_says_nothing_of_a_correction(world):
     (own,), _ = moved(HEAD, [key], WORLDS[world])
     seen = np.ones(len(TAKE), bool)
     found = corrected(PERSON, places_on(HEAD, 60), turned, seen, {12: own}, 5)
-    np.testing.assert_allclose(meshes_of(HEAD, found), expected @ turn.T, atol=5e-4)
+    assert_allclose(meshes_of(HEAD, found), expected @ turn.T, atol=5e-4)
 
 
 @pytest.mark.parametrize(
@@ -83,7 +84,7 @@ def test_keys_anywhere(keys):
     given = {timestep: opened(timestep, angle) for timestep, angle in keys.items()}
     found = correct(given)
     for timestep, values in given.items():
-        np.testing.assert_allclose(found[timestep], values, atol=1e-12)
+        assert_allclose(found[timestep], values, atol=1e-12)
     assert np.abs(found - TAKE).max() < (0.5 if keys else 1e-15)
 
 
@@ -112,13 +113,13 @@ def test_a_corrected_capture_shows_the_key(tracked, tmp_path):
     capture = open_capture(out, model)
     flame = capture.flame
     expected = flame_forward(flame.model, flame.shape, frame_of(key), flame.static_offset)
-    np.testing.assert_allclose(capture.mesh(1), expected, atol=1e-6)
-    np.testing.assert_allclose(parameters_in(out, model)[3:], before[3:], atol=1e-7)
+    assert_allclose(capture.mesh(1), expected, atol=1e-6)
+    assert_allclose(parameters_in(out, model)[3:], before[3:], atol=1e-7)
     after = read_json(out / "tracking.json")["reprojection_px"]["cam0"]
     assert after["1"] > report["1"] + 0.5
     assert abs(after["4"] - report["4"]) < 0.02
     correct_capture(out, model, {})
-    np.testing.assert_allclose(parameters_in(out, model), before, atol=1e-7)
+    assert_allclose(parameters_in(out, model), before, atol=1e-7)
     with refusal("has no timestep 99"):
         correct_capture(out, model, {99: before[0]})
     other = tmp_path / "other"
@@ -203,7 +204,7 @@ def test_a_damaged_capture_is_named(tracked, tmp_path, capsys, name):
     (line,) = capsys.readouterr().err.splitlines()
     assert str(tmp_path / "out" / file) in line
     assert re.search(message, line)
-    np.testing.assert_array_equal(parameters_in(tmp_path / "out", model), before)
+    assert_array_equal(parameters_in(tmp_path / "out", model), before)
 
 
 @pytest.mark.parametrize(
@@ -216,4 +217,4 @@ def test_a_key_that_is_none_is_named(tracked, tmp_path, capsys, key):
     assert stga("perform", tmp_path / "job") == 2
     message = rf"key at timestep 1: expected \({SIZE},\) finite numbers"
     assert re.search(message, capsys.readouterr().err)
-    np.testing.assert_array_equal(parameters_in(out, model), before)
+    assert_array_equal(parameters_in(out, model), before)

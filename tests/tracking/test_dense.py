@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from flame.small_head import EXPRESSIONS, small_head, small_head_colors, subdivided
 from numpy.random import default_rng
+from numpy.testing import assert_allclose
 
 from stga_addon.capture.camera import look_at
 from stga_addon.flame.forward import FlameFrame, flame_forward
@@ -157,7 +158,7 @@ def test_projection_derivative_agrees_with_differences():
     for axis in range(3):
         step = 1e-6 * np.eye(3)[axis]
         difference = (camera.project(points + step)[0] - camera.project(points - step)[0]) / 2e-6
-        np.testing.assert_allclose(found[:, :, axis], difference, rtol=1e-5, atol=1e-5)
+        assert_allclose(found[:, :, axis], difference, rtol=1e-5, atol=1e-5)
 
 
 def test_smoothing_stays_at_the_solution_of_its_own_terms(head):
@@ -177,7 +178,7 @@ def test_smoothing_stays_at_the_solution_of_its_own_terms(head):
     information, right = map(np.stack, zip(*terms, strict=True))
     stiffness = acceleration_precision(one.model)
     found = smoothed(solved, information, stiffness, right, one)
-    np.testing.assert_allclose(found, solved, atol=5e-3)
+    assert_allclose(found, solved, atol=5e-3)
 
 
 def test_a_short_take_is_left_to_landmarks_and_surface():

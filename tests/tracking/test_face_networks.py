@@ -8,7 +8,7 @@ from flame.small_head import small_head
 from numpy.linalg import norm
 from scipy.spatial.transform import Rotation
 
-from stga_addon.capture.camera import Camera, look_at
+from stga_addon.capture.camera import look_at
 from stga_addon.capture.mesh_geometry import similarity
 from stga_addon.capture.open import open_capture
 from stga_addon.flame.model import EYEBALL_WEIGHT
@@ -34,7 +34,7 @@ REFERENCE = Path(__file__).with_name("mediapipe.npz")
 
 
 @pytest.fixture(scope="module")
-def pictures() -> list[np.ndarray]:
+def pictures():
     """From the front, from the side, and turned in the image's plane before a wide dark
     background."""
     model = small_head(0)
@@ -156,10 +156,10 @@ def test_a_known_head_seen_from_above_is_not_tilted(tmp_path, monkeypatch):
         cv2.imwrite(str(tmp_path / f"photos/{number}.png"), image[..., ::-1])
     footage = open_footage(tmp_path / "photos", focal=1500.0)
 
-    def draw(vertices: np.ndarray, seen_by: Camera) -> np.ndarray:
+    def draw(vertices, seen_by):
         return shaded_image(vertices, faces, seen_by)
 
-    def draw_nothing(vertices: np.ndarray, seen_by: Camera) -> np.ndarray:
+    def draw_nothing(vertices, seen_by):
         return np.zeros((512, 512, 3), np.uint8)
 
     places = calibrate(head.model, FaceNetworks(), "head")

@@ -7,6 +7,7 @@ import pytest
 from flame.conftest import random_arrays, random_frame
 from numpy.linalg import norm
 from numpy.random import default_rng
+from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
 from stga_addon.capture.camera import look_at
@@ -107,10 +108,10 @@ def test_points_agree_with_the_forward_pass_and_their_derivatives_with_differenc
     values = np.concatenate([shape, frame.parameters])
     positions, jacobian = points.linearized(*split(values))
     expected = places.on(flame_forward(model, shape, frame), model.faces)
-    np.testing.assert_allclose(positions, expected, atol=1e-12)
+    assert_allclose(positions, expected, atol=1e-12)
     for column, step in enumerate(1e-5 * np.eye(len(values))):
         sides = [points.positions(*split(values + s)) for s in (step, -step)]
-        np.testing.assert_allclose(jacobian[..., column], (sides[0] - sides[1]) / 2e-5, atol=5e-6)
+        assert_allclose(jacobian[..., column], (sides[0] - sides[1]) / 2e-5, atol=5e-6)
 
 
 def in_cameras_world(fit, timestep):
@@ -291,7 +292,7 @@ def test_rays_that_all_miss_give_a_start(head):
         observed = observed_landmarks(found, world, np.ones(30, bool))
         start = rigid_start(points, observed)
     assert (observed.weight > 0).all()
-    np.testing.assert_allclose(start[-3:], (observed.position - points).mean(0), atol=3)
+    assert_allclose(start[-3:], (observed.position - points).mean(0), atol=3)
     assert norm(start[:3]) <= np.pi + 1e-9
 
 
@@ -310,7 +311,7 @@ def test_a_linear_model_without_joints_moves_rigidly():
     found = flame_forward(head.model, np.zeros(0), frame_of(fit))
     shaped = arrays["mean"] + arrays["expression"] @ [0.5, -1.0]
     lengths = [norm(mesh[:, None] - mesh[None], axis=2) for mesh in (found, shaped)]
-    np.testing.assert_allclose(*lengths, atol=1e-12)
+    assert_allclose(*lengths, atol=1e-12)
 
 
 def test_timesteps_without_a_face_are_interpolated():
@@ -318,7 +319,7 @@ def test_timesteps_without_a_face_are_interpolated():
     low = np.zeros(20)
     high = np.ones(20)
     found = interpolated({2: low, 6: high}, (1, 2, 3, 6, 7))
-    np.testing.assert_allclose([found[t][0] for t in (1, 2, 3, 6, 7)], [0, 0, 0.25, 1, 1])
+    assert_allclose([found[t][0] for t in (1, 2, 3, 6, 7)], [0, 0, 0.25, 1, 1])
 
 
 # y of the world points down; the head faces -z; both are half a turn, but for the head's own
@@ -354,7 +355,7 @@ def test_the_world_says_nothing_of_heads_in_between(head, world):
     expected = meshes_of(head, interpolated(known, range(5)).values())
     turned, turn = moved(head, known.values(), WORLDS[world])
     found = interpolated(dict(zip(known, turned, strict=True)), range(5))
-    np.testing.assert_allclose(meshes_of(head, found.values()), expected @ turn.T, atol=2e-4)
+    assert_allclose(meshes_of(head, found.values()), expected @ turn.T, atol=2e-4)
 
 
 @pytest.mark.parametrize("world", WORLDS)
@@ -386,7 +387,7 @@ def test_nearest_points_of_a_mesh(head):
     points = default_rng(0).normal(0, 0.08, (40, 3))
     places, distance = nearest_points(head.model.v_template, head.model.faces, points)
     on = places.on(head.model.v_template, head.model.faces)
-    np.testing.assert_allclose(norm(on - points, axis=1), distance, atol=1e-9)
+    assert_allclose(norm(on - points, axis=1), distance, atol=1e-9)
     corners = head.model.v_template[head.model.faces]
     weights = default_rng(1).dirichlet([1, 1, 1], 60)
     samples = np.einsum("sk,fkc->fsc", weights, corners).reshape(-1, 3)

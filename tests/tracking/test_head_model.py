@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from flame.small_head import small_head, write_flame
+from numpy.testing import assert_allclose, assert_array_equal
 from refusal import refusal
 
 from stga_addon.tracking.head_model import read_head_model, shape_arrays, write_linear_model
@@ -86,7 +87,7 @@ def assert_same_surface(found, mean, faces, shapes, tolerance=2e-6):
     distance, row = cKDTree(there[..., 0]).query(expected[..., 0])
     assert len(there) == len(expected) == len(set(row.tolist()))
     assert distance.max() < 2 * tolerance
-    np.testing.assert_allclose(there[row], expected, atol=tolerance)
+    assert_allclose(there[row], expected, atol=tolerance)
 
 
 @pytest.mark.parametrize("sparse", [False, True], ids=["dense", "sparse"])
@@ -111,7 +112,7 @@ def test_a_glb_that_blender_exports(tmp_path, sparse):
     theirs = trimesh.load(tmp_path / "head.glb", process=False).to_geometry().vertices
     ours = read_head_model(tmp_path / "head.glb").model.v_template
     for one, other in ((ours.min(0), theirs.min(0)), (ours.max(0), theirs.max(0))):
-        np.testing.assert_allclose(one, other, atol=1e-6)
+        assert_allclose(one, other, atol=1e-6)
 
 
 @pytest.mark.slow
@@ -157,11 +158,11 @@ def test_shape_keys_become_a_linear_model(tmp_path):
     __import__("bpy").context.view_layer.update()
     write_linear_model(tmp_path / "head.npz", shape_arrays(*shape_key_model(head)))
     found = read_head_model(tmp_path / "head.npz").model
-    np.testing.assert_allclose(found.v_template, MESH.v_template + np.array([0, 0.3, 0]), atol=1e-6)
-    np.testing.assert_array_equal(found.faces, MESH.faces)
+    assert_allclose(found.v_template, MESH.v_template + np.array([0, 0.3, 0]), atol=1e-6)
+    assert_array_equal(found.faces, MESH.faces)
     assert (found.n_identity, found.n_expression) == (2, 4)
-    np.testing.assert_allclose(found.shapedirs[:, :, :5], SHAPES, atol=1e-6)
-    np.testing.assert_allclose(found.shapedirs[:, :, 5], 0, atol=1e-6)
+    assert_allclose(found.shapedirs[:, :, :5], SHAPES, atol=1e-6)
+    assert_allclose(found.shapedirs[:, :, 5], 0, atol=1e-6)
 
 
 @pytest.mark.filterwarnings("error::RuntimeWarning")

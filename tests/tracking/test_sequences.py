@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 from refusal import refusal
 
 from stga_addon.render.video import video_writer
@@ -159,7 +160,7 @@ def test_range_of_videos(tmp_path):
     footage = open_footage(tmp_path, tmp_path / "calibration", FrameRange(2, 12, 4, {"b": 2}))
     assert footage.timesteps == (2, 6, 10)
     found = [footage.cameras[1].image(t).mean() for t in (2, 6, 10)]
-    np.testing.assert_allclose(found, [105, 145, 185], atol=3)
+    assert_allclose(found, [105, 145, 185], atol=3)
 
 
 @pytest.mark.parametrize(
@@ -210,7 +211,7 @@ def test_names_that_are_protocols(tmp_path, monkeypatch, name):
     with video_writer(Path(name), 25) as append:
         append(np.full((48, 64, 3), 80, np.uint8))
     (again,) = open_footage(Path(name)).cameras
-    np.testing.assert_allclose(again.image(0), 80, atol=3)
+    assert_allclose(again.image(0), 80, atol=3)
 
 
 def test_two_cameras_without_calibration(tmp_path):

@@ -9,6 +9,7 @@ import pytest
 from flame.small_head import small_head, small_head_colors, subdivided, write_flame
 from numpy.linalg import norm
 from numpy.random import default_rng
+from numpy.testing import assert_allclose
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
@@ -239,10 +240,10 @@ def test_the_necks_end_is_drawn_over_the_chest(fine_head):
     assert moved.sum() > 20
     assert np.median(beside[moved & (sheet.height < 0.7)]) < 0.1
     assert after[:, 1].min() < shown[:, 1].min() + 0.03
-    np.testing.assert_allclose(after[sheet.height == 0], at[sheet.height == 0], atol=1e-12)
+    assert_allclose(after[sheet.height == 0], at[sheet.height == 0], atol=1e-12)
     behind = at[:, 2] < base[2] - 0.02
     assert behind.any()
-    np.testing.assert_allclose(after[behind], at[behind], atol=1e-12)
+    assert_allclose(after[behind], at[behind], atol=1e-12)
 
 
 @pytest.mark.slow
@@ -312,9 +313,9 @@ def test_turning_the_root_leaves_the_head_in_its_place(head):
     changed = with_root(frame.parameters, rotation, joints[NECK] - joints[ROOT])
     before, after = (flame_forward(model, np.zeros(0), own) for own in (frame, frame_of(changed)))
     apart = model.weights[:, ROOT] == 0
-    np.testing.assert_allclose(after[apart], before[apart], atol=1e-12)
+    assert_allclose(after[apart], before[apart], atol=1e-12)
     turned = axis_angle_matrices(frame_of(changed).rotation[None])[0]
-    np.testing.assert_allclose(turned, rotation, atol=1e-12)
+    assert_allclose(turned, rotation, atol=1e-12)
 
 
 def test_points_are_carried_by_the_triangles_that_they_lie_on(fine_head):
@@ -369,10 +370,10 @@ def test_a_take_on_its_torso_has_the_vertices_that_motion_and_cloth_say(fine_hea
         if bends:
             wanted[cloth] += (drape[cloth] + bent[timestep]) @ turn.T
         found = posed_mesh(followed.fit, followed.parameters[timestep], followed.offsets[timestep])
-        np.testing.assert_allclose(found, wanted, atol=1e-9)
+        assert_allclose(found, wanted, atol=1e-9)
     template = bare.model.v_template + followed.fit.static_offset
-    np.testing.assert_allclose(followed.fit.static_offset, static + drape * bends, atol=1e-15)
-    np.testing.assert_allclose(followed.fit.head.model.v_template, template, atol=1e-15)
+    assert_allclose(followed.fit.static_offset, static + drape * bends, atol=1e-15)
+    assert_allclose(followed.fit.head.model.v_template, template, atol=1e-15)
     motion = followed.motion
     assert motion.misfit == decided.misfit
     necks = [values[expressions + 3 : expressions + 6] for values in tracked.values()]

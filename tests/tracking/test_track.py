@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from command_line import stga
 from flame.small_head import write_flame
+from numpy.testing import assert_allclose, assert_array_equal
 from refusal import refusal
 from scipy.spatial.transform import Rotation
 
@@ -106,7 +107,7 @@ def test_the_capture_opens_and_projects_where_the_landmarks_were(recorded, head)
     assert_projects_as(capture, meshes, head.model.masks["face"])
     mesh = (folder / "out/meshes/00001.obj").read_text().splitlines()
     vertices = np.array([line.split()[1:] for line in mesh if line.startswith("v ")], float)
-    np.testing.assert_allclose(vertices, capture.mesh(1), atol=2e-6)
+    assert_allclose(vertices, capture.mesh(1), atol=2e-6)
     assert (folder / "out/contact_sheet.png").is_file()
     shares = [progress.share for progress in told]
     assert shares == sorted(shares)
@@ -143,8 +144,8 @@ def test_the_cameras_world_is_kept(recorded, capsys, head, scale, arguments):
     for view in capture.views["train"]:
         camera = filmed[f"cam{view.camera_index}"]
         turned = view.camera.world_to_camera[:3, :3]
-        np.testing.assert_allclose(view.camera.position, unit * camera.position, atol=1e-6)
-        np.testing.assert_allclose(turned, camera.world_to_camera[:3, :3], atol=1e-9)
+        assert_allclose(view.camera.position, unit * camera.position, atol=1e-6)
+        assert_allclose(turned, camera.world_to_camera[:3, :3], atol=1e-9)
     for timestep in (0, 3):
         missed = capture.mesh(timestep) - unit * world.apply(meshes[timestep])
         assert np.linalg.norm(missed[head.model.masks["face"]], axis=1).mean() < 2e-3
@@ -348,7 +349,7 @@ def test_detection_resumes_camera_by_camera(recorded):
     assert all(camera.confidence.all() for camera in found.values())
     camera = footage.cameras[0]
     written = read_camera(landmark_file(folder / "found", camera.name), camera)
-    np.testing.assert_array_equal(written.points, 1)
+    assert_array_equal(written.points, 1)
     two = np.array([[0.0, 0.0], [9.0, 9.0]])
     with refusal(r"camera cam0 sees 5 of 5 frames with two faces, the first at timestep 0"):
         detect_landmarks(footage, Counting([two, two + 30]), folder, Crew(Helpers(1)))
@@ -403,7 +404,7 @@ def test_a_canceled_run_ends_as_an_unbroken_one(tmp_path, head, monkeypatch):
         other = tmp_path / "resumed" / path.relative_to(tmp_path / "unbroken")
         if path.suffix == ".npz":  # an archive holds the time at which it was written
             for name, array in np.load(path).items():
-                np.testing.assert_array_equal(np.load(other)[name], array, f"{path}: {name}")
+                assert_array_equal(np.load(other)[name], array, f"{path}: {name}")
         else:
             assert path.read_bytes() == other.read_bytes(), path
 

@@ -9,6 +9,7 @@ from fractions import Fraction
 import numpy as np
 import pytest
 from capture.test_images import LEVELS, corners
+from numpy.testing import assert_allclose, assert_array_equal
 from PIL import Image
 from refusal import refusal
 
@@ -85,7 +86,7 @@ def shown(image):
     bits = levels > 125
     assert np.abs(levels - np.where(bits, 190, 60)).max() < 25, levels.round()
     first, second = np.split(bits, 2)
-    np.testing.assert_array_equal(first, ~second)
+    assert_array_equal(first, ~second)
     return int((first << np.arange(len(first))).sum())
 
 
@@ -206,7 +207,7 @@ def test_an_open_video_goes_to_a_helping_process(tmp_path):
     frames.image(0)
     there = pickle.loads(pickle.dumps(frames))
     for timestep in (1, 2):
-        np.testing.assert_array_equal(there.image(timestep), frames.image(timestep))
+        assert_array_equal(there.image(timestep), frames.image(timestep))
 
 
 def test_variable_frame_rate(tmp_path):
@@ -384,7 +385,7 @@ def test_colors_of_phones(tmp_path, name):
     )
     encode(path, [frame] * 4, codec, options, set_up=set_up)
     found = open_footage(path).cameras[0].image(0)[32, 32] / 255
-    np.testing.assert_allclose(found, expected, atol=0.025)
+    assert_allclose(found, expected, atol=0.025)
 
 
 @pytest.mark.parametrize(

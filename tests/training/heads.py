@@ -1,8 +1,6 @@
 """A FLAME capture drawn from true parameters, whose tracked parameters are off."""
 
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 from capture import factory
@@ -10,7 +8,6 @@ from PIL import Image
 
 from stga_addon.avatar.embedding import face_frames
 from stga_addon.avatar.lattice import lattice_splats
-from stga_addon.capture.model import Capture
 from stga_addon.capture.open import open_capture
 from stga_addon.render.render import render, to_uint8
 
@@ -25,7 +22,7 @@ NOISE = {"expr": 0.5, "rotation": 0.02, "jaw_pose": 0.04, "translation": 0.002}
 """What a tracker is off by where the error is 1: coefficients of some 2 mm, radians, meters."""
 
 
-def write_head(root: Path, error: float = 1.0) -> tuple[Capture, dict[int, np.ndarray]]:
+def write_head(root, error=1.0):
     """The ball in FLAME's format, and timestep -> mesh (V, 3) that its images show."""
     _, model = factory.write_flame_capture(root, TIMESTEPS, CAMERAS)
     factory.write_splits(
@@ -40,7 +37,7 @@ def write_head(root: Path, error: float = 1.0) -> tuple[Capture, dict[int, np.nd
     return open_capture(root, model), meshes
 
 
-def _entry(timestep: int, camera: int) -> dict[str, Any]:
+def _entry(timestep, camera):
     pose = factory.pose(PLACES[camera]).tolist()
     return factory.frame(
         timestep,
@@ -51,7 +48,7 @@ def _entry(timestep: int, camera: int) -> dict[str, Any]:
     )
 
 
-def _lose_track(root: Path, error: float) -> None:
+def _lose_track(root, error):
     """Disturb what was tracked, but for the test timestep.
 
     Of an error that all timesteps share nobody could tell whether it is the tracker's or the
@@ -71,7 +68,7 @@ def _lose_track(root: Path, error: float) -> None:
         np.savez(root / f"flame_param/{timestep:05d}.npz", **tracked)
 
 
-def _paint(capture: Capture) -> None:
+def _paint(capture):
     """Draw every view of the capture as it is tracked, over white, and its mask."""
     rng = np.random.default_rng(1)
     splats = lattice_splats(capture.neutral, capture.faces, order=3, sh_degree=0, opacity_logit=4.0)

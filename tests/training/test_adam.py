@@ -3,10 +3,11 @@
 import numpy as np
 import pytest
 import torch
+from numpy.testing import assert_allclose, assert_array_equal
 
 from stga_addon.capture.camera import Camera
 from stga_addon.training.optimize import adam
-from stga_addon.training.optimize.state import TrainState, new_state
+from stga_addon.training.optimize.state import new_state
 from stga_addon.training.settings import TrainingSettings
 
 from .toys import bits, random_splats, random_state
@@ -24,12 +25,12 @@ OPTIONS = adam.PLAIN._replace(
 )
 
 
-def set_gradients(state: TrainState, rng: np.random.Generator, scale: float = 1.0) -> None:
+def set_gradients(state, rng, scale=1.0):
     for array in state.gradients:
         array[:] = rng.normal(0, scale, array.shape)
 
 
-def separate_rows(state: TrainState) -> list[dict[str, torch.Tensor]]:
+def separate_rows(state):
     """Each row's parameters as float64 tensors of their own; the view-dependent color apart."""
     rows = []
     for n in range(len(state)):
@@ -76,19 +77,15 @@ def test_each_row_is_torchs_adam_with_its_own_history(seed, degree):
         average = torch.tensor(state.parameters.xyz[n], dtype=torch.float64)
         for count, value in enumerate(values, 1):
             average = average.lerp(value, max(0.2, 4 / (count + 3)))
-        np.testing.assert_allclose(
-            state.average.xyz[n], average, rtol=1e-5, atol=25 * RATES["xyz"] * 1e-5
-        )
+        assert_allclose(state.average.xyz[n], average, rtol=1e-5, atol=25 * RATES["xyz"] * 1e-5)
     for n, row in enumerate(rows):
         for name in ("xyz", "rotation", "log_scale", "opacity"):
             # 25 float32 steps of at most the rate each
             found = getattr(state.parameters, name)[n]
             wanted = row[name].detach()
-            np.testing.assert_allclose(found, wanted, rtol=1e-5, atol=25 * RATES[name] * 1e-5)
+            assert_allclose(found, wanted, rtol=1e-5, atol=25 * RATES[name] * 1e-5)
         color = torch.cat([row["sh"], row["sh_rest"]]).detach()
-        np.testing.assert_allclose(
-            state.parameters.sh[n], color, rtol=1e-5, atol=25 * RATES["sh"] * 1e-5
-        )
+        assert_allclose(state.parameters.sh[n], color, rtol=1e-5, atol=25 * RATES["sh"] * 1e-5)
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
@@ -101,9 +98,9 @@ def test_a_broken_gradient_leaves_its_row(bad):
     adam.step(state, np.arange(4, dtype=np.int32), RATES)
     after = bits(state)
     for part in ("parameters", "first", "second"):
-        np.testing.assert_array_equal(after[f"{part}/log_scale"][1], before[f"{part}/log_scale"][1])
+        assert_array_equal(after[f"{part}/log_scale"][1], before[f"{part}/log_scale"][1])
         rest = slice(12, None)  # bytes after the first coefficient's three floats
-        np.testing.assert_array_equal(after[f"{part}/sh"][2, rest], before[f"{part}/sh"][2, rest])
+        assert_array_equal(after[f"{part}/sh"][2, rest], before[f"{part}/sh"][2, rest])
         for row in (0, 2, 3):
             assert (after[f"{part}/log_scale"][row] != before[f"{part}/log_scale"][row]).any()
     for array in (*state.parameters, *state.first, *state.second):
@@ -126,14 +123,14 @@ def test_many_rows(ahead):
     }
     before = {name: array[rows].astype(float) for name, array in state.parameters._asdict().items()}
     adam.step(state, rows, RATES, adam.PLAIN._replace(ahead=np.float32(ahead)), sh_degree=1)
-    np.testing.assert_array_equal(state.steps[rows], counts)
+    assert_array_equal(state.steps[rows], counts)
     for name, value in before.items():
         gradient = getattr(state.gradients, name)[rows].astype(float)
         per_row = counts.reshape(-1, *[1] * (value.ndim - 1))
         first = 0.9 * old[f"first/{name}"] + 0.1 * gradient
         in_use = (..., slice(4), slice(None)) if name == "sh" else ...
         kept = getattr(state.first, name)[rows]
-        np.testing.assert_allclose(kept[in_use], first[in_use], rtol=1e-5, atol=1e-6)
+        assert_allclose(kept[in_use], first[in_use], rtol=1e-5, atol=1e-6)
         mean = ((1 - ahead) * first + ahead * gradient) / (1 - (1 - ahead) * 0.9**per_row)
         square = (0.999 * old[f"second/{name}"] + 0.001 * gradient**2) / (1 - 0.999**per_row)
         rate = np.full(value.shape[1:], RATES[name])

@@ -3,20 +3,18 @@
 import json
 import re
 import shutil
-from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
 import torch
 from command_line import stga
+from numpy.testing import assert_allclose, assert_array_equal, assert_equal
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from stga_addon.avatar.embedding import FaceFrames, face_frames, frame_backward
+from stga_addon.avatar.embedding import face_frames, frame_backward
 from stga_addon.avatar.file import Avatar, read_avatar
 from stga_addon.capture.images import read_view
 from stga_addon.capture.mesh_geometry import silhouette
@@ -27,7 +25,7 @@ from stga_addon.files import read_npz, write_npz
 from stga_addon.flame.forward import parameters_gradient
 from stga_addon.flame.sequence import read_motion, sequence_mesh, with_identity
 from stga_addon.jobs.finished_run import measure_run
-from stga_addon.progress import Cancelled, Progress, Report
+from stga_addon.progress import Cancelled
 from stga_addon.raster.cpu.layout import Parameters
 from stga_addon.report import report_run
 from stga_addon.tracking.folder import is_in_order
@@ -62,18 +60,18 @@ WHITE = np.ones(3, np.float32)
 
 
 @pytest.fixture(scope="module")
-def lost(tmp_path_factory: pytest.TempPathFactory) -> Made:
+def lost(tmp_path_factory):
     """Tracked a few millimeters and degrees off."""
     return write_head(tmp_path_factory.mktemp("lost"))
 
 
 @pytest.fixture(scope="module")
-def right(tmp_path_factory: pytest.TempPathFactory) -> Made:
+def right(tmp_path_factory):
     return write_head(tmp_path_factory.mktemp("right"), error=0.0)
 
 
 @pytest.fixture(scope="module")
-def person(right: Made) -> TrainedAvatar:
+def person(right):
     """An avatar whose training saw the right meshes."""
     capture = right[0]
     settings = quick_settings("global", iterations=300, lattice=1, sh_degree=0, sh_steps=())
@@ -89,20 +87,20 @@ def person(right: Made) -> TrainedAvatar:
     return TrainedAvatar(avatar, settings)
 
 
-def millimeters(capture: Capture, true: dict[int, np.ndarray]) -> np.ndarray:
+def millimeters(capture, true):
     """(T,) mean distance of a capture's vertices from where they should be."""
     away = [capture.mesh(timestep) - true[timestep] for timestep in TIMESTEPS]
     return 1000 * np.linalg.norm(away, axis=-1).mean(1)
 
 
-def test_a_finished_avatar_finds_the_head(person: TrainedAvatar, lost: Made) -> None:
+def test_a_finished_avatar_finds_the_head(person, lost):
     """Catches a gradient or a preconditioner with a wrong sign, axis or joint, steps that stop too
     early, and a drift of the last timestep, which is tracked right already."""
     capture, true = lost
     tracking = RefinedTracking(capture, "stga")
     stages = list[tuple[int, int]]()
 
-    def report(done: int, total: int) -> bool:
+    def report(done, total):
         stages.append((done, total))
         return False
 
@@ -120,9 +118,7 @@ def test_a_finished_avatar_finds_the_head(person: TrainedAvatar, lost: Made) -> 
         track_by_avatar(person, replace(capture, faces=capture.faces[:-1]))
 
 
-def test_a_timestep_begins_where_the_one_before_led(
-    person: TrainedAvatar, lost: Made, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_timestep_begins_where_the_one_before_led(person, lost, monkeypatch):
     """Catches tracking that begins anew at each timestep, and so never arrives where all of a take
     is off alike; and a start that is worse than as tracked."""
     capture, _ = lost
@@ -145,10 +141,10 @@ def test_a_timestep_begins_where_the_one_before_led(
         wanted = tracked[1][-1] + (0.004 if better else 0.0)
         track_by_avatar(person, capture, TIMESTEPS[:2])
         assert not starts[TIMESTEPS[0]].any()
-        np.testing.assert_allclose(starts[TIMESTEPS[1]], led if better else 0 * led, atol=1e-12)
+        assert_allclose(starts[TIMESTEPS[1]], led if better else 0 * led, atol=1e-12)
 
 
-def test_weights_that_leave_0_to_1_are_pulled_back(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_weights_that_leave_0_to_1_are_pulled_back(monkeypatch):
     """Catches a pull into the range of ARKit's shapes that counts as energy and not in its
     gradient, or the other way round: the search then ends where it begins. Against the minimum
     worked out by hand, where images say nothing."""
@@ -165,12 +161,10 @@ def test_weights_that_leave_0_to_1_are_pulled_back(monkeypatch: pytest.MonkeyPat
     pull = WEIGHT_EXCESS_SIGMA**-2
     expected = tracked.copy()
     expected[:2] = (precision * tracked[:2] + pull * np.array([1.0, 0.0])) / (precision + pull)
-    np.testing.assert_allclose(found, expected, atol=1e-6)
+    assert_allclose(found, expected, atol=1e-6)
 
 
-def test_without_masks_the_mesh_that_is_tried_cuts(
-    person: TrainedAvatar, lost: Made, tmp_path: Path
-) -> None:
+def test_without_masks_the_mesh_that_is_tried_cuts(person, lost, tmp_path):
     """Catches images cut by the very mesh whose place is sought, which say that it is right."""
     capture, true = lost
     views = []
@@ -189,9 +183,7 @@ def test_without_masks_the_mesh_that_is_tried_cuts(
     assert np.median(after[:-1] / before[:-1]) < 0.6
 
 
-def test_refined_meshes_cut_what_is_trained_on(
-    right: Made, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_refined_meshes_cut_what_is_trained_on(right, tmp_path, monkeypatch):
     """Catches images without masks that are cut by the meshes before refinement, also those read
     ahead or kept from then: the head would lose a rim, and get one of the backdrop."""
     capture = right[0]
@@ -201,20 +193,17 @@ def test_refined_meshes_cut_what_is_trained_on(
     step = Trainer.step
     moved = []
 
-    def aside(
-        trained: TrainedAvatar, shown: Capture, timesteps: list[int], *_: Any
-    ) -> AvatarTracking:
-        assert shown.flame is not None
+    def aside(trained, shown, timesteps, *_):
         values = np.stack([shown.flame.frame(timestep).parameters for timestep in timesteps])
         values[:, -3:] += 0.02
         none = np.zeros((len(values), 3))
         return AvatarTracking(tuple(timesteps), values, none[:, 0], none, none[:, 0], np.eye(1))
 
-    def note(trainer: Trainer, view: Any, image: Any, share: float, mask: Any, mesh: Any) -> Any:
+    def note(trainer, view, image, share, mask, mesh):
         found = step(trainer, view, image, share, mask, mesh)
         mesh = trainer.frames.mesh(view.timestep)
         inside = silhouette(mesh, capture.faces, view.camera)
-        np.testing.assert_array_equal(mask > 0, inside)
+        assert_array_equal(mask > 0, inside)
         moved.append(np.abs(mesh - capture.mesh(view.timestep)).max() > 0.01)
         return found
 
@@ -228,12 +217,12 @@ def test_refined_meshes_cut_what_is_trained_on(
 
 @pytest.mark.parametrize(("allowed_s", "most"), [(0.5, 2), (30.0, 6), (1000.0, 30)])
 def test_time_is_kept_to(
-    allowed_s: float,
-    most: int,
-    right: Made,
-    person: TrainedAvatar,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+    allowed_s,
+    most,
+    right,
+    person,
+    monkeypatch,
+):
     """Catches a time that is judged by the first timestep, which costs a fifth of the others, and
     matrices of each timestep that nobody reads."""
     clock = [0.0]
@@ -241,10 +230,10 @@ def test_time_is_kept_to(
     class Slow:
         solved = 0
 
-        def __init__(self, *_: Any) -> None:
+        def __init__(self, *_):
             clock[0] = Slow.solved = 0
 
-        def solve(self, timestep: int) -> tuple[np.ndarray, np.ndarray, float]:
+        def solve(self, timestep):
             clock[0] += 5.0 if Slow.solved else 1.0
             Slow.solved += 1
             return np.full(23, timestep, float), np.eye(23), 0.0
@@ -261,7 +250,7 @@ def test_time_is_kept_to(
     assert other.information.shape == (30, 23, 23)
 
 
-def test_a_long_take_tracks_no_longer_than_it_trains(right: Made) -> None:
+def test_a_long_take_tracks_no_longer_than_it_trains(right):
     """Catches 1,800 frames that a preset of 500 iterations tracks one by one, and short takes that
     are no longer tracked as a whole."""
     capture = right[0]
@@ -280,17 +269,17 @@ def test_a_long_take_tracks_no_longer_than_it_trains(right: Made) -> None:
     assert len(tracked_timesteps(settings, wide, range(90))) == 25
 
 
-def test_timesteps_between_change_as_their_neighbors(lost: Made) -> None:
+def test_timesteps_between_change_as_their_neighbors(lost):
     """Catches changes that go to the wrong timesteps where a budget allows only some."""
     tracking = RefinedTracking(lost[0], "stga")
     some = tracking.tracked[[0, 3]] + np.array([[1.0], [4.0]])
     found = AvatarTracking((0, 5), some, np.zeros(2), np.zeros((2, 3)), np.ones(0), np.eye(1))
     tracking.take(found, TIMESTEPS[:-1])
     change = tracking.parameters[:, :-3] - tracking.tracked
-    np.testing.assert_allclose(change[:, 0], [1, 2, 3, 4, 0])
+    assert_allclose(change[:, 0], [1, 2, 3, 4, 0])
 
 
-def test_a_change_near_half_a_turn_is_one_of_rotations(lost: Made) -> None:
+def test_a_change_near_half_a_turn_is_one_of_rotations(lost):
     """Catches axis-angles that are subtracted, where the head faces -z: 3° between the timesteps
     that are tracked became turns by up to half a turn."""
     tracking = RefinedTracking(lost[0], "stga")
@@ -309,10 +298,10 @@ def test_a_change_near_half_a_turn_is_one_of_rotations(lost: Made) -> None:
     tracking.take(found, TIMESTEPS[:-1])
     for row, turn in enumerate(turns[:4]):
         now = Rotation.from_rotvec(tracking.parameters[row, -21:-18])
-        np.testing.assert_allclose((now * turn.inv()).as_rotvec(), tilt, atol=1e-9)
+        assert_allclose((now * turn.inv()).as_rotvec(), tilt, atol=1e-9)
 
 
-def test_time_says_what_images_do_not(right: Made) -> None:
+def test_time_says_what_images_do_not(right):
     """Catches jitter in depth that a single camera does not see, motion that it does see but that
     is smoothed away, a blurred cut, and shifts and poses that change places."""
     model = right[0].flame.model
@@ -329,14 +318,12 @@ def test_time_says_what_images_do_not(right: Made) -> None:
     found = AvatarTracking(tuple(range(count)), values, none, shift, none, each)
     smooth = found.smoothed(model)
     assert smooth.parameters[:, -1].std() < 0.6 * values[:, -1].std()
-    np.testing.assert_allclose(smooth.parameters[:, 1:-1], values[:, 1:-1], atol=1e-5)
-    np.testing.assert_allclose(smooth.parameters[:, 0], values[:, 0], atol=0.05)
-    np.testing.assert_allclose(smooth.shift, shift, atol=1e-5)
+    assert_allclose(smooth.parameters[:, 1:-1], values[:, 1:-1], atol=1e-5)
+    assert_allclose(smooth.parameters[:, 0], values[:, 0], atol=0.05)
+    assert_allclose(smooth.shift, shift, atol=1e-5)
 
 
-def differences(
-    tracking: RefinedTracking, timestep: int, loss: Callable[[], float], step: float
-) -> np.ndarray:
+def differences(tracking, timestep, loss, step):
     """(P,) central differences of a loss; step: meters by which vertices move, about."""
     row = tracking.sequence.timesteps.index(timestep)
     before = tracking.parameters.copy()
@@ -353,7 +340,7 @@ def differences(
     return np.array(found)
 
 
-def test_the_gradient_from_splats_to_parameters(lost: Made) -> None:
+def test_the_gradient_from_splats_to_parameters(lost):
     """Catches a sign, a transposed rotation, a joint or a component taken for another, and what
     turns or grows a splat left out: against differences of a made-up loss of where splats are and
     how they lie."""
@@ -370,10 +357,10 @@ def test_the_gradient_from_splats_to_parameters(lost: Made) -> None:
         for more in ((), (3,))
     )
 
-    def frames() -> FaceFrames:
+    def frames():
         return face_frames(tracking.mesh(3), capture.faces, capture.neutral)
 
-    def loss() -> torch.Tensor:
+    def loss():
         origin, turn, scale = (torch.from_numpy(getattr(frames(), name)[face]) for name in NAMES)
         w, x, y, z = (rotation / rotation.norm(dim=1, keepdim=True)).unbind(1)
         own = torch.stack(
@@ -404,25 +391,25 @@ def test_the_gradient_from_splats_to_parameters(lost: Made) -> None:
     assert capture.flame is not None
     found = parameters_gradient(with_identity(capture.flame).model, tracking.frame(3), by_vertex)
     expected = differences(tracking, 3, lambda: loss().item(), 1e-6)
-    np.testing.assert_allclose(found, expected, rtol=1e-3, atol=1e-4 * np.abs(expected).max())
+    assert_allclose(found, expected, rtol=1e-3, atol=1e-4 * np.abs(expected).max())
 
 
 @pytest.fixture(scope="module")
-def run_folder(lost: Made, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def run_folder(lost, tmp_path_factory):
     """An unbroken run."""
     out = tmp_path_factory.mktemp("tracked") / "run"
     train_run(lost[0], out, make_run(lost[0]))
     return out
 
 
-def make_run(capture: Capture, **changes: Any) -> Run:
+def make_run(capture, **changes):
     ours = {"iterations": 40, "lattice": 1, "tracking": True}
     changes = {**ours, "driven_offsets": ("strain_position", "strain_scale"), **changes}
     settings = quick_settings("global", **changes)
     return Run(capture.root, capture.root / "model.npz", "vhap", settings)
 
 
-def test_what_it_brings(lost: Made, tmp_path: Path) -> None:
+def test_what_it_brings(lost, tmp_path):
     """Catches a training that goes on with the meshes of before, and tracking that leads nowhere:
     meshes come closer to where they should be, and so do pictures of an unseen view."""
     capture, true = lost
@@ -439,9 +426,7 @@ def test_what_it_brings(lost: Made, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("held_out", ["camera", "timesteps"])
-def test_tracking_is_undone_where_what_is_left_out_loses(
-    held_out: str, right: Made, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_tracking_is_undone_where_what_is_left_out_loses(held_out, right, tmp_path, monkeypatch):
     """Catches tracking that is judged by images that it has fitted, by the wrong sign, or kept
     where the heads were right before; here it moves them by 4 mm."""
     capture = right[0]
@@ -450,10 +435,7 @@ def test_tracking_is_undone_where_what_is_left_out_loses(
         capture = replace(capture, views={**capture.views, "val": ()})
         monkeypatch.setattr(session, "LEFT_OUT_INTERVAL", 2)
 
-    def astray(
-        trained: TrainedAvatar, shown: Capture, timesteps: list[int], *_: Any
-    ) -> AvatarTracking:
-        assert shown.flame is not None
+    def astray(trained, shown, timesteps, *_):
         seen = (view for views in shown.views.values() for view in views)
         given.append((tuple(timesteps), {view.camera_index for view in seen}))
         values = np.stack([shown.flame.frame(timestep).parameters for timestep in timesteps])
@@ -467,7 +449,7 @@ def test_tracking_is_undone_where_what_is_left_out_loses(
     assert given == [(tracked, {0, 1, 2, 3})]  # and no timesteps of other splits afterwards
     checkpoint = read_checkpoint(tmp_path)
     before = RefinedTracking(capture, "stga").parameters
-    np.testing.assert_array_equal(checkpoint.tracking, before)
+    assert_array_equal(checkpoint.tracking, before)
     said = "\n".join(report_run(tmp_path))
     assert re.search(r"left out lose \d\.\d\d dB, so heads stay as they were tracked", said)
     # timesteps in no order have no neighbors that could say anything
@@ -482,12 +464,12 @@ def test_tracking_is_undone_where_what_is_left_out_loses(
     assert read_checkpoint(tmp_path / "b").rounds == 2
 
 
-def stop_in_tracking(turn: int) -> Report:
+def stop_in_tracking(turn):
     """Stops a training in the middle of its avatar's tracking for the nth time: first of training
     timesteps, then of unseen ones."""
     begun = []
 
-    def report(progress: Progress) -> bool:
+    def report(progress):
         if progress.stage.startswith("Tracking by the avatar: 0 of"):
             begun.append(progress)
         in_the_middle = turn < 2 and "Tracking by the avatar: 2 of" in progress.stage
@@ -501,9 +483,7 @@ def stop_in_tracking(turn: int) -> Report:
     [stop_at(31), stop_in_tracking(1), stop_in_tracking(2)],
     ids=["training", "halfway", "at the end"],
 )
-def test_stopped_and_resumed_is_the_unbroken_run(
-    stops: Report, lost: Made, run_folder: Path, tmp_path: Path
-) -> None:
+def test_stopped_and_resumed_is_the_unbroken_run(stops, lost, run_folder, tmp_path):
     """Catches anything of the tracking that a step depends on and a checkpoint does not hold, a
     step on old meshes before they are tracked, unseen timesteps that stay untracked for ever, and
     evaluations or avatars that an unbroken run would not have."""
@@ -514,24 +494,22 @@ def test_stopped_and_resumed_is_the_unbroken_run(
     train_run(capture, tmp_path, make_run(capture), resume=True)
     ours, theirs = (read_checkpoint(folder) for folder in (tmp_path, run_folder))
     assert ours.rounds == theirs.rounds == 2
-    np.testing.assert_array_equal(ours.tracking, theirs.tracking)
+    assert_array_equal(ours.tracking, theirs.tracking)
     assert_same_state(tmp_path, run_folder)
     moved, expected = (
         checkpoint.state.driven_offsets["strain_position"] for checkpoint in (ours, theirs)
     )
     assert np.abs(expected.value).max() > 0
-    np.testing.assert_array_equal(moved.value, expected.value)
+    assert_array_equal(moved.value, expected.value)
     for name in ("avatar.npz", "tracking.npz", "residuals.npz"):
         left, right = (read_npz(folder / name) for folder in (tmp_path, run_folder))
-        np.testing.assert_equal(left, right)
+        assert_equal(left, right)
     assert {path.name for path in tmp_path.iterdir()} == {p.name for p in run_folder.iterdir()}
     lines, expected_lines = (without_times(read_metrics(f)) for f in (tmp_path, run_folder))
     assert lines == expected_lines
 
 
-def test_quality_is_measured_with_and_without_fitted_heads(
-    lost: Made, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_quality_is_measured_with_and_without_fitted_heads(lost, tmp_path, monkeypatch):
     """Catches heads fitted to held-out images in a figure that is not called so, also by `stga
     eval`, and fitted heads that are lost where the last state is not the kept one."""
     capture = lost[0]
@@ -548,11 +526,10 @@ def test_quality_is_measured_with_and_without_fitted_heads(
         assert "psnr_fitted_heads" not in before
         assert {"ssim_fitted_heads", "detail_difference_fitted_heads"} <= last.keys()
         refined, plain = (with_refined_tracking(capture, out, fitted=f) for f in (True, False))
-        np.testing.assert_array_equal(plain.mesh(3), capture.mesh(3))
+        assert_array_equal(plain.mesh(3), capture.mesh(3))
         assert np.abs(refined.mesh(3) - capture.mesh(3)).max() > 1e-4
         avatar = read_avatar(out / "avatar.npz")
         found, fitted = measure_run(out, avatar, capture, "val")
-        assert fitted is not None
         assert fitted.psnr == pytest.approx(last["psnr_fitted_heads"], abs=0.005)
         assert fitted.psnr > found.psnr
         line = read_metrics(out)[number - 1]
@@ -562,9 +539,7 @@ def test_quality_is_measured_with_and_without_fitted_heads(
 
 
 @pytest.mark.parametrize("timesteps", [(0, 2, 3), (0, 2)])
-def test_a_short_take_is_checked_or_called_unchecked(
-    timesteps: tuple[int, ...], right: Made, tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_short_take_is_checked_or_called_unchecked(timesteps, right, tmp_path, caplog):
     """Catches tracking that is kept without a check, and without a warning, in short takes."""
     views = right[0].views["train"]
     shown = tuple(view for view in views if view.timestep in timesteps)
@@ -577,7 +552,7 @@ def test_a_short_take_is_checked_or_called_unchecked(
     assert ("is kept unchecked" in caplog.text) == (len(timesteps) < 3)
 
 
-def test_a_run_and_its_checkpoint_must_agree(lost: Made, run_folder: Path, tmp_path: Path) -> None:
+def test_a_run_and_its_checkpoint_must_agree(lost, run_folder, tmp_path):
     """Catches a run that goes on with tracked meshes after it was trained on refined ones."""
     run = shutil.copytree(run_folder, tmp_path / "run")
     with pytest.raises(StgaError, match="was begun with other settings"):
@@ -594,9 +569,7 @@ def test_a_run_and_its_checkpoint_must_agree(lost: Made, run_folder: Path, tmp_p
         (np.full((5, 20), np.nan), "tracking/parameters holds a value that is not finite"),
     ],
 )
-def test_damaged_checkpoints(
-    run_folder: Path, tmp_path: Path, value: np.ndarray, says: str
-) -> None:
+def test_damaged_checkpoints(run_folder, tmp_path, value, says):
     """Catches an array that training would go on with to nonsense."""
     arrays = read_npz(run_folder / "checkpoint.npz")
     write_npz(tmp_path / "checkpoint.npz", {**arrays, "tracking/parameters": value})
@@ -604,7 +577,7 @@ def test_damaged_checkpoints(
         read_checkpoint(tmp_path)
 
 
-def test_the_runs_capture_has_the_refined_meshes(lost: Made, right: Made, run_folder: Path) -> None:
+def test_the_runs_capture_has_the_refined_meshes(lost, right, run_folder):
     """Catches a quality on other meshes than trained on, and meshes of another capture."""
     capture, _ = lost
     checkpoint = read_checkpoint(run_folder)
@@ -613,38 +586,34 @@ def test_the_runs_capture_has_the_refined_meshes(lost: Made, right: Made, run_fo
     tracking.parameters = checkpoint.tracking
     shown = with_refined_tracking(capture, run_folder)
     for timestep in TIMESTEPS:
-        np.testing.assert_allclose(shown.mesh(timestep), tracking.mesh(timestep), atol=1e-12)
+        assert_allclose(shown.mesh(timestep), tracking.mesh(timestep), atol=1e-12)
         assert np.abs(shown.mesh(timestep) - capture.mesh(timestep)).max() > 1e-4
     other = with_refined_tracking(right[0], run_folder)
-    np.testing.assert_array_equal(other.mesh(2), right[0].mesh(2))
+    assert_array_equal(other.mesh(2), right[0].mesh(2))
     assert with_refined_tracking(capture, run_folder.parent) is capture
 
 
-def test_the_file_is_a_motion(lost: Made, run_folder: Path) -> None:
+def test_the_file_is_a_motion(lost, run_folder):
     """Catches a file that neither `render --motion` nor Blender's Apply Motion could play."""
     capture, _ = lost
-    assert capture.flame is not None
     motion = read_motion(run_folder / "tracking.npz", capture.flame.model)
     shown = with_refined_tracking(capture, run_folder)
     assert motion.timesteps == TIMESTEPS
     for timestep in TIMESTEPS:
-        np.testing.assert_allclose(
-            sequence_mesh(motion, timestep), shown.mesh(timestep), atol=1e-12
-        )
+        assert_allclose(sequence_mesh(motion, timestep), shown.mesh(timestep), atol=1e-12)
 
 
 def test_commands_use_the_refined_meshes(
-    run_folder: Path,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-    caplog: pytest.LogCaptureFixture,
-) -> None:
+    run_folder,
+    tmp_path,
+    capsys,
+    caplog,
+):
     """Catches a command that opens a run's capture past `refined`."""
     best = max(line["psnr"] for line in read_metrics(run_folder))
     assert stga("eval", run_folder) == 0
     found = re.search(r"PSNR ([\d.]+) dB", capsys.readouterr().out)
     # the avatar that is written lacks offsets that do not show
-    assert found is not None
     assert float(found[1]) == pytest.approx(best, abs=0.005)
     root = read_run(run_folder).capture
     tracked = open_capture(root, root / "model.npz")
@@ -678,11 +647,11 @@ def test_commands_use_the_refined_meshes(
         assert np.abs(np.diff(np.stack(pictures).astype(int), axis=0)).max() <= 2
 
 
-def read_bytes(folder: Path) -> dict[str, bytes]:
+def read_bytes(folder):
     return {path.name: path.read_bytes() for path in folder.iterdir()}
 
 
-def test_damaged_files(lost: Made, run_folder: Path, tmp_path: Path) -> None:
+def test_damaged_files(lost, run_folder, tmp_path):
     """Catches a traceback for a file that was written by something else."""
     arrays = read_npz(run_folder / "tracking.npz")
     for name, value, says in (
@@ -694,9 +663,7 @@ def test_damaged_files(lost: Made, run_folder: Path, tmp_path: Path) -> None:
             with_refined_tracking(lost[0], tmp_path)
 
 
-def test_a_run_that_refines_nothing_leaves_nothing(
-    lost: Made, run_folder: Path, tmp_path: Path
-) -> None:
+def test_a_run_that_refines_nothing_leaves_nothing(lost, run_folder, tmp_path):
     """Catches a file of the run before, which the new avatar would be shown with."""
     shutil.copy(run_folder / "tracking.npz", tmp_path)
     train_run(lost[0], tmp_path, make_run(lost[0], tracking=False, iterations=3))
@@ -704,12 +671,12 @@ def test_a_run_that_refines_nothing_leaves_nothing(
 
 
 def test_where_it_cannot_work(
-    toy: Capture,
-    lost: Made,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+    toy,
+    lost,
+    tmp_path,
+    capsys,
+    monkeypatch,
+):
     """Catches a traceback without parameters, and a GPU on which nothing is refined."""
     with pytest.raises(StgaError, match="is not tracked with FLAME"):
         Trainer(toy, quick_settings("global", tracking=True), {})

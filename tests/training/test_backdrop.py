@@ -1,16 +1,15 @@
 """Images without what lies behind the head: by masks, by the mesh, over random colors."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.testing import assert_array_equal
 from PIL import Image, ImageDraw
 from scipy.ndimage import binary_dilation, binary_erosion
 
 from stga_addon.capture.images import read_image, read_mask, read_view
 from stga_addon.capture.mesh_geometry import rasterize
-from stga_addon.capture.model import Capture
 from stga_addon.raster.cpu.image_loss import change_background
 from stga_addon.raster.cpu.rasterize import frames_in_camera
 from stga_addon.training.evaluate.metrics import read_evaluation_view
@@ -30,13 +29,13 @@ SIZE = 80
 GREEN = (0.0, 1.0, 0.0)
 
 
-def room() -> np.ndarray:
+def room():
     """(SIZE, SIZE, 3) levels of a wall in shades and colors."""
     y, x = np.mgrid[:SIZE, :SIZE] / SIZE
     return np.stack([60 + 120 * x, 200 - 100 * y, 90 + 60 * np.sin(3 * x + 2 * y)], -1)
 
 
-def person() -> tuple[np.ndarray, np.ndarray]:
+def person():
     """Levels (SIZE, SIZE, 3), and coverage in 0…1 with an edge of six pixels, as of hair."""
     y, x = np.mgrid[:SIZE, :SIZE]
     distance = np.hypot(x - 38, y - 42)
@@ -61,19 +60,17 @@ def test_masks_of_one_value(level):
     """Catches a division by zero where a mask shows nothing or everything."""
     image = room().astype(np.uint8)
     expected = image if level else np.broadcast_to(255 * np.array(GREEN), image.shape)
-    np.testing.assert_array_equal(
-        over_color(image, np.full((SIZE, SIZE), level, np.uint8), GREEN), expected
-    )
+    assert_array_equal(over_color(image, np.full((SIZE, SIZE), level, np.uint8), GREEN), expected)
 
 
-def same_but_for_the_edge(found: np.ndarray, expected: np.ndarray) -> bool:
+def same_but_for_the_edge(found, expected):
     """Whether both are the same but for two pixels outside of the outline, or one inside."""
     near = binary_dilation(expected, np.ones((5, 5)))
     core = binary_erosion(expected, np.ones((3, 3)))
     return bool(core.any() and not near.all() and (found <= near).all() and (found >= core).all())
 
 
-def in_a_room(capture: Capture, folder: Path, keeps_masks: bool) -> Capture:
+def in_a_room(capture, folder, keeps_masks):
     """The capture with stripes in place of its background."""
 
     def repaint(view):
@@ -101,16 +98,13 @@ def test_what_is_trained_and_evaluated_is_what_masks_show(toy, tmp_path):
     walled = in_a_room(toy, tmp_path, keeps_masks=True)
     settings = make_settings(iterations=1, backdrop="masked")
     prepare = image_preparation(walled, settings)
-    assert prepare is not None
     for plain, view in zip(toy.views["val"], walled.views["val"], strict=True):
         _, expected, mask = read_view(plain)
         trained, kept = prepare(*read_view(view))
         inside = (mask == 0) | (mask == 255)
         assert np.abs(trained.astype(int) - expected)[inside].max() <= 1
-        np.testing.assert_array_equal(kept, mask)
-        np.testing.assert_array_equal(
-            read_evaluation_view(walled, view, backdrop="masked").target, trained
-        )
+        assert_array_equal(kept, mask)
+        assert_array_equal(read_evaluation_view(walled, view, backdrop="masked").target, trained)
     assert image_preparation(walled, replace(settings, backdrop="plain")) is None
 
 
@@ -123,10 +117,8 @@ def test_without_masks_the_mesh_is_the_mask(toy, tmp_path):
     assert made is not None
     mesh = rasterize(np.asarray(walled.mesh(view.timestep)), walled.faces, small.camera)[0] >= 0
     assert same_but_for_the_edge(made > 0, mesh)
-    np.testing.assert_array_equal(
-        found[made == 0], np.broadcast_to([0, 255, 0], found[made == 0].shape)
-    )
-    np.testing.assert_array_equal(found[made == 255], image[made == 255])
+    assert_array_equal(found[made == 0], np.broadcast_to([0, 255, 0], found[made == 0].shape))
+    assert_array_equal(found[made == 255], image[made == 255])
 
 
 def test_exchanged_background_is_the_composite_over_the_new_one():
@@ -145,7 +137,7 @@ def test_exchanged_background_is_the_composite_over_the_new_one():
     assert np.abs(out - expected).max() <= 1.01
 
 
-def transmittance_error(capture: Capture, random_background: bool) -> float:
+def transmittance_error(capture, random_background):
     """Mean square of held-out alpha − mask, trained shortly on a white head before white."""
     trainer = Trainer(
         capture, quick_settings("global", lattice=1, random_background=random_background), {}
@@ -175,4 +167,4 @@ def test_alpha_becomes_the_mask(toy):
         trainer = Trainer(toy, quick_settings("global", random_background=random_background), {})
         trainer.step(view, read_image(view), 0.0)
         states.append(trainer.state.splats().sh)
-    np.testing.assert_array_equal(*states)
+    assert_array_equal(*states)

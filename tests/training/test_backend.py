@@ -1,14 +1,11 @@
 """The seam between the trainer and what holds the splats."""
 
-from collections.abc import Collection
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
 
 from stga_addon.capture.images import read_image, read_mask
-from stga_addon.capture.model import Capture
 from stga_addon.training.optimize import make_backend, trainer
 from stga_addon.training.optimize.backend import Backend
 from stga_addon.training.optimize.trainer import Trainer
@@ -22,25 +19,25 @@ class Far:
     """A backend whose splats are elsewhere: what the seam has no method for is not there, columns
     are copies, and reading everything is forbidden."""
 
-    def __init__(self, real: Any) -> None:
+    def __init__(self, real):
         self.real = real
 
-    def __getattr__(self, name: str) -> Any:
+    def __getattr__(self, name):
         if name not in METHODS - {"state"}:
             raise AssertionError(f"{name} is asked for")
         return getattr(self.real, name)
 
-    def __len__(self) -> int:
+    def __len__(self):
         return len(self.real)
 
-    def columns(self, names: Collection[str]) -> dict[str, np.ndarray]:
+    def columns(self, names):
         found = {name: array.copy() for name, array in self.real.columns(names).items()}
         for array in found.values():
             array.setflags(write=False)
         return found
 
 
-def trained(capture: Capture) -> Trainer:
+def trained(capture):
     """Trained until every change of the splats had its turn."""
     changes = {"density_interval": 3, "density_span": (0.0, 1.0), "stray_reset_interval": 2}
     settings = quick_settings("global", lattice=1, stray_limit=0.05, growth=0.6, **changes)
@@ -61,7 +58,7 @@ def test_a_training_needs_no_more_than_the_seam(toy, monkeypatch):
     capture = replace(toy, views={"train": views})
     near = trained(capture)
 
-    def far(*given: Any) -> Far:
+    def far(*given):
         return Far(make_backend.make_backend(*given))
 
     monkeypatch.setattr(trainer, "make_backend", far)

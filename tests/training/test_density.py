@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 from avatar.conftest import splats_of
+from numpy.testing import assert_allclose, assert_array_equal
 from scipy.spatial.transform import Rotation
 
 from stga_addon.capture.camera import Camera
@@ -11,7 +12,7 @@ from stga_addon.raster.cpu.autograd import render_differentiable
 from stga_addon.raster.cpu.layout import Parameters
 from stga_addon.training.optimize.change import Turn
 from stga_addon.training.optimize.density import DensityControl
-from stga_addon.training.optimize.state import TrainState, arrays_of, new_state
+from stga_addon.training.optimize.state import arrays_of, new_state
 
 from .toys import Rows, bits, random_state
 
@@ -21,7 +22,7 @@ MIN_OPACITY = 0.02
 FAINT_LOGIT = float(np.log(MIN_OPACITY / (1 - MIN_OPACITY)))
 
 
-def busy_state(listed: list[int]) -> TrainState:
+def busy_state(listed):
     """Forty splats on six triangles; the listed ones have a screen gradient, in this order."""
     state = random_state(COUNT, FACES)
     state.face[:] = np.arange(COUNT) % FACES
@@ -32,7 +33,7 @@ def busy_state(listed: list[int]) -> TrainState:
     return state
 
 
-def control(state: TrainState, budget: int = 1000, share: float = 1.0, seed: int = 0) -> TrainState:
+def control(state, budget=1000, share=1.0, seed=0):
     rows = Rows(state)
     density = DensityControl(1, (0.0, 1.0), split_share=share, growth=0.0, seed=seed)
     density.apply(rows, Turn(0, 0.5, initial_count=len(state) + budget))
@@ -49,17 +50,15 @@ def test_survivors_keep_everything_and_children_what_steadies_them():
     assert len(new) == COUNT + 3
     for name, old in before.items():
         if name not in ("screen_gradient", "gradient_count"):
-            np.testing.assert_array_equal(after[name][: COUNT - 3], old[survivors], err_msg=name)
+            assert_array_equal(after[name][: COUNT - 3], old[survivors], err_msg=name)
     parents = np.tile(listed, 2)  # in the order of their screen_gradient
     for name, array in arrays_of(new).items():
         if name.startswith("first"):
             assert not array[COUNT - 3 :].any()
         elif name.startswith(("second", "steps")):
-            np.testing.assert_array_equal(
-                after[name][COUNT - 3 :], before[name][parents], err_msg=name
-            )
+            assert_array_equal(after[name][COUNT - 3 :], before[name][parents], err_msg=name)
     for value, average in zip(new.parameters, new.average, strict=True):
-        np.testing.assert_array_equal(value[COUNT - 3 :], average[COUNT - 3 :])
+        assert_array_equal(value[COUNT - 3 :], average[COUNT - 3 :])
     assert not new.screen_gradient.any()
     assert not new.gradient_count.any()
     assert {len(array) for array in arrays_of(new).values()} == {COUNT + 3}
@@ -86,7 +85,7 @@ def test_children_stand_on_either_side_along_the_longest_axis():
         pair = children.rows(np.array([n, n + 4]))
         assert (pair.face == parents.face[row]).all()
         assert (pair.unbound == parents.unbound[row]).all()
-        np.testing.assert_allclose(pair.xyz.mean(0), parents.xyz[row], atol=1e-6)
+        assert_allclose(pair.xyz.mean(0), parents.xyz[row], atol=1e-6)
         longest = int(np.argmax(parents.log_scale[row]))
         axis = Rotation.from_quat(np.roll(parents.rotation[row], -1)).as_matrix()[:, longest]
         offset = (pair.xyz[1] - pair.xyz[0]) / np.linalg.norm(pair.xyz[1] - pair.xyz[0])
@@ -97,8 +96,8 @@ def test_children_stand_on_either_side_along_the_longest_axis():
         assert ((reach > 0.2) & (reach < 1.0)).all()
         shrunk = parents.log_scale[row] - pair.log_scale
         assert (shrunk[:, longest] > 0.2).all()
-        np.testing.assert_array_equal(np.delete(shrunk, longest, axis=1), 0)
-        np.testing.assert_array_equal(pair.sh, parents.sh[[row, row]])
+        assert_array_equal(np.delete(shrunk, longest, axis=1), 0)
+        assert_array_equal(pair.sh, parents.sh[[row, row]])
         assert (
             controlled.unseen_share[[COUNT - 4 + n, COUNT + n]] == state.unseen_share[row]
         ).all()

@@ -5,11 +5,11 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
 from stga_addon.avatar.file import Avatar
 from stga_addon.avatar.offsets import COLOR, OFFSETS, POSITION, SCALE, SIGNALS
 from stga_addon.capture.images import read_view
-from stga_addon.capture.model import Capture
 from stga_addon.render.render import render_avatar
 from stga_addon.training.optimize import adam
 from stga_addon.training.optimize.backend import RenderOptions
@@ -21,7 +21,7 @@ from stga_addon.training.run.checkpoint import trained_strain_range
 from .toys import quick_settings
 
 
-def squeezed(toy: Capture) -> Capture:
+def squeezed(toy):
     """The toy with a mesh that is narrower along other axes in each timestep."""
     scales = {t: 1 - 0.06 * np.random.default_rng(t).random(3) for t in toy.timesteps}
     return replace(toy, mesh=lambda timestep: toy.neutral * scales[timestep])
@@ -31,7 +31,7 @@ SIZES = {POSITION: 1e-3, SCALE: 0.1, COLOR: 0.1}
 """Of coefficients."""
 
 
-def make_trainer(capture: Capture, *offsets: str, seed: int = 0) -> Trainer:
+def make_trainer(capture, *offsets, seed=0):
     settings = quick_settings(
         "global", lattice=1, driven_offsets=offsets or tuple(OFFSETS), random_background=False
     )
@@ -83,11 +83,11 @@ def test_the_step_is_adams_on_the_gradient_of_the_loss(toy, name):
             changed[face, component, axis] += sign * step
             ends.append(loss(changed))
         slope = (ends[0] - ends[1]) / (2 * step)
-        np.testing.assert_allclose(gradient[face, component, axis], slope, rtol=0.1)
+        assert_allclose(gradient[face, component, axis], slope, rtol=0.1)
     rate = offset.rate_share * getattr(trainer.settings.rates, offset.rate)
     moved = (stepped - before)[strongest]
     # Adam's first step is nearly as long as the rate
-    np.testing.assert_allclose(np.abs(moved).max((1, 2)), rate, rtol=0.1)
+    assert_allclose(np.abs(moved).max((1, 2)), rate, rtol=0.1)
     assert (np.sign(moved) == -np.sign(gradient[strongest])).all()
 
 
@@ -132,11 +132,11 @@ def test_the_step_is_adam_in_float64():
             v = second[f] / (1 - 0.999 ** steps[f])
             value[f] -= offset.rate_share * rate * m / (np.sqrt(v) + epsilon)
             average[f] += max(ema_share, 4 / (steps[f] + 3)) * (value[f] - average[f])
-    np.testing.assert_array_equal(state.steps, steps)
+    assert_array_equal(state.steps, steps)
     assert steps.min() == 0
     for found, expected in ((state.value, value), (state.first, first), (state.average, average)):
-        np.testing.assert_allclose(found, expected, rtol=2e-4, atol=1e-6)
-    np.testing.assert_allclose(state.second, second, rtol=2e-4)
+        assert_allclose(found, expected, rtol=2e-4, atol=1e-6)
+    assert_allclose(state.second, second, rtol=2e-4)
 
 
 def test_tracking_follows_splats_that_move_and_grow(toy, monkeypatch):
@@ -185,7 +185,7 @@ def test_training_draws_what_the_avatar_draws(toy):
     )
     drawn = trainer.render(view, 0.0)
     expected = render_avatar(avatar, capture.mesh(view.timestep), view.camera, (1.0, 1.0, 1.0))
-    np.testing.assert_allclose(drawn, expected, atol=2e-5)
+    assert_allclose(drawn, expected, atol=2e-5)
     plain = replace(avatar, driven_offsets={})
     still = render_avatar(plain, capture.mesh(view.timestep), view.camera, (1.0, 1.0, 1.0))
     assert np.abs(still - drawn).max() > 0.005

@@ -7,10 +7,10 @@ import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
+from numpy.testing import assert_array_equal
 
 from stga_addon.errors import StgaError
 from stga_addon.training.optimize.state import arrays_of
@@ -26,12 +26,12 @@ from .toys import random_state
 FACES = 5
 
 
-def make_run(**changes: Any) -> Run:
+def make_run(**changes):
     settings = make_settings(iterations=9, **changes)
     return Run(Path("/data/head"), Path("/data/flame.npz"), "opencv", settings)
 
 
-def make_checkpoint() -> Checkpoint:
+def make_checkpoint():
     return Checkpoint(
         state=random_state(12, FACES),
         iteration=34,
@@ -46,7 +46,7 @@ def make_checkpoint() -> Checkpoint:
     )
 
 
-def edit_json(path: Path, **changes: Any) -> None:
+def edit_json(path, **changes):
     path.write_text(json.dumps({**json.loads(path.read_text()), **changes}))
 
 
@@ -93,7 +93,7 @@ def test_selection_round_trip(tmp_path):
     again = checkpoint_files.read_selection(tmp_path, FACES)
     assert list(again) == list(selection)
     for timestep, faces in selection.items():
-        np.testing.assert_array_equal(again[timestep], faces)
+        assert_array_equal(again[timestep], faces)
         assert again[timestep].dtype == bool
     other = r"selection\.npz: '00000' is bool \(5,\), expected bool \(6,\)"
     with pytest.raises(StgaError, match=other):
@@ -116,7 +116,7 @@ def test_checkpoint_round_trip(tmp_path):
         if name.startswith("gradients/"):
             assert theirs[name].shape == array.shape
         else:
-            np.testing.assert_array_equal(theirs[name], array, err_msg=name)
+            assert_array_equal(theirs[name], array, err_msg=name)
         assert theirs[name].dtype == array.dtype
     left, right = ({k: v for k, v in vars(c).items() if k != "state"} for c in (again, checkpoint))
     assert left == right
@@ -136,7 +136,7 @@ def test_checkpoint_round_trip(tmp_path):
         assert (limited.iteration, limited.visit, limited.last_timestep) == counts
 
 
-def meta(**changes: Any) -> np.ndarray:
+def meta(**changes):
     values = {
         "version": checkpoint_files.VERSION,
         **{k: v for k, v in vars(make_checkpoint()).items() if k not in ("state", "tracking")},
@@ -145,14 +145,14 @@ def meta(**changes: Any) -> np.ndarray:
     return np.frombuffer(json.dumps(values).encode(), np.uint8)
 
 
-def strain_position(**changes: np.ndarray) -> dict[str, np.ndarray]:
+def strain_position(**changes):
     """The arrays of positions that follow strain, of FACES triangles, with changes."""
     tables = dict.fromkeys(("value", "average", "first", "second"), np.zeros((5, 3, 3), np.float32))
     arrays = {**tables, "steps": np.zeros(FACES, np.int32), **changes}
     return {f"strain_position/{name}": array for name, array in arrays.items()}
 
 
-METAS: dict[str, dict[str, Any]] = {
+METAS = {
     "has checkpoint format version 3, this add-on reads 4; train it again": {"version": 3},
     r"fields are missing or unknown \(color\)": {"color": 3},
     "setting iteration: expected a whole number from 0 up to .*, got -1": {"iteration": -1},
@@ -163,7 +163,7 @@ METAS: dict[str, dict[str, Any]] = {
 }
 """What is said of counts and other values -> them."""
 SHAPES = r"first is float32 \(4, 3, 3\), expected float32 \(5, 3, 3\)"
-DAMAGES: dict[str, dict[str, np.ndarray | None]] = {
+DAMAGES = {
     **{says: {"meta": meta(**changes)} for says, changes in METAS.items()},
     "a field is missing": {"second/sh": None},
     "a field is missing or malformed": {"meta": None},
@@ -188,7 +188,7 @@ def test_damaged_checkpoints(tmp_path, says):
         checkpoint_files.read_checkpoint(tmp_path)
 
 
-def line(iteration: int, **changes: Any) -> dict[str, Any]:
+def line(iteration, **changes):
     """A line of metrics with the fields that every line has."""
     times = {"seconds": 0.5 * iteration, "evaluation_s": 0.1, "wall_s": float(iteration)}
     return {"iteration": iteration, "splats": 80, **times, **changes}
@@ -259,7 +259,6 @@ def test_second_run_is_refused_while_the_first_lives(tmp_path):
     with subprocess.Popen(
         command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
     ) as other:
-        assert other.stdout is not None
         assert other.stdout.readline() == "held\n"
         with pytest.raises(StgaError, match=f"process {other.pid}"), folder.locked(target):
             pass

@@ -1,15 +1,13 @@
 """When a run evaluates, and when it stops by itself."""
 
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from itertools import count
-from typing import Any
 
 import numpy as np
 import pytest
 
 from stga_addon.avatar.file import read_avatar
-from stga_addon.capture.model import Capture
 from stga_addon.training import schedule
 from stga_addon.training.evaluate import evaluator
 from stga_addon.training.evaluate.evaluator import EVALUATION_SHARE
@@ -27,35 +25,35 @@ from .toys import quick_settings
 Evaluate = Callable[..., Quality]
 
 
-def run_of(capture: Capture, **changes: Any) -> Run:
+def run_of(capture, **changes):
     return Run(capture.root, None, "vhap", quick_settings("global", **{"lattice": 0, **changes}))
 
 
-def scores(values: Iterator[float]) -> Evaluate:
+def scores(values):
     return lambda *args, **kwargs: Quality(next(values), 0.5)
 
 
 class Clock:
     """A clock that only training and evaluation move, by fixed amounts."""
 
-    def __init__(self) -> None:
+    def __init__(self):
         self.now = 0.0
 
-    def __call__(self) -> float:
+    def __call__(self):
         return self.now
 
 
 @pytest.fixture
-def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
+def clock(monkeypatch):
     """Steps take a second, evaluations three."""
     clock = Clock()
     step = session.Trainer.step
 
-    def slow_step(*arguments: Any) -> float | None:
+    def slow_step(*arguments):
         clock.now += 1
         return step(*arguments)
 
-    def slow_evaluate(*arguments: Any, **named: Any) -> Quality:
+    def slow_evaluate(*arguments, **named):
         clock.now += 3
         return Quality(20 + np.log(clock.now), 0.5)
 

@@ -2,15 +2,14 @@
 states, freezing, whole runs."""
 
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal, assert_equal
 from raster import gpu_device
 
 from stga_addon.avatar.offsets import OFFSETS
 from stga_addon.capture.images import read_image
-from stga_addon.capture.model import Capture
 from stga_addon.errors import DeviceError, StgaError
 from stga_addon.raster.gpu import rasterize
 from stga_addon.raster.gpu.device import Device
@@ -21,7 +20,6 @@ from stga_addon.training.optimize.gpu_backend import GpuBackend
 from stga_addon.training.optimize.initial_splats import initial_splats
 from stga_addon.training.optimize.state import (
     OffsetState,
-    TrainState,
     arrays_of,
     keep_rows,
     new_state,
@@ -31,7 +29,6 @@ from stga_addon.training.run.folder import read_run
 from stga_addon.training.run.metrics_log import read_metrics
 from stga_addon.training.run.session import train_run, train_run_or_fall_back
 from stga_addon.training.schedule import learning_rates
-from stga_addon.training.settings import TrainingSettings
 
 from .test_driven_offsets import SIZES, squeezed
 from .test_run import make_run
@@ -41,7 +38,7 @@ from .toys import assert_same_state, bits, quick_settings, stop_at
 pytestmark = pytest.mark.needs("adapter")
 
 
-def settings_of(**changes: Any) -> TrainingSettings:
+def settings_of(**changes):
     """Every term of the loss at work on most splats."""
     limits = {"scale_limit": 0.2, "distance_weight": 0.1, "distance_limit": 0.3}
     limits |= {"unseen_opacity_weight": 0.5, "lattice": 2}
@@ -49,7 +46,7 @@ def settings_of(**changes: Any) -> TrainingSettings:
     return quick_settings("selective", **{**limits, **effects, **changes})
 
 
-def disturbed(capture: Capture, settings: TrainingSettings) -> TrainState:
+def disturbed(capture, settings):
     """Splats unlike each other, in the middle of training; the averages of driven offsets are far
     from the latest values."""
     state = new_state(initial_splats(capture, settings))
@@ -73,7 +70,7 @@ def disturbed(capture: Capture, settings: TrainingSettings) -> TrainState:
     return state
 
 
-def following(state: TrainState) -> dict[str, np.ndarray]:
+def following(state):
     """The arrays of every driven offset."""
     return {
         f"{name}/{part}": array
@@ -82,13 +79,13 @@ def following(state: TrainState) -> dict[str, np.ndarray]:
     }
 
 
-def every_bit(state: TrainState) -> dict[str, np.ndarray]:
+def every_bit(state):
     """A copy of every value by name, so that equal ones have equal bits; gradients left out."""
     driven = {name: table.copy().view(np.uint32) for name, table in following(state).items()}
     return {**bits(state), **driven}
 
 
-def pair(capture: Capture, settings: TrainingSettings) -> tuple[CpuBackend, GpuBackend]:
+def pair(capture, settings):
     """Both implementations with the same splats."""
     frames = FrameStore(capture, settings.convention, True)
     cpu = CpuBackend(settings, frames, disturbed(capture, settings))
@@ -161,7 +158,7 @@ def test_a_local_iteration_leaves_frozen_rows_bit_identical(toy):
     after = bits(state)
     selected = toy.regions["mouth"][state.face]
     for name in before:
-        np.testing.assert_array_equal(after[name][~selected], before[name][~selected], err_msg=name)
+        assert_array_equal(after[name][~selected], before[name][~selected], err_msg=name)
     for name in ("parameters/xyz", "parameters/sh", "first/opacity", "second/rotation", "steps"):
         assert (after[name] != before[name]).any(axis=1)[selected].mean() > 0.3, name
 
@@ -180,7 +177,7 @@ def test_an_iteration_without_room_is_repeated(toy, monkeypatch):
         for batch in (*batches, *batches):
             step.step(batch)
         results.append(every_bit(step.state))
-    np.testing.assert_equal(results[1], results[0])
+    assert_equal(results[1], results[0])
 
 
 @pytest.mark.parametrize("part", [None, "mouth"])
@@ -259,13 +256,13 @@ def test_states_are_the_same_bits_on_both(toy):
         cpu.step(batch_of(toy, settings, timestep))
     gpu.state = cpu.state
     state = gpu.state
-    np.testing.assert_equal(every_bit(state), every_bit(cpu.state))
+    assert_equal(every_bit(state), every_bit(cpu.state))
     kept = every_bit(state)
     gpu.step(batch_of(toy, settings))
     cpu.state = gpu.state
     assert not np.array_equal(bits(cpu.state)["parameters/xyz"], bits(state)["parameters/xyz"])
     for name in following(state):
-        np.testing.assert_array_equal(every_bit(state)[name], kept[name], err_msg=name)
+        assert_array_equal(every_bit(state)[name], kept[name], err_msg=name)
     # which fails where an array has another type or is not contiguous
     cpu.step(batch_of(toy, settings))
     gpu.state = replace(state, driven_offsets={})
@@ -273,7 +270,7 @@ def test_states_are_the_same_bits_on_both(toy):
     assert not gpu.state.driven_offsets
 
 
-def assert_near(got: TrainState, want: TrainState) -> None:
+def assert_near(got, want):
     """All values and moments, as shares of the largest of their name."""
     for name, expected in following(want).items():
         off = np.abs(following(got)[name] - expected)
@@ -321,7 +318,7 @@ def test_renders_with_the_average(toy):
     view = view_of(capture, 3)
     options = RenderOptions(np.ones(3, np.float32), 3)
     image = gpu.render(view, options)
-    np.testing.assert_allclose(image, cpu.render(view, options), atol=1e-4)
+    assert_allclose(image, cpu.render(view, options), atol=1e-4)
     for offset in state.driven_offsets.values():
         offset.average[:] = offset.value
     gpu.state = state
@@ -349,4 +346,4 @@ def test_stopped_and_resumed_is_the_unbroken_run(toy, tmp_path):
     assert_same_state(broken, whole)
     ours, theirs = (following(read_checkpoint(folder).state) for folder in (broken, whole))
     assert theirs["strain_color/steps"].max() > 3
-    np.testing.assert_equal(ours, theirs)
+    assert_equal(ours, theirs)

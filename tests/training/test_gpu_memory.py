@@ -9,8 +9,6 @@ import numpy as np
 import pytest
 from avatar.conftest import splats_of
 
-from stga_addon.avatar.splats import Splats
-from stga_addon.capture.model import Capture
 from stga_addon.raster.gpu import rasterize
 from stga_addon.raster.gpu.device import Device
 from stga_addon.training.optimize.backend import Batch, RenderOptions
@@ -30,14 +28,14 @@ Counts = tuple[int, int, int]
 """Splats, pixels, and pairs: found on the CPU, room for them on the GPU."""
 
 
-def splats_on(capture: Capture, count: int, log_scale: float) -> Splats:
+def splats_on(capture, count, log_scale):
     """Splats of SH degree 3 on the first triangles."""
     face = np.arange(count) % len(capture.faces)
     sh = np.zeros((1, 16, 3))
     return splats_of(np.zeros((count, 3)), log_scale=log_scale, sh=sh, face=face)
 
 
-def batch_of(capture: Capture, width: int, height: int) -> Batch:
+def batch_of(capture, width, height):
     view = view_of(capture, 1)
     view = replace(view, camera=replace(view.camera, width=width, height=height))
     target = np.zeros((height, width, 3), np.uint8)
@@ -79,7 +77,7 @@ def gpu_bytes(capture, count, size, capacity):
     return (count, size[0] * size[1], capacity), device.bytes
 
 
-def per_item(measured: list[tuple[Counts, int]]) -> np.ndarray:
+def per_item(measured):
     """Bytes a splat, a pixel and a pair, from four measurements: the rest is constant."""
     counts = np.array([[*found, 1] for found, _ in measured], np.float64)
     return np.linalg.solve(counts, [size for _, size in measured])[:3]

@@ -1,21 +1,21 @@
 """Hull points of an analytic scene: a ball beside the mesh, seen in masks from all around."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 import trimesh
 from flame.small_head import small_head
+from numpy.testing import assert_allclose, assert_array_equal
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from stga_addon.avatar.embedding import face_frames, to_world
 from stga_addon.avatar.splats import SH_C0
-from stga_addon.capture.camera import Camera, look_at
+from stga_addon.capture.camera import look_at
 from stga_addon.capture.model import Capture, View
-from stga_addon.flame.forward import FlameFrame, neutral_frame
-from stga_addon.flame.model import FlameModel, torso_faces
+from stga_addon.flame.forward import neutral_frame
+from stga_addon.flame.model import torso_faces
 from stga_addon.flame.sequence import FlameSequence, sequence_mesh
 from stga_addon.tracking.folder import TorsoPoints, write_torso_points
 from stga_addon.training.optimize.initial_splats import (
@@ -34,7 +34,7 @@ RADIUS = 0.03
 TIMESTEP = 4
 
 
-def cameras(count: int = 20) -> list[Camera]:
+def cameras(count=20):
     """Cameras on a sphere of a meter around the origin (a Fibonacci spiral), looking at it."""
     found = []
     for n in range(count):
@@ -46,7 +46,7 @@ def cameras(count: int = 20) -> list[Camera]:
     return found
 
 
-def silhouette(camera: Camera, centre: np.ndarray, radius: float) -> np.ndarray:
+def silhouette(camera, centre, radius):
     """(H, W) bool: the pixels whose ray passes the centre within the radius."""
     rows, columns = np.mgrid[:SIZE, :SIZE] + 0.5
     rays = np.stack(
@@ -57,7 +57,7 @@ def silhouette(camera: Camera, centre: np.ndarray, radius: float) -> np.ndarray:
     return np.asarray(np.linalg.norm(np.cross(rays, seen), axis=-1) < radius)
 
 
-def scene(root: Path, centre: np.ndarray = CENTRE, radius: float = RADIUS) -> Capture:
+def scene(root, centre=CENTRE, radius=RADIUS):
     """A head mesh of 8 cm that at TIMESTEP is turned, moved and 10 % larger than the neutral one,
     and the ball."""
     ball = trimesh.creation.icosphere(4, 0.06)
@@ -87,11 +87,11 @@ def scene(root: Path, centre: np.ndarray = CENTRE, radius: float = RADIUS) -> Ca
 
 
 @pytest.fixture(scope="module")
-def beside(tmp_path_factory: pytest.TempPathFactory) -> Capture:
+def beside(tmp_path_factory):
     return scene(tmp_path_factory.mktemp("beside"))
 
 
-def in_world(capture: Capture, points, convention: str = "stga"):
+def in_world(capture, points, convention="stga"):
     frames = face_frames(capture.mesh(TIMESTEP), capture.faces, capture.neutral, convention)
     return to_world(points, frames)
 
@@ -130,16 +130,16 @@ def test_points_are_unbound_gray_and_embedded_in_the_nearest_triangle(beside):
     assert not points.sh.any()
     assert not points.opacity.any()
     world = in_world(beside, points)
-    np.testing.assert_allclose(np.exp(world.log_scale), VOXEL_SIZE_M / 2, rtol=1e-5)
+    assert_allclose(np.exp(world.log_scale), VOXEL_SIZE_M / 2, rtol=1e-5)
     centroids = beside.mesh(TIMESTEP)[beside.faces].mean(1)
     some = np.arange(0, len(points), 7)
     distances = np.linalg.norm(world.xyz[some, None] - centroids[None], axis=2)
     bound = distances[np.arange(len(some)), points.face[some]]
     # The nearest triangle need not have the nearest centroid, but on this even mesh it nearly does.
-    np.testing.assert_allclose(bound, distances.min(axis=1), atol=3e-4)
+    assert_allclose(bound, distances.min(axis=1), atol=3e-4)
     views = [replace(view, mask=None) for view in beside.views["train"]]
     bare, masked = (hull_points(beside, v, "stga", 0) for v in (views, beside.views["train"]))
-    np.testing.assert_array_equal(bare.xyz, masked.xyz)
+    assert_array_equal(bare.xyz, masked.xyz)
 
 
 @pytest.mark.parametrize(("whole", "shift"), [(6, 1), (4, 9)])
@@ -185,13 +185,13 @@ def test_one_mask_that_says_no_is_enough(beside, tmp_path):
     assert len(hull_points(beside, views, "stga", 0)) == 0
 
 
-def turned(model: FlameModel) -> FlameFrame:
+def turned(model):
     """The torso turned under a head that stays."""
     turn = np.array([0.0, 0.4, 0.0])
     return replace(neutral_frame(model), rotation=turn, neck_pose=-turn)
 
 
-def posed_head(model: FlameModel, frame: FlameFrame) -> FlameSequence:
+def posed_head(model, frame):
     return FlameSequence(model, np.zeros(model.n_identity), None, (TIMESTEP,), lambda _: frame)
 
 
@@ -225,7 +225,7 @@ def test_what_lies_below_the_neck_follows_the_torso(tmp_path, one):
             torso_faces(model)[after.face].all() if carried else (after.face == before.face).all()
         )
         world = [in_world(capture, points).xyz for points in (before, after)]
-        np.testing.assert_allclose(world[0], world[1], atol=1e-6)
+        assert_allclose(world[0], world[1], atol=1e-6)
 
 
 def test_few_cameras_take_the_torso_from_where_it_was_seen(tmp_path):
@@ -247,7 +247,7 @@ def test_few_cameras_take_the_torso_from_where_it_was_seen(tmp_path):
     neutral = face_frames(capture.mesh(TIMESTEP + 1), capture.faces, capture.neutral)
     assert np.linalg.norm(to_world(seen, neutral).xyz - at.mean(0), axis=1).max() < 0.03
     assert np.linalg.norm(in_world(capture, seen).xyz - at.mean(0), axis=1).min() > 0.01
-    np.testing.assert_array_equal(hull_points(capture, views, "stga", 0, torso=True).xyz, many.xyz)
+    assert_array_equal(hull_points(capture, views, "stga", 0, torso=True).xyz, many.xyz)
 
 
 @pytest.mark.parametrize("convention", ["stga", "gaussian_avatars"])
@@ -272,10 +272,10 @@ def test_a_single_camera_gets_a_layer_as_deep_as_the_mesh(beside, convention):
         np.linalg.norm(wanted[:, None] + 0.5 - pixels[None], axis=2).min(axis=1).max() < 1.5 * step
     )
     assert world.unbound.all()
-    np.testing.assert_allclose(np.exp(world.log_scale), VOXEL_SIZE_M / 2, rtol=1e-5)
+    assert_allclose(np.exp(world.log_scale), VOXEL_SIZE_M / 2, rtol=1e-5)
 
 
-def _gap(camera: Camera) -> float:
+def _gap(camera):
     """Distance in meters between head and ball as the camera sees them, without the depth."""
     rotation = camera.world_to_camera[:2, :3]
     return float(np.linalg.norm(rotation @ CENTRE)) - 1.1 * 0.06 + RADIUS / 2
@@ -297,12 +297,12 @@ def test_a_single_camera_continues_the_torso_that_it_cuts_off(tmp_path, right, u
     pixels = side.camera.project(whole.xyz.astype(np.float64))[0]
     beyond = ((pixels < 0) | (pixels >= SIZE)).any(axis=1)
     assert beyond.any() == continued
-    np.testing.assert_allclose(whole.xyz[~beyond], cut.xyz, atol=1e-6)
+    assert_allclose(whole.xyz[~beyond], cut.xyz, atol=1e-6)
     if continued:
         assert (pixels[beyond, 1] > SIZE).any()
         assert pixels[beyond, 1].max() < 1.4 * SIZE
         color = np.tile([90, 250, 40], (beyond.sum(), 1)) / 255
-        np.testing.assert_allclose(whole.sh[beyond, 0] * SH_C0 + 0.5, color, atol=1e-6)
+        assert_allclose(whole.sh[beyond, 0] * SH_C0 + 0.5, color, atol=1e-6)
         assert (whole.opacity[beyond] > 2).all()
 
 

@@ -3,10 +3,7 @@
 import json
 import shutil
 import signal
-from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -15,7 +12,6 @@ from command_line import stga
 from PIL import Image
 
 from stga_addon.avatar.file import read_avatar
-from stga_addon.capture.model import Capture
 from stga_addon.capture.open import open_capture
 from stga_addon.errors import StgaError
 from stga_addon.jobs.perform import request_folder, write_request
@@ -32,7 +28,7 @@ from .toys import assert_same_state, quick_settings, stop_at
 ITERATIONS = 12
 
 
-def make_run(capture: Capture, flame: Path | None = None, **changes: Any) -> Run:
+def make_run(capture, flame=None, **changes):
     settings = quick_settings(
         "global", **{"iterations": ITERATIONS, "lattice": 0, "sh_degree": 0, **changes}
     )
@@ -40,7 +36,7 @@ def make_run(capture: Capture, flame: Path | None = None, **changes: Any) -> Run
 
 
 @pytest.fixture(scope="session")
-def begun(toy: Capture, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def begun(toy, tmp_path_factory):
     """A run of the toy capture, stopped halfway."""
     out = tmp_path_factory.mktemp("begun") / "run"
     train_run(toy, out, make_run(toy), report=stop_at(ITERATIONS // 2))
@@ -48,48 +44,48 @@ def begun(toy: Capture, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def copy(begun: Path, tmp_path: Path) -> Path:
+def copy(begun, tmp_path):
     """A copy of that run, to be damaged."""
     return shutil.copytree(begun, tmp_path / "run")
 
 
-def edit_frames(root: Path, change: Callable[[dict[str, Any]], object]) -> None:
+def edit_frames(root, change):
     for path in root.glob("transforms_*.json"):
         factory.edit(path, lambda document: [change(frame) for frame in document["frames"]])
 
 
-def move_cameras(root: Path) -> None:
-    def change(frame: dict[str, Any]) -> None:
+def move_cameras(root):
+    def change(frame):
         frame["transform_matrix"][0][3] += 0.001
 
     edit_frames(root, change)
 
 
-def rename_images(root: Path) -> None:
+def rename_images(root):
     shutil.copytree(root / "images", root / "pictures")
     edit_frames(
         root, lambda frame: frame.update(file_path=frame["file_path"].replace("images", "pictures"))
     )
 
 
-def halve_images(root: Path) -> None:
+def halve_images(root):
     for path in (*root.glob("images/*"), *root.glob("fg_masks/*")):
         Image.open(path).resize((20, 30)).save(path)
     edit_frames(root, lambda frame: frame.update(w=20, h=30))
 
 
-def other_topology(root: Path) -> None:
+def other_topology(root):
     vertices, faces = factory.ball()
     for path in (root / "meshes").iterdir():
         factory.write_mesh(path, vertices, faces[:, ::-1])
 
 
-def larger_neutral(root: Path) -> None:
+def larger_neutral(root):
     vertices, faces = factory.ball()
     factory.write_mesh(root / "meshes/neutral.obj", 1.15 * vertices, faces)
 
 
-def other_lens(root: Path) -> None:
+def other_lens(root):
     edit_frames(root, lambda frame: frame.update(fl_x=101.0))
 
 

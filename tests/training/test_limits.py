@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import torch
+from numpy.testing import assert_allclose, assert_array_equal, assert_equal
 
 from stga_addon.raster.cpu.optimizer import distance_limit, opacity_weight, scale_limit
 from stga_addon.training.optimize.change import Turn
@@ -15,7 +16,7 @@ WEIGHT = 0.7
 
 
 @pytest.fixture(params=range(3))
-def scene(request: pytest.FixtureRequest):
+def scene(request):
     """Splats, half of them over their limits, some rows, and limits (F,) per triangle."""
     splats = random_splats(50, FACES, request.param)
     rng = np.random.default_rng(request.param)
@@ -24,7 +25,7 @@ def scene(request: pytest.FixtureRequest):
     return splats, rows, limit
 
 
-def expected(values: np.ndarray, size, splats, rows, limits) -> tuple[float, np.ndarray]:
+def expected(values, size, splats, rows, limits):
     """limits (2, F) of bound and of unbound splats."""
     x = torch.tensor(values, dtype=torch.float64, requires_grad=True)
     of = torch.tensor(
@@ -45,10 +46,10 @@ def test_limits_and_weights_are_autograds(scene):
     out = np.full((50, 3), 0.25, np.float32)
     found = scale_limit(rows, splats.log_scale, splats.face, splats.unbound, limits, WEIGHT, out)
     assert found == pytest.approx(norm, rel=1e-5)
-    np.testing.assert_allclose(out - 0.25, gradient, rtol=1e-4, atol=1e-7)
+    assert_allclose(out - 0.25, gradient, rtol=1e-4, atol=1e-7)
     assert (gradient[rows[splats.unbound[rows]]] > 0).any()
     untouched = ~np.isin(np.arange(50), rows)
-    np.testing.assert_array_equal(out[untouched], 0.25)
+    assert_array_equal(out[untouched], 0.25)
     limit = limit * np.float32(0.015)
     limits = np.stack([limit, np.full_like(limit, np.inf)])
     norm, gradient = expected(splats.xyz, lambda x: x.norm(dim=1), splats, rows, limits)
@@ -56,16 +57,15 @@ def test_limits_and_weights_are_autograds(scene):
     out = np.full((50, 3), 0.25, np.float32)
     found = distance_limit(rows, splats.xyz, splats.face, splats.unbound, limit, WEIGHT, out)
     assert found == pytest.approx(norm, rel=1e-5)
-    np.testing.assert_allclose(out - 0.25, gradient, rtol=1e-4, atol=1e-6)
+    assert_allclose(out - 0.25, gradient, rtol=1e-4, atol=1e-6)
     untouched = splats.unbound | ~np.isin(np.arange(50), rows)
-    np.testing.assert_array_equal(out[untouched], 0.25)
+    assert_array_equal(out[untouched], 0.25)
     share = np.random.default_rng(3).random(50, np.float32)
     x = torch.tensor(splats.opacity, dtype=torch.float64, requires_grad=True)
     (WEIGHT * torch.from_numpy(share)[rows] * torch.sigmoid(x[rows])).sum().backward()
     out = np.full(50, 0.25, np.float32)
     opacity_weight(rows, splats.opacity, share, WEIGHT, out)
-    assert x.grad is not None
-    np.testing.assert_allclose(out - 0.25, x.grad.numpy(), rtol=1e-4, atol=1e-6)
+    assert_allclose(out - 0.25, x.grad.numpy(), rtol=1e-4, atol=1e-6)
 
 
 @pytest.mark.parametrize("kernel", [scale_limit, distance_limit])
@@ -79,7 +79,7 @@ def test_within_the_limits_nothing_happens(kernel):
     limit = np.full(FACES, 10, np.float32)
     limit = np.stack([limit, limit]) if kernel is scale_limit else limit
     assert kernel(rows, values, splats.face, splats.unbound, limit, WEIGHT, out) == 0
-    np.testing.assert_array_equal(out, 0.25)
+    assert_array_equal(out, 0.25)
 
 
 @pytest.mark.parametrize("to", [0.0, 0.5, 1.0])
@@ -103,17 +103,17 @@ def test_stray_resets(to):
     after = bits(state)
     for name, old in before.items():
         if name in ("parameters/xyz", "first/xyz"):
-            np.testing.assert_array_equal(after[name][~strays], old[~strays])
+            assert_array_equal(after[name][~strays], old[~strays])
         if name == "average/xyz":
-            np.testing.assert_array_equal(after[name][~strays], old[~strays])
-            np.testing.assert_array_equal(after[name][strays], after["parameters/xyz"][strays])
+            assert_array_equal(after[name][~strays], old[~strays])
+            assert_array_equal(after[name][strays], after["parameters/xyz"][strays])
         elif name == "parameters/xyz":
             length = np.linalg.norm(xyz[strays].astype(float), axis=1, keepdims=True)
             wanted = xyz[strays] / length * to * limit[face[strays], None]
-            np.testing.assert_allclose(state.parameters.xyz[strays], wanted, rtol=1e-5)
+            assert_allclose(state.parameters.xyz[strays], wanted, rtol=1e-5)
         elif name == "first/xyz":
             assert not after[name][strays].any()
         else:
-            np.testing.assert_array_equal(after[name], old, err_msg=name)
+            assert_array_equal(after[name], old, err_msg=name)
     reset.apply(Rows(state), Turn(0, 0.5, 60))
-    np.testing.assert_equal(after, bits(state))
+    assert_equal(after, bits(state))

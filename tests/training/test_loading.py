@@ -2,7 +2,6 @@
 
 import threading
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -10,7 +9,7 @@ from capture import factory
 
 from stga_addon.avatar.embedding import face_frames
 from stga_addon.capture.loader import ViewLoader
-from stga_addon.capture.model import Capture, evenly_spread
+from stga_addon.capture.model import evenly_spread
 from stga_addon.capture.open import open_capture
 from stga_addon.training.evaluate.metrics import Residuals
 from stga_addon.training.optimize import frames
@@ -28,12 +27,12 @@ KEPT = 12
 
 
 @pytest.fixture(autouse=True)
-def few_timesteps_are_kept(toy: Capture, monkeypatch: pytest.MonkeyPatch) -> None:
+def few_timesteps_are_kept(toy, monkeypatch):
     size = frames.BYTES_PER_TRIANGLE * len(toy.faces)
     monkeypatch.setattr(frames, "CACHE_BYTES", (KEPT + 0.5) * size)
 
 
-def no_residuals(*arguments: Any) -> Residuals:
+def no_residuals(*arguments):
     return Residuals(np.zeros(1), np.ones(1))
 
 

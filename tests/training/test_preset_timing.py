@@ -21,12 +21,12 @@ class Stopwatch:
 
     now = 0.0
 
-    def __call__(self) -> float:
+    def __call__(self):
         return self.now
 
 
 @pytest.fixture
-def shares(monkeypatch: pytest.MonkeyPatch) -> list[float]:
+def shares(monkeypatch):
     """Shares of the budget that the steps were made at."""
     watch = Stopwatch()
     seen = []
@@ -37,13 +37,13 @@ def shares(monkeypatch: pytest.MonkeyPatch) -> list[float]:
         state = 1000
         once_s = 0.0
 
-        def __init__(self, *_: Any, **__: Any) -> None:
+        def __init__(self, *_, **__):
             self.changes: dict[str, Any] = {}
 
-        def prepare_turns(self) -> None:
+        def prepare_turns(self):
             watch.now += self.once_s
 
-        def step(self, view: Any, image: Any, share: float, mask: Any, mesh: Any) -> None:
+        def step(self, view, image, share, mask, mesh):
             assert not image.flags.writeable
             assert image.shape[:2] == mask.shape == (view.camera.height, view.camera.width)
             watch.now += 0.01 * image.shape[0] * image.shape[1] / 1000 * self.state / 1000
@@ -109,9 +109,9 @@ def test_what_is_done_once_is_no_step(toy, shares, monkeypatch):
     before = seconds_per_iteration(toy, settings, 1000, 2.4)
     monkeypatch.setattr(preset_timing.Trainer, "once_s", 5.0)
     assert seconds_per_iteration(toy, settings, 1000, 2.4) == pytest.approx(before + 0.005)
-    asked: list[int] = []
+    asked = []
 
-    def track(*arguments: Any) -> None:
+    def track(*arguments):
         some = arguments[2]
         note = arguments[4]
         for number in range(len(some)):

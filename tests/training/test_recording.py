@@ -4,10 +4,10 @@ import json
 import os
 import shutil
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
@@ -51,12 +51,12 @@ SHADE = 0.3
 IDENTITY = Similarity(1.0, np.eye(3), np.zeros(3))
 
 
-def ignore(done: int, total: int) -> None:
+def ignore(done, total):
     pass
 
 
 @pytest.fixture
-def recording(tmp_path: Path, lost, person) -> tuple[Path, Path]:  # noqa: F811
+def recording(tmp_path, lost, person):  # noqa: F811
     """A run, and a capture that is darker, lit from a side, and in a world that is too large."""
     avatar, settings = person
     run = tmp_path / "run"
@@ -91,8 +91,7 @@ def test_another_recording_is_tracked(recording, lost):  # noqa: F811
     assert sizes[1] / sizes[0] == pytest.approx(1 / SCALE, abs=0.004)
     assert read_json(root / "tracking.json")["meters_per_unit"] == pytest.approx(1, abs=0.004)
     torso = read_torso_points(root)
-    assert torso is not None
-    np.testing.assert_allclose(torso.at, 1, atol=0.004)
+    assert_allclose(torso.at, 1, atol=0.004)
     away = millimeters(open_capture(root, root / "model.npz"), lost[1])
     tracked = millimeters(*lost)
     assert np.median(away[:-1] / tracked[:-1]) < 0.4
@@ -103,7 +102,7 @@ def test_another_recording_is_tracked(recording, lost):  # noqa: F811
     fit = known.fit
     assert known.camera is None
     assert model == recording[1] / "model.npz"
-    np.testing.assert_allclose(fit.head.model.v_template, lost[0].neutral, atol=1e-9)
+    assert_allclose(fit.head.model.v_template, lost[0].neutral, atol=1e-9)
     assert fit.head.model.n_identity == 0
     assert len(fit.shape) == 4
 
@@ -137,10 +136,10 @@ def test_the_world_is_turned_as_the_avatars_was(light_turns, keeps_world, record
     after = open_capture(root, root / "model.npz")
     for timestep in after.timesteps:
         expected = moved.apply(before[timestep])
-        np.testing.assert_allclose(after.mesh(timestep), expected, atol=2e-6)
+        assert_allclose(after.mesh(timestep), expected, atol=2e-6)
     told = list[int]()
 
-    def stop_once_turned(done: int, total: int) -> None:
+    def stop_once_turned(done, total):
         told.append(done)
         if len(told) == 2:
             raise Cancelled
@@ -151,7 +150,7 @@ def test_the_world_is_turned_as_the_avatars_was(light_turns, keeps_world, record
     first = lost[0].views["train"][0].camera.world_to_camera[:3, :3]
     stays = light_turns or keeps_world
     expected = first @ turn.inv().as_matrix() if stays else first
-    np.testing.assert_allclose(found[:3, :3], expected, atol=1e-5)
+    assert_allclose(found[:3, :3], expected, atol=1e-5)
 
 
 @pytest.fixture

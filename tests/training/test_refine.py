@@ -1,22 +1,20 @@
 """Refining a region: nothing else changes; a stopped one is continued to the same bits."""
 
 import shutil
-from collections.abc import Callable
 from dataclasses import replace
 from itertools import islice
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
+from numpy.testing import assert_array_equal
 
 from stga_addon.avatar.file import read_avatar
-from stga_addon.capture.model import Capture
 from stga_addon.errors import StgaError
 from stga_addon.files import write_npz
 from stga_addon.jobs.train import Refine, prepare
 from stga_addon.progress import ignore
-from stga_addon.training.optimize.state import TrainState, arrays_of
+from stga_addon.training.optimize.state import arrays_of
 from stga_addon.training.run import continuation as module
 from stga_addon.training.run.checkpoint import read_checkpoint
 from stga_addon.training.run.continuation import (
@@ -39,7 +37,7 @@ ITERATIONS = 16
 
 
 @pytest.fixture(scope="module")
-def finished(toy: Capture, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def finished(toy, tmp_path_factory):
     """With strain color, density control and hull points; the avatar is the last state's."""
     out = tmp_path_factory.mktemp("finished") / "run"
     settings = quick_settings(
@@ -59,14 +57,14 @@ def finished(toy: Capture, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def parent(finished: Path, toy: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def parent(finished, toy, tmp_path, monkeypatch):
     """A copy of the finished run, whose density control comes often when it is refined."""
     monkeypatch.setattr(module, "DENSITY_INTERVAL", 4)
     monkeypatch.setattr("stga_addon.training.run.folder.open_run", opening(toy))
     return Path(shutil.copytree(finished, tmp_path / "run"))
 
 
-def opening(toy: Capture) -> Callable[..., Any]:
+def opening(toy):
     """`open_run` for the capture without held-out views, which has no file of its own."""
     from stga_addon.training.run.folder import OpenedRun
 
@@ -80,14 +78,14 @@ def prepare_refinement(parent, region, frames=None, **changes):
     return prepare(request, ignore, lambda line: None)
 
 
-def refine(parent: Path, out: Path, stop: int | None = None, **changes: Any) -> Path:
+def refine(parent, out, stop=None, **changes):
     prepared = prepare_refinement(parent, "mouth", **{"growth": 0.5, **changes})
 
     train_run(prepared.capture, out, prepared.run, prepared.selection, report=stop_at(stop))
     return out
 
 
-def rows_of(state: TrainState, keep: np.ndarray) -> dict[str, np.ndarray]:
+def rows_of(state, keep):
     """Bytes of every array at the rows; without gradients and statistics, which no avatar holds."""
     skipped = ("gradients", "screen_gradient", "gradient_count")
     kept = {name: array for name, array in arrays_of(state).items() if not name.startswith(skipped)}
@@ -103,9 +101,7 @@ def test_nothing_outside_the_region_changes_by_one_bit(parent, toy, tmp_path):
     assert 0 < outside[0].sum() < len(before.splats)
     for name, old in vars(before.splats).items():
         new = getattr(after.splats, name)
-        np.testing.assert_array_equal(
-            old[outside[0]].tobytes(), new[outside[1]].tobytes(), err_msg=name
-        )
+        assert_array_equal(old[outside[0]].tobytes(), new[outside[1]].tobytes(), err_msg=name)
     inside = before.splats.rows(~outside[0]), after.splats.rows(~outside[1])
     assert len(inside[1]) > len(inside[0])
     assert set(np.unique(inside[1].face)) == set(np.unique(inside[0].face))
@@ -117,7 +113,7 @@ def test_nothing_outside_the_region_changes_by_one_bit(parent, toy, tmp_path):
     kept = [rows_of(state, ~region[state.face]) for state in states]
     for name, old in kept[0].items():
         if not name.startswith("parameters"):  # which start from the average
-            np.testing.assert_array_equal(kept[1][name], old, err_msg=name)
+            assert_array_equal(kept[1][name], old, err_msg=name)
 
 
 def test_a_stopped_refinement_is_continued_to_the_same_bits(parent, toy, tmp_path):

@@ -3,16 +3,13 @@
 import shutil
 from dataclasses import replace
 from itertools import count
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
+from numpy.testing import assert_array_equal, assert_equal
 
-from stga_addon.avatar.file import Avatar, read_avatar
-from stga_addon.capture.model import Capture
+from stga_addon.avatar.file import read_avatar
 from stga_addon.errors import StgaError
-from stga_addon.progress import Progress
 from stga_addon.training.evaluate import evaluator
 from stga_addon.training.evaluate.forecast import kept_line
 from stga_addon.training.evaluate.metrics import Quality
@@ -33,12 +30,12 @@ CLOCKED = ("seconds", "evaluation_s", "wall_s", "peak_memory_mb", "forecast")
 """Fields of a metrics line that depend on how fast the machine was."""
 
 
-def make_run(capture: Capture, strategy: str = "selective", **changes: Any) -> Run:
+def make_run(capture, strategy="selective", **changes):
     settings = quick_settings(strategy, **{"iterations": ITERATIONS, **BUSY, **changes})
     return Run(capture.root, None, "vhap", settings)
 
 
-def without_times(lines: list[dict[str, Any]]) -> list[dict[str, Any]]:
+def without_times(lines):
     """Metrics without wall times; sums of float32 rows to seven digits."""
     kept = [{k: v for k, v in line.items() if k not in CLOCKED} for line in lines]
     for line in kept:
@@ -47,14 +44,14 @@ def without_times(lines: list[dict[str, Any]]) -> list[dict[str, Any]]:
 
 
 @pytest.fixture(scope="module")
-def unbroken(toy: Capture, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def unbroken(toy, tmp_path_factory):
     """A run from start to end."""
     out = tmp_path_factory.mktemp("unbroken") / "run"
     assert train_run(toy, out, make_run(toy)) == out / "avatar.npz"
     return out
 
 
-def test_what_a_run_leaves(toy: Capture, unbroken: Path) -> None:
+def test_what_a_run_leaves(toy, unbroken):
     """Catches a budget over- or underrun, missing evaluations, and files that do not read back."""
     checkpoint = read_checkpoint(unbroken)
     assert checkpoint.iteration == ITERATIONS
@@ -75,7 +72,7 @@ def test_what_a_run_leaves(toy: Capture, unbroken: Path) -> None:
     with pytest.raises(StgaError, match=r"residuals\.npz: expected 'residual', float32 \(7,\)"):
         read_residuals(unbroken, 7)
     avatar = read_avatar(unbroken / "avatar.npz")
-    np.testing.assert_array_equal(avatar.faces, toy.faces)
+    assert_array_equal(avatar.faces, toy.faces)
     assert avatar.settings["strategy"] == "selective"
     assert sorted(p.name for p in unbroken.iterdir()) == [
         "avatar.npz",
@@ -92,12 +89,12 @@ class Crash(Exception):
 
 
 @pytest.fixture(scope="module")
-def continued(toy: Capture, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def continued(toy, tmp_path_factory):
     """Crashed after iteration 13, went on from a checkpoint of 8, and came to its end."""
     out = tmp_path_factory.mktemp("continued")
     with pytest.MonkeyPatch.context() as patch:
 
-        def crash(progress: Progress) -> bool:
+        def crash(progress):
             iteration = progress.figures().get("iteration", 0)
             patch.setattr(run_module, "CHECKPOINT_S", 0.0 if iteration == 7 else 1e9)
             if iteration == 13:
@@ -112,7 +109,7 @@ def continued(toy: Capture, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
-def test_crashed_and_resumed_is_the_unbroken_run(unbroken: Path, continued: Path) -> None:
+def test_crashed_and_resumed_is_the_unbroken_run(unbroken, continued):
     """Catches evaluations twice, or missing, after going on from an older checkpoint."""
     assert_same_state(continued, unbroken)
     ours, theirs = (without_times(read_metrics(folder)) for folder in (continued, unbroken))
@@ -123,16 +120,14 @@ def test_crashed_and_resumed_is_the_unbroken_run(unbroken: Path, continued: Path
     # Not to the last bit: the value is summed in float32 along each row, for people to look at, and
     # does not train.
     assert losses[0] == pytest.approx(losses[1], rel=1e-6)
-    np.testing.assert_equal(
+    assert_equal(
         vars(read_avatar(continued / "avatar.npz").splats),
         vars(read_avatar(unbroken / "avatar.npz").splats),
     )
 
 
 @pytest.mark.parametrize("iteration", [2, 11, 15])
-def test_stopped_and_resumed_is_the_unbroken_run(
-    iteration: int, toy: Capture, unbroken: Path, tmp_path: Path
-) -> None:
+def test_stopped_and_resumed_is_the_unbroken_run(iteration, toy, unbroken, tmp_path):
     """Catches a line of metrics, or an avatar, of the moment of a Ctrl-C that stays after resuming;
     15 is the iteration of an evaluation, 2 before the first."""
     train_run(toy, tmp_path, make_run(toy), report=stop_at(iteration))
@@ -146,30 +141,26 @@ def test_stopped_and_resumed_is_the_unbroken_run(
     assert {path.name for path in tmp_path.iterdir()} == {p.name for p in unbroken.iterdir()}
 
 
-def test_the_avatar_of_a_stop_is_not_that_of_the_resumed_run(
-    toy: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_avatar_of_a_stop_is_not_that_of_the_resumed_run(toy, tmp_path, monkeypatch):
     """Catches a stopped run without the best avatar so far, and a resumed one that keeps a state
     which the unbroken run never evaluated."""
     before = iter([Quality(20, 0.5), Quality(21, 0.5), Quality(25, 0.5)])
     monkeypatch.setattr(evaluator, "evaluate", lambda *_: next(before))
     train_run(toy, tmp_path, make_run(toy), report=stop_at(6))
     now = read_avatar(tmp_path / "avatar.npz").splats.xyz
-    np.testing.assert_array_equal(now, read_checkpoint(tmp_path).state.average.xyz)
+    assert_array_equal(now, read_checkpoint(tmp_path).state.average.xyz)
     monkeypatch.setattr(evaluator, "evaluate", lambda *_: Quality(19, 0.5))
     train_run(toy, tmp_path, make_run(toy), resume=True)
     kept = read_avatar(tmp_path / "avatar.npz").splats.xyz
     train_run(toy, tmp_path / "five", make_run(toy), report=stop_at(5))
     five = read_checkpoint(tmp_path / "five").state.average.xyz
-    np.testing.assert_array_equal(kept, five)
+    assert_array_equal(kept, five)
 
 
-def test_residuals_that_could_not_be_measured(
-    toy: Capture, unbroken: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_residuals_that_could_not_be_measured(toy, unbroken, tmp_path, monkeypatch):
     """Catches a run that failed after its last iteration, resumed with success and no residuals."""
 
-    def fail(*_: Any) -> None:
+    def fail(*_):
         raise StgaError("image 7 cannot be read")
 
     with monkeypatch.context() as patch:
@@ -178,11 +169,11 @@ def test_residuals_that_could_not_be_measured(
             train_run(toy, tmp_path, make_run(toy))
     train_run(toy, tmp_path, make_run(toy), resume=True)
     count = len(toy.faces)
-    np.testing.assert_array_equal(read_residuals(tmp_path, count), read_residuals(unbroken, count))
+    assert_array_equal(read_residuals(tmp_path, count), read_residuals(unbroken, count))
     assert len(read_metrics(tmp_path)) == len(read_metrics(unbroken))
 
 
-def test_checkpoints_as_often_as_the_environment_says(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_checkpoints_as_often_as_the_environment_says(monkeypatch):
     """Catches a farm's wish ignored, and a traceback or no checkpoints of a nonsensical one."""
     for text, seconds in (("", None), ("0.5", 0.5), ("0", 0.0)):
         monkeypatch.setenv("STGA_CHECKPOINT_S", text)
@@ -195,11 +186,11 @@ def test_checkpoints_as_often_as_the_environment_says(monkeypatch: pytest.Monkey
             run_module._asked_interval_s()
 
 
-def test_a_given_selection_survives_an_early_crash(toy: Capture, tmp_path: Path) -> None:
+def test_a_given_selection_survives_an_early_crash(toy, tmp_path):
     """Catches a painted selection replaced by the rule where there was no checkpoint yet."""
     painted = {timestep: np.arange(len(toy.faces)) < 7 for timestep in toy.timesteps}
 
-    def crash(progress: Progress) -> bool:
+    def crash(progress):
         if progress.figures().get("iteration", 0) == 2:
             raise Crash
         return False
@@ -212,16 +203,16 @@ def test_a_given_selection_survives_an_early_crash(toy: Capture, tmp_path: Path)
     assert all((kept[timestep] == painted[timestep]).all() for timestep in painted)
 
 
-def test_a_lost_avatar_is_written_anew(toy: Capture, unbroken: Path, tmp_path: Path) -> None:
+def test_a_lost_avatar_is_written_anew(toy, unbroken, tmp_path):
     """Catches "--resume" of a finished run that ends without an avatar and says nothing, trains on,
     or evaluates again."""
     out = tmp_path / "run"
     shutil.copytree(unbroken, out)
     for name in ("avatar.npz", "residuals.npz"):
         (out / name).unlink()
-    told: list[str] = []
+    told = []
 
-    def note(progress: Progress) -> bool:
+    def note(progress):
         return bool(told.append(progress.stage))
 
     train_run(toy, out, make_run(toy), resume=True, report=note)
@@ -229,7 +220,7 @@ def test_a_lost_avatar_is_written_anew(toy: Capture, unbroken: Path, tmp_path: P
     assert_same_state(out, unbroken)
     assert len(read_metrics(out)) == len(read_metrics(unbroken))
     written = read_avatar(out / "avatar.npz").splats
-    np.testing.assert_array_equal(written.xyz, read_checkpoint(unbroken).state.average.xyz)
+    assert_array_equal(written.xyz, read_checkpoint(unbroken).state.average.xyz)
     assert read_residuals(out, len(toy.faces)).shape == (len(toy.faces),)
     stopped = tmp_path / "stopped"
     train_run(toy, stopped, make_run(toy), report=stop_at(11))
@@ -239,12 +230,12 @@ def test_a_lost_avatar_is_written_anew(toy: Capture, unbroken: Path, tmp_path: P
 
 
 @pytest.mark.parametrize("change", ["renamed", "emptied"])
-def test_a_folder_that_is_moved_while_training(toy: Capture, tmp_path: Path, change: str) -> None:
+def test_a_folder_that_is_moved_while_training(toy, tmp_path, change):
     """Catches a renamed run begun again under its old name, without what resuming needs."""
     out = tmp_path / "run"
     moved = tmp_path / "moved"
 
-    def move(progress: Progress) -> bool:
+    def move(progress):
         if progress.figures().get("iteration", 0) == 7:
             out.rename(moved)
             if change == "emptied":
@@ -259,22 +250,20 @@ def test_a_folder_that_is_moved_while_training(toy: Capture, tmp_path: Path, cha
     assert read_checkpoint(moved).iteration == ITERATIONS
 
 
-def test_the_best_avatar_is_kept(
-    toy: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_best_avatar_is_kept(toy, tmp_path, monkeypatch):
     """Catches a run that gets worse and takes its best avatar with it, and one that keeps an early
     state because it is a hair sharper."""
     found = (30, 0.3), (30, 0.1), (29, 0.2), (31, 0.11), *[(30.5, 0.15)] * 20
     scores = iter(found)
-    written: list[Avatar] = []
+    written = []
 
-    def write(path: Path, avatar: Avatar) -> None:
+    def write(path, avatar):
         written.append(avatar)
         run_module_write(path, avatar)
 
     run_module_write = run_module.write_avatar
 
-    def evaluate(*arguments: Any) -> Quality:
+    def evaluate(*arguments):
         psnr, difference = next(scores)
         return Quality(psnr, 0.5, detail_difference=difference)
 
@@ -285,20 +274,20 @@ def test_the_best_avatar_is_kept(
     assert len(written) == 3
     assert kept_line(read_metrics(tmp_path), make_run(toy).settings)["psnr"] == 31
     best = read_avatar(tmp_path / "avatar.npz").splats
-    np.testing.assert_array_equal(best.xyz, written[2].splats.xyz)
+    assert_array_equal(best.xyz, written[2].splats.xyz)
     assert not np.array_equal(written[0].splats.xyz, written[1].splats.xyz)
 
 
-def test_without_held_out_views_the_latest_avatar_is_kept(toy: Capture, tmp_path: Path) -> None:
+def test_without_held_out_views_the_latest_avatar_is_kept(toy, tmp_path):
     """Catches a run without avatar, or with its first one, where nothing can be measured."""
     bare = replace(toy, views={"train": toy.views["train"]})
     train_run(bare, tmp_path, make_run(toy))
     avatar = read_avatar(tmp_path / "avatar.npz")
-    np.testing.assert_array_equal(avatar.splats.xyz, read_checkpoint(tmp_path).state.average.xyz)
+    assert_array_equal(avatar.splats.xyz, read_checkpoint(tmp_path).state.average.xyz)
     assert all("psnr" not in line for line in read_metrics(tmp_path))
 
 
-def test_what_is_refused_changes_nothing(toy: Capture, unbroken: Path, tmp_path: Path) -> None:
+def test_what_is_refused_changes_nothing(toy, unbroken, tmp_path):
     """Catches hours of training lost to a forgotten --resume, files of a run among those of a
     recording, an endless wait for views that never come, and a folder made for nothing."""
     for out, says in (
@@ -318,13 +307,13 @@ def test_what_is_refused_changes_nothing(toy: Capture, unbroken: Path, tmp_path:
     assert not (tmp_path / "run").exists()
 
 
-def test_a_budget_in_seconds(toy: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_budget_in_seconds(toy, tmp_path, monkeypatch):
     """Catches wall time not counted, counted twice when resumed, or overrun."""
     ticks = count()  # a clock that ticks when it is read, so that every step takes 0.01 s
     monkeypatch.setattr(run_module, "perf_counter", lambda: next(ticks) / 100)
-    shares: list[float] = []
+    shares = []
 
-    def note(progress: Progress) -> bool:
+    def note(progress):
         shares.append(progress.share)
         return progress.figures().get("iteration", 0) == 6
 
@@ -338,17 +327,15 @@ def test_a_budget_in_seconds(toy: Capture, tmp_path: Path, monkeypatch: pytest.M
     assert shares == sorted(shares)
 
 
-def test_more_training(
-    toy: Capture, unbroken: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_more_training(toy, unbroken, tmp_path, monkeypatch):
     """Catches a finished run that trains nothing more, or as if from the beginning, an avatar that
     gets worse, and a run that cannot be resumed afterwards."""
     out = tmp_path / "run"
     shutil.copytree(unbroken, out)
-    shares: list[float] = []
-    left: list[float] = []
+    shares = []
+    left = []
 
-    def note(progress: Progress) -> bool:
+    def note(progress):
         if progress.stage == "Training":
             shares.append(progress.share)
             left.append(progress.figures()["left_s"])
@@ -373,9 +360,7 @@ def test_more_training(
 
 @pytest.mark.parametrize("strategy", STRATEGIES)
 @pytest.mark.parametrize("schedule", ["default", "paper"])
-def test_every_strategy_and_schedule_runs(
-    toy: Capture, tmp_path: Path, strategy: str, schedule: str
-) -> None:
+def test_every_strategy_and_schedule_runs(toy, tmp_path, strategy, schedule):
     """Catches a combination that no other test trains, and an avatar's wrong convention."""
     settings = quick_settings(
         strategy, schedule=schedule, iterations=8, stray_reset_interval=3, density_interval=3
@@ -387,14 +372,14 @@ def test_every_strategy_and_schedule_runs(
     assert (read_selection(tmp_path, len(toy.faces)) != {}) == (strategy == "selective")
 
 
-def test_progress_tells_what_a_person_wants_to_know(toy: Capture, tmp_path: Path) -> None:
+def test_progress_tells_what_a_person_wants_to_know(toy, tmp_path):
     """Catches shares that do not end at one, speeds or losses that are never filled in, and a wait
     for kernels with nothing to look at."""
-    told: list[Progress] = []
-    figures: list[dict[str, float]] = []
-    first: list[int] = []
+    told = []
+    figures = []
+    first = []
 
-    def report(progress: Progress) -> bool:
+    def report(progress):
         figures.append(dict(progress.figures()))
         if progress.stage == "Compiling kernels" and progress.preview is not None:
             progress.preview(tmp_path / "first.npz")

@@ -18,7 +18,7 @@ VIEWS = [View(t, c, CAMERA, f"{t}_{c}", Path()) for t, n in FRAMES.items() for c
 EPOCH = len(VIEWS)
 
 
-def names(count: int, per_visit: int = 1, seed: int = 0, start: int = 0) -> list[str]:
+def names(count, per_visit=1, seed=0, start=0):
     return [view.name for view in islice(view_order(VIEWS, per_visit, seed, start), count)]
 
 
@@ -34,7 +34,7 @@ def test_every_view_once_an_epoch_and_another_order_each(per_visit):
         assert names(EPOCH, per_visit, start=start) == order[start : start + EPOCH]
 
 
-def visits(per_visit: int) -> list[int]:
+def visits(per_visit):
     """Lengths of the runs of one frame's views."""
     order = islice(view_order(VIEWS, per_visit, 3), EPOCH)
     return [len(list(group)) for _, group in groupby(order, lambda view: view.timestep)]

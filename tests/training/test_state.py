@@ -1,6 +1,7 @@
 """Rows travel with everything that belongs to them."""
 
 import numpy as np
+from numpy.testing import assert_array_equal
 
 from stga_addon.training.optimize.state import arrays_of, join, keep_rows, new_state
 
@@ -17,7 +18,7 @@ def test_keep_and_join():
     order = np.concatenate([np.flatnonzero(keep), np.flatnonzero(~keep)])
     joined = arrays_of(join(kept, rest))
     for name, array in arrays_of(state).items():
-        np.testing.assert_array_equal(joined[name], array[order], err_msg=name)
+        assert_array_equal(joined[name], array[order], err_msg=name)
         assert joined[name].dtype == array.dtype
         assert joined[name].flags.c_contiguous
 
@@ -31,10 +32,10 @@ def test_memory_is_shared_where_promised_and_only_there():
     copy = state.splats()
     state.parameters.xyz[:] += 1
     state.face[:] += 1
-    np.testing.assert_array_equal(splats.xyz, xyz)
-    np.testing.assert_array_equal(splats.face, face)
-    np.testing.assert_array_equal(copy.xyz, xyz)
-    np.testing.assert_array_equal(state.average.xyz, xyz)
+    assert_array_equal(splats.xyz, xyz)
+    assert_array_equal(splats.face, face)
+    assert_array_equal(copy.xyz, xyz)
+    assert_array_equal(state.average.xyz, xyz)
     assert all(
         not array.any() for part in (state.gradients, state.first, state.second) for array in part
     )

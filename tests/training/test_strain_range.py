@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from numpy.testing import assert_array_equal
 
 from stga_addon.avatar.file import Avatar, read_avatar, write_avatar
 from stga_addon.avatar.strain import (
@@ -13,7 +14,6 @@ from stga_addon.avatar.strain import (
     strain_basis,
     trained_range,
 )
-from stga_addon.capture.model import Capture
 from stga_addon.errors import StgaError
 from stga_addon.files import write_npz
 from stga_addon.training.evaluate.forecast import kept_line
@@ -31,12 +31,12 @@ from .toys import quick_settings, random_splats, stop_at
 COLORS = "strain_color", "normal_color"
 
 
-def deformed(toy: Capture, timestep: int) -> np.ndarray:
+def deformed(toy, timestep):
     """The toy's mesh, stretched by another amount along each axis in each timestep."""
     return np.asarray(toy.neutral) * (1 + 0.03 * np.random.default_rng(timestep).normal(size=3))
 
 
-def strains(toy: Capture, timesteps: set[int]) -> np.ndarray:
+def strains(toy, timesteps):
     basis = strain_basis(toy.neutral, toy.faces, trained_range(len(toy.faces)))
     return np.stack([deformation(basis, deformed(toy, t)) for t in sorted(timesteps)])
 
@@ -48,7 +48,6 @@ def test_a_run_writes_the_range_of_what_it_trained(toy, tmp_path):
     found = read_avatar(train_run(capture, tmp_path / "on", Run(toy.root, None, "vhap", settings)))
     trained = strains(toy, {view.timestep for view in toy.views["train"]})
     limits = found.strain_range
-    assert limits is not None
     assert (limits[:, 0] <= trained.min(0)).all()
     assert (trained.max(0) <= limits[:, 1]).all()
     assert (trained.max(0) * 1.21 + 1e-6 >= limits[:, 1])[trained.max(0) > 0].all()
@@ -74,15 +73,13 @@ def test_a_continuation_keeps_what_its_parent_saw(toy, tmp_path):
     continuation = Continuation(tmp_path, "", 0, 0)
     alone = trained_strain_range(toy, lambda t: deformed(toy, t), None)
     both = trained_strain_range(toy, lambda t: deformed(toy, t), continuation)
-    assert alone is not None
-    assert both is not None
-    np.testing.assert_array_equal(both[:, 0], np.minimum(alone[:, 0], -0.5))
+    assert_array_equal(both[:, 0], np.minimum(alone[:, 0], -0.5))
     # its parent followed stretch
-    np.testing.assert_array_equal(both[:, 1, :2], np.float32(-MIN_COMPRESSION))
-    np.testing.assert_array_equal(both[:, 1, 2:], np.maximum(alone[:, 1, 2:], np.float32(0.01)))
+    assert_array_equal(both[:, 1, :2], np.float32(-MIN_COMPRESSION))
+    assert_array_equal(both[:, 1, 2:], np.maximum(alone[:, 1, 2:], np.float32(0.01)))
     write_avatar(tmp_path / "avatar.npz", replace(parent, strain_range=None))
     unlimited = trained_strain_range(toy, lambda t: deformed(toy, t), continuation)
-    np.testing.assert_array_equal(unlimited, np.broadcast_to(TRAINED_RANGE, (count, 2, 6)))
+    assert_array_equal(unlimited, np.broadcast_to(TRAINED_RANGE, (count, 2, 6)))
 
 
 def test_colors_follow_compression_and_shear_but_no_stretch(toy):
@@ -92,11 +89,11 @@ def test_colors_follow_compression_and_shear_but_no_stretch(toy):
     larger, little, smaller = (
         deformation(basis, scale * np.asarray(toy.neutral)) for scale in (1.05, 0.985, 0.9)
     )
-    np.testing.assert_array_equal(larger[:, :2], np.float32(-MIN_COMPRESSION))
-    np.testing.assert_array_equal(little[:, :2], np.float32(-MIN_COMPRESSION))
+    assert_array_equal(larger[:, :2], np.float32(-MIN_COMPRESSION))
+    assert_array_equal(little[:, :2], np.float32(-MIN_COMPRESSION))
     assert (smaller[:, :2] < -0.4).all()
     limits = trained_strain_range(toy, lambda t: 1.05 * np.asarray(toy.neutral), None)
-    np.testing.assert_array_equal(limits[:, :, :2], np.float32(-MIN_COMPRESSION))
+    assert_array_equal(limits[:, :, :2], np.float32(-MIN_COMPRESSION))
     sheared = np.asarray(toy.neutral) @ np.array([[1, 0.1, 0], [0, 1, 0], [0, 0, 1.0]])
     shear = deformation(basis, sheared)[:, 2]
     assert shear.min() < -0.05

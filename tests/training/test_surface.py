@@ -1,10 +1,10 @@
 """What outlines tell of a head's surface, and what splats are like that no view tells of."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 from PIL import Image
 from scipy.ndimage import binary_dilation
 
@@ -32,7 +32,7 @@ COLLAR_M = 0.01
 
 
 @pytest.fixture(scope="module")
-def filmed(tmp_path_factory: pytest.TempPathFactory) -> Capture:
+def filmed(tmp_path_factory):
     """The bundled head by one camera that goes 60° to either side, its masks as of a head whose
     scalp and shoulders stand out."""
     folder = tmp_path_factory.mktemp("filmed")
@@ -53,7 +53,7 @@ def filmed(tmp_path_factory: pytest.TempPathFactory) -> Capture:
     return capture_of(folder, neutral, tuple(views))
 
 
-def normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+def normals(vertices, faces):
     a, b, c = vertices[faces].swapaxes(0, 1)
     total = np.zeros_like(vertices)
     for corner in faces.T:
@@ -61,7 +61,7 @@ def normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     return total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-12)
 
 
-def capture_of(root: Path, neutral: np.ndarray, views: tuple[View, ...]) -> Capture:
+def capture_of(root, neutral, views):
     model = flame_model(None)
     return Capture(
         root=root,
@@ -101,10 +101,8 @@ def test_an_end_of_a_bust_is_no_eye(filmed):
     border = frames.surface.border
     bound, unbound = frames.scale_limits(quick_settings(scale_limit=3.0, unbound_scale_limit=2.0))
     is_seen = frames.surface.facing > GRAZING_COSINE
-    np.testing.assert_allclose(
-        bound[border & is_seen], 0.6 * frames.units[border & is_seen], rtol=1e-6
-    )
-    np.testing.assert_allclose(unbound[is_seen], 2 * voxel_size(filmed.neutral), rtol=1e-6)
+    assert_allclose(bound[border & is_seen], 0.6 * frames.units[border & is_seen], rtol=1e-6)
+    assert_allclose(unbound[is_seen], 2 * voxel_size(filmed.neutral), rtol=1e-6)
     height = filmed.neutral[filmed.faces[border]][:, :, 1].min(1)
     assert border.sum() > 20
     assert height.max() < -0.1
@@ -145,11 +143,11 @@ def test_flat_splats_look_the_same_from_the_front(axis):
     after = covariances(*flattened(rotation, log_scale, axis, limit))
     others = [n for n in range(3) if n != axis]
     rows = np.ix_(range(500), others, others)
-    np.testing.assert_allclose(after[rows], before[rows], rtol=1e-4, atol=1e-9)
-    np.testing.assert_allclose(np.sqrt(after[:, axis, axis]), limit, rtol=1e-3, atol=1e-6)
+    assert_allclose(after[rows], before[rows], rtol=1e-4, atol=1e-9)
+    assert_allclose(np.sqrt(after[:, axis, axis]), limit, rtol=1e-3, atol=1e-6)
 
 
-def covariances(rotation: np.ndarray, log_scale: np.ndarray) -> np.ndarray:
+def covariances(rotation, log_scale):
     sides = to_matrices(rotation.astype(np.float64)) * np.exp(log_scale.astype(np.float64))[:, None]
     return sides @ sides.swapaxes(1, 2)
 
@@ -180,13 +178,13 @@ def test_what_views_tell_is_kept(filmed):
     rows = of_grazing & ~told & ~prior.sides.triangles[state.face]
     assert rows.sum() > 100
     color = 0.5 + SH_C0 * state.parameters.sh[rows, 0]
-    np.testing.assert_allclose(color, prior.sides.color[state.face[rows]], atol=1e-3)
+    assert_allclose(color, prior.sides.color[state.face[rows]], atol=1e-3)
     height = state.parameters.xyz[rows, 2]
     hair = surface.hair_height[state.face[rows]]
     outer = 0.8 * hair - voxel_size(filmed.neutral) / 2
     edges = np.diff(filmed.neutral[filmed.faces[state.face[rows]]], axis=1).swapaxes(0, 1)
     skin = -0.1 * np.sqrt(np.linalg.norm(np.cross(*edges), axis=1))
-    np.testing.assert_allclose(height, np.where(outer > 0, outer, skin), atol=1e-5)
+    assert_allclose(height, np.where(outer > 0, outer, skin), atol=1e-5)
 
 
 def test_the_sides_that_were_filmed(filmed):
@@ -194,14 +192,14 @@ def test_the_sides_that_were_filmed(filmed):
     mesh."""
     empty = hidden_splats(FrameStore(filmed, "stga"), quick_settings()).rows([])
 
-    def sides_of(turn: np.ndarray, angles: range) -> str:
+    def sides_of(turn, angles):
         views = tuple(view for view in filmed.views["train"] if view.timestep in angles)
         hidden = Surface(replace(filmed, views={"train": views})).hidden
         regions = {**filmed.regions, UNSEEN_REGION: hidden}
         neutral = (filmed.neutral @ turn.T).astype(np.float32)
         return filmed_sides(Avatar(empty, "stga", neutral, filmed.faces, regions=regions))
 
-    def filmed_from(right: int, left: int) -> str:
+    def filmed_from(right, left):
         return (
             f"filmed from {right}° on its right to {left}° on its left; what is beyond is plausible"
         )

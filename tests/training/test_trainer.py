@@ -1,17 +1,16 @@
 """One step of training: what a local iteration touches, and its whole gradient."""
 
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
 from capture import factory
+from numpy.testing import assert_allclose, assert_array_equal
 from PIL import Image
 
 from stga_addon.avatar.embedding import face_frames, to_world
 from stga_addon.avatar.offsets import OFFSETS
 from stga_addon.capture.images import read_image
-from stga_addon.capture.model import Capture, View
 from stga_addon.capture.open import open_capture
 from stga_addon.training.optimize.backend import RenderOptions
 from stga_addon.training.optimize.cpu_backend import CpuBackend
@@ -29,36 +28,36 @@ from .toys import bits, quick_settings
 WHITE = np.ones(3, np.float32)
 
 
-def lower_part(capture: Capture) -> dict[int, np.ndarray]:
+def lower_part(capture):
     """The capture's mouth selected in timesteps 1 and 3, nothing in 0, and 4 left out."""
     nothing = np.zeros(len(capture.faces), bool)
     return {0: nothing, 1: capture.regions["mouth"], 3: capture.regions["mouth"]}
 
 
-def make_trainer(capture: Capture, strategy: str = "selective", **changes: Any) -> Trainer:
+def make_trainer(capture, strategy="selective", **changes):
     quiet = {"density_interval": 0, "stray_reset_interval": 0, "driven_offsets": tuple(OFFSETS)}
     quiet |= {"warm_up_share": 0.0, "global_interval": 2}
     return Trainer(capture, quick_settings(strategy, **{**quiet, **changes}), lower_part(capture))
 
 
-def cpu_backend(trainer: Trainer) -> CpuBackend:
+def cpu_backend(trainer):
     assert isinstance(trainer._backend, CpuBackend)
     return trainer._backend
 
 
-def view_of(capture: Capture, timestep: int, camera: int = 1) -> View:
+def view_of(capture, timestep, camera=1):
     views = [v for split in capture.views.values() for v in split]
     return next(v for v in views if (v.timestep, v.camera_index) == (timestep, camera))
 
 
-def large(view: View, factor: float = 3.0) -> tuple[View, np.ndarray]:
+def large(view, factor=3.0):
     """In a larger image, and a noisy target: many tiles and a gradient everywhere."""
     view = replace(view, camera=view.camera.scaled(factor))
     size = view.camera.height, view.camera.width, 3
     return view, np.random.default_rng(0).integers(0, 256, size, np.uint8)
 
 
-def disturb(trainer: Trainer) -> None:
+def disturb(trainer):
     """Rows unlike each other, and as many coefficients as there may be."""
     rng = np.random.default_rng(1)
     for value, average in zip(trainer.state.parameters, trainer.state.average, strict=True):
@@ -81,7 +80,7 @@ def test_a_local_iteration_leaves_frozen_rows_bit_identical(toy):
     selected = toy.regions["mouth"][trainer.state.face]
     assert 0.05 < selected.mean() < 0.5
     for name in before:
-        np.testing.assert_array_equal(after[name][~selected], before[name][~selected], err_msg=name)
+        assert_array_equal(after[name][~selected], before[name][~selected], err_msg=name)
     for name in ("parameters/xyz", "parameters/sh", "first/opacity", "second/rotation", "steps"):
         changed = (after[name] != before[name]).any(axis=1)
         # Those on the far side of the ball may be invisible, the rest are trained.
@@ -110,7 +109,7 @@ def test_local_gradient_is_the_whole_images(toy, degree, camera):
         array.fill(7.0)
     rows, screen, loss = step._backward(frames, view, target, options, focus)
     assert loss is None
-    np.testing.assert_array_equal(np.sort(rows), np.sort(wanted))
+    assert_array_equal(np.sort(rows), np.sort(wanted))
     assert 20 < len(rows) < 0.5 * len(trainer.state)
     others = np.setdiff1d(np.arange(len(trainer.state)), rows)
     unused = trainer.state.gradients.sh[:, (degree + 1) ** 2 :]
@@ -119,8 +118,8 @@ def test_local_gradient_is_the_whole_images(toy, degree, camera):
     for name, array in trainer.state.gradients._asdict().items():
         difference = np.abs(array[rows] - full[name][rows]).max(initial=0)
         assert difference <= 1e-6 * np.abs(full[name][rows]).max(initial=0), name
-        np.testing.assert_array_equal(array[others], 7.0)
-    np.testing.assert_allclose(screen[rows], screen_gradient[rows], rtol=1e-5)
+        assert_array_equal(array[others], 7.0)
+    assert_allclose(screen[rows], screen_gradient[rows], rtol=1e-5)
 
 
 @pytest.mark.parametrize("timestep", [0, 4])
@@ -197,7 +196,7 @@ def test_initial_splats_with_hull_points(tmp_path):
     assert len(full) > len(bare) + 100
     assert full.unbound[len(bare) :].all()
     for name, value in vars(bare).items():
-        np.testing.assert_array_equal(getattr(full, name)[: len(bare)], value)
+        assert_array_equal(getattr(full, name)[: len(bare)], value)
 
 
 @pytest.mark.parametrize(
@@ -236,7 +235,7 @@ def test_unseen_share(toy):
         row = camera.fl_y * y / z + camera.cy
         beside = (column < 0) | (column >= camera.width) | (row < 0) | (row >= camera.height)
         unseen.append(beside | (z < 0.01))
-    np.testing.assert_allclose(found[::2], np.mean(unseen, axis=0)[::2], atol=1e-6)
+    assert_allclose(found[::2], np.mean(unseen, axis=0)[::2], atol=1e-6)
     assert not found[1::2].any()
     assert 0.05 < found[::2].mean() < 0.95
 
@@ -247,7 +246,7 @@ def test_render_shows_the_average(toy):
     view = view_of(toy, 1)
     picture = trainer.render(view)
     trainer.state.parameters.opacity[:] = -20
-    np.testing.assert_array_equal(trainer.render(view), picture)
+    assert_array_equal(trainer.render(view), picture)
     trainer.state.average.opacity[:] = -20
     assert trainer.render(view).min() == 1
 
@@ -262,8 +261,8 @@ def test_scale_limits_in_meters(toy, convention):
     facing = store.surface.facing
     share = np.interp(facing, (UNSEEN_COSINE, GRAZING_COSINE), (UNSEEN_LIMIT_SHARE, 1))
     assert 0 < (share < 1).mean() < 0.8
-    np.testing.assert_allclose(bound, 3 * share * store.units, rtol=1e-6)
+    assert_allclose(bound, 3 * share * store.units, rtol=1e-6)
     diagonal = np.linalg.norm(toy.neutral.max(0) - toy.neutral.min(0))
     frames = face_frames(toy.neutral, toy.faces, toy.neutral, convention)
     expected = 2 * max(0.004, diagonal / 200) * share
-    np.testing.assert_allclose(unbound * frames.scale, expected, rtol=1e-5)
+    assert_allclose(unbound * frames.scale, expected, rtol=1e-5)

@@ -5,12 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from capture import factory
+from numpy.testing import assert_allclose, assert_array_equal
 from PIL import Image
 
 from stga_addon.capture.camera import look_at
 from stga_addon.capture.images import read_image
 from stga_addon.capture.mesh_geometry import connected_parts, rasterize
-from stga_addon.capture.model import Capture, View
+from stga_addon.capture.model import View
 from stga_addon.flame.model import faces_within
 from stga_addon.flame.parts import flame_model, key_regions
 from stga_addon.training.optimize.change import Turn
@@ -18,7 +19,7 @@ from stga_addon.training.optimize.frames import FrameStore
 from stga_addon.training.optimize.surface import Surface
 from stga_addon.training.optimize.surface_prior import SurfacePrior
 from stga_addon.training.optimize.trainer import Trainer
-from stga_addon.training.optimize.unseen_sides import UnseenSides, unseen_sides
+from stga_addon.training.optimize.unseen_sides import unseen_sides
 
 from .heads import PLACES, write_head
 from .toys import Rows, quick_settings
@@ -27,12 +28,12 @@ CAMERA = 3
 """Sees the ball's +x side and front, from 40° beside the middle."""
 
 
-def sides_of(capture: Capture) -> UnseenSides:
+def sides_of(capture):
     return unseen_sides(Surface(capture))
 
 
 @pytest.fixture(scope="module")
-def from_one_side(tmp_path_factory: pytest.TempPathFactory) -> Capture:
+def from_one_side(tmp_path_factory):
     capture, _ = write_head(tmp_path_factory.mktemp("side"), error=0.0)
     own = [view for view in capture.views["train"] if view.camera_index == CAMERA]
     views = [view for view in own if view.timestep == 0]
@@ -56,7 +57,7 @@ def test_what_is_hidden_and_what_it_looks_like(from_one_side):
     partner = (mirrored @ direction.T).argmax(1)
     copied = sides.triangles & (cosine[partner] > 0.7)
     assert copied.sum() > 20
-    np.testing.assert_array_equal(sides.color[copied], sides.color[partner[copied]])
+    assert_array_equal(sides.color[copied], sides.color[partner[copied]])
     trainer = Trainer(
         capture, quick_settings("global", iterations=200, lattice=1, sh_degree=1, sh_steps=()), {}
     )
@@ -68,7 +69,7 @@ def test_what_is_hidden_and_what_it_looks_like(from_one_side):
     splats = trainer.state.splats()
     far = sides.triangles[splats.face]
     expected = (sides.color[splats.face[far]] - 0.5) / 0.28209479177387814
-    np.testing.assert_allclose(splats.sh[far, 0], expected, atol=1e-6)
+    assert_allclose(splats.sh[far, 0], expected, atol=1e-6)
     assert (splats.sh[far, 1:] == 0).all()
     near = splats.sh[~far, 0] - (sides.color[splats.face[~far]] - 0.5) / 0.28209479177387814
     assert np.abs(near).max() > 0.01
@@ -90,7 +91,7 @@ def test_a_side_that_one_view_shows_is_not_unseen(from_one_side):
     both = sides_of(replace(capture, views={"train": (view, turned)})).triangles
     assert (alone & ~beside).sum() > 20
     assert (beside & ~alone).sum() > 20
-    np.testing.assert_array_equal(both, alone & beside)
+    assert_array_equal(both, alone & beside)
 
 
 def test_restored_colors_are_those_of_the_avatar(from_one_side):
@@ -110,10 +111,10 @@ def test_restored_colors_are_those_of_the_avatar(from_one_side):
     assert 0 < far.sum() < len(far)
     expected = (sides.color[state.face[far]] - 0.5) / 0.28209479177387814
     for part in (state.parameters, state.average):
-        np.testing.assert_allclose(part.sh[far, 0], expected, atol=1e-6)
+        assert_allclose(part.sh[far, 0], expected, atol=1e-6)
         assert (part.sh[far, 1:] == 0).all()
     for name, old in before.items():
-        np.testing.assert_array_equal(getattr(state, name).sh[~far], old[~far])
+        assert_array_equal(getattr(state, name).sh[~far], old[~far])
     assert (state.first.sh[far] == 0).all()
     assert (state.second.sh[far] == 0).all()
 
@@ -134,7 +135,7 @@ def test_a_glance_counts(from_one_side):
     video = replace(capture, views={"train": tuple(views)}, mesh=lambda _: posed)
     facing = Surface(video).facing
     both = Surface(replace(capture, views={"train": (view, glance)})).facing
-    np.testing.assert_array_equal(facing, both)
+    assert_array_equal(facing, both)
 
 
 HAIR = np.array([40, 25, 15], np.uint8)

@@ -11,7 +11,7 @@ from command_line import refused, stga
 from PIL import Image
 from scipy.ndimage import gaussian_filter, map_coordinates
 
-from stga_addon.capture.camera import Camera, look_at
+from stga_addon.capture.camera import look_at
 from stga_addon.capture.open import open_capture
 from stga_addon.render.render import render
 from stga_addon.training import world
@@ -27,7 +27,7 @@ WALL_M = 1.0
 """Behind the person, who is at the origin."""
 
 
-def wall(camera: Camera, texture: np.ndarray) -> np.ndarray:
+def wall(camera, texture):
     """(H, W, 3): a textured wall at z = −WALL_M, one texel to a centimeter, by rays."""
     y, x = np.mgrid[: camera.height, : camera.width]
     origin = camera.position
@@ -38,13 +38,13 @@ def wall(camera: Camera, texture: np.ndarray) -> np.ndarray:
     return np.stack(colors, 1).reshape(camera.height, camera.width, 3).astype(np.float32)
 
 
-def camera_at(degrees: float) -> Camera:
+def camera_at(degrees):
     angle = np.radians(degrees)
     eye = (1.1 * np.sin(angle), 0.05, 1.1 * np.cos(angle))
     return look_at(eye, (0, 0, 0), width=120, height=160, focal_length=280)
 
 
-def plates_of(texture: np.ndarray) -> list[CleanPlate]:
+def plates_of(texture):
     cameras = [camera_at(degrees) for degrees in (-24, -8, 8, 24)]
     seen = np.ones((160, 120), bool)
     return [CleanPlate(camera, wall(camera, texture), seen) for camera in cameras]
@@ -83,7 +83,7 @@ STRIPES = (np.array([110, 90, 150]) + WAVES).round().astype(np.uint8)
 
 
 @pytest.fixture(scope="module")
-def walled(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def walled(tmp_path_factory):
     """The toy's capture, its ball before stripes."""
     root = factory.write_mesh_capture(tmp_path_factory.mktemp("walled"), (0, 1, 3, 4), range(4))
     inside = factory.silhouette()[..., None]
@@ -97,7 +97,7 @@ EFFECTS = ("--effect", "world=on", "--effect", "exposure=off")
 
 
 @pytest.fixture(scope="module")
-def run(walled: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def run(walled, tmp_path_factory):
     folder = tmp_path_factory.mktemp("run") / "run"
     assert stga("train", walled, "--out", folder, "--iterations 60", *EFFECTS) == 0
     return folder

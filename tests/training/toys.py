@@ -1,23 +1,18 @@
 """States and settings small enough to check by hand."""
 
 import math
-from collections.abc import Collection
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 from avatar.conftest import splats_of
 
-from stga_addon.avatar.splats import Splats
-from stga_addon.progress import Report
 from stga_addon.training.optimize.cpu_backend import CpuBackend
-from stga_addon.training.optimize.state import TrainState, arrays_of, new_state
+from stga_addon.training.optimize.state import arrays_of, new_state
 from stga_addon.training.run.checkpoint import read_checkpoint
-from stga_addon.training.settings import TrainingSettings, make_settings
+from stga_addon.training.settings import make_settings
 
 
-def random_splats(count: int, faces: int, seed: int = 0, degree: int = 1) -> Splats:
+def random_splats(count, faces, seed=0, degree=1):
     rng = np.random.default_rng(seed)
     bound = splats_of(
         0.01 * rng.normal(size=(count, 3)),
@@ -30,7 +25,7 @@ def random_splats(count: int, faces: int, seed: int = 0, degree: int = 1) -> Spl
     return replace(bound, unbound=rng.random(count) < 0.3)
 
 
-def random_state(count: int, faces: int, seed: int = 0, degree: int = 1) -> TrainState:
+def random_state(count, faces, seed=0, degree=1):
     """A state in the middle of training: no two rows alike in anything."""
     state = new_state(random_splats(count, faces, seed, degree))
     rng = np.random.default_rng(seed)
@@ -44,17 +39,17 @@ def random_state(count: int, faces: int, seed: int = 0, degree: int = 1) -> Trai
     return state
 
 
-def quick_settings(strategy: str = "selective", **changes: Any) -> TrainingSettings:
+def quick_settings(strategy="selective", **changes):
     """Without hull points, which have tests of their own."""
     return make_settings(strategy, **{"iterations": 100, "hull_points": False, **changes})
 
 
-def stop_at(iteration: int | None) -> Report:
+def stop_at(iteration):
     """A report that stops a training after so many iterations; None: not at all."""
     return lambda progress: progress.figures().get("iteration", 0) >= (iteration or math.inf)
 
 
-def assert_same_state(folder: Path, expected: Path) -> None:
+def assert_same_state(folder, expected):
     """The checkpoints of two runs, bit for bit."""
     ours = read_checkpoint(folder)
     theirs = read_checkpoint(expected)
@@ -70,17 +65,17 @@ def assert_same_state(folder: Path, expected: Path) -> None:
 class Rows(CpuBackend):
     """The rows of a state alone; columns are copies that cannot be written to, as a device's."""
 
-    def __init__(self, state: TrainState) -> None:
+    def __init__(self, state):
         self.state = state
 
-    def columns(self, names: Collection[str]) -> dict[str, np.ndarray]:
+    def columns(self, names):
         found = {name: array.copy() for name, array in super().columns(names).items()}
         for array in found.values():
             array.setflags(write=False)
         return found
 
 
-def bits(state: TrainState) -> dict[str, np.ndarray]:
+def bits(state):
     """Every array as bytes per row, so that NaN and −0 compare; without gradients."""
     arrays = {
         name: array for name, array in arrays_of(state).items() if not name.startswith("gradients")

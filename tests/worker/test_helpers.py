@@ -199,7 +199,7 @@ messages.flush()
 
 
 @pytest.mark.parametrize("closed", [False, True])
-def test_only_messages_reach_standard_output(closed: bool) -> None:
+def test_only_messages_reach_standard_output(closed):
     """Catches output of libraries between messages, and a closed standard error that ends it."""
     done = subprocess.run([sys.executable, "-c", CLAIM.format(closed=closed)], capture_output=True)
     assert done.returncode == 0, done.stderr

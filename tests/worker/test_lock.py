@@ -7,9 +7,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator
-from contextlib import AbstractContextManager, contextmanager
-from pathlib import Path
+from contextlib import contextmanager
 
 import pytest
 from filelock import FileLock
@@ -27,11 +25,11 @@ HOLD = (
 )
 
 
-def hold(path: Path) -> AbstractContextManager[object]:
+def hold(path):
     return hold_folder(path.parent, path.name, "holder")
 
 
-def test_a_lock_ends_with_its_process(tmp_path: Path) -> None:
+def test_a_lock_ends_with_its_process(tmp_path):
     """Catches a worker alive for ever after kill -9, and a probe that leaves a file."""
     path = tmp_path / "worker.lock"
     assert not is_locked(path)
@@ -39,7 +37,6 @@ def test_a_lock_ends_with_its_process(tmp_path: Path) -> None:
     command = [sys.executable, "-c", HOLD, str(tmp_path)]
     pipe = subprocess.PIPE
     with subprocess.Popen(command, stdin=pipe, stdout=pipe, text=True) as other:
-        assert other.stdout is not None
         assert other.stdout.readline() == "held\n"
         assert is_locked(path)
         assert lock_owner(path) == other.pid
@@ -73,12 +70,12 @@ def test_what_is_no_lock_file(tmp_path):
 
 
 @contextmanager
-def probed(path: Path) -> Iterator[None]:
+def probed(path):
     """Hold the lock for a moment in another thread, as a probe of another process does, while the
     block runs."""
     begun = threading.Event()
 
-    def hold() -> None:
+    def hold():
         with FileLock(path):
             begun.set()
             time.sleep(0.1)
@@ -91,7 +88,7 @@ def probed(path: Path) -> Iterator[None]:
     thread.join()
 
 
-def test_probes_disturb_nobody(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_probes_disturb_nobody(tmp_path, monkeypatch):
     """Catches a probe that another one takes for a lock, or that keeps a worker from starting."""
     monkeypatch.setattr(lock, "PROBE_TIMEOUT_S", 10.0)
     monkeypatch.setattr(lock, "ACQUIRE_TIMEOUT_S", 10.0)
@@ -106,7 +103,7 @@ def test_storage_without_locks(tmp_path, monkeypatch):
     answers as an NFS without its lock service does."""
     fcntl = pytest.importorskip("fcntl")
 
-    def flock(descriptor: int, operation: int) -> None:
+    def flock(descriptor, operation):
         raise OSError(errno.ENOLCK, "No locks available")
 
     monkeypatch.setattr(fcntl, "flock", flock)

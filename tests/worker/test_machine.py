@@ -1,7 +1,5 @@
 """Processors and memory of containers, from the files of Linux's control groups."""
 
-from pathlib import Path
-
 import pytest
 
 from stga_addon.worker.machine import free_memory_gb, processors
@@ -36,7 +34,7 @@ NONE_1 = {
 }
 
 
-def below(folder: str, files: dict[str, object]) -> dict[str, object]:
+def below(folder, files):
     return {f"{folder}/{name}": value for name, value in files.items()}
 
 
@@ -74,7 +72,7 @@ CASES = {
 
 
 @pytest.mark.parametrize("case", CASES)
-def test_a_container_has_what_it_is_given(tmp_path: Path, monkeypatch, case) -> None:
+def test_a_container_has_what_it_is_given(tmp_path, monkeypatch, case):
     """Catches a batch planned with the processors and memory of a container's host, a limit of a
     group above, and pages of files that count as memory in use."""
     groups, mounts, shown, files, expected, free = CASES[case]

@@ -9,7 +9,6 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -62,9 +61,9 @@ def start(tmp_path, monkeypatch):
     path = os.pathsep.join([str(ROOT), str(tmp_path)])
     environment = lambda variables, python: {**variables, "PYTHONPATH": path}  # noqa: E731
     monkeypatch.setattr(launch, "worker_environment", environment)
-    running: list[subprocess.Popen[bytes]] = []
+    running = []
 
-    def run(action: str = "work") -> tuple[Path, "subprocess.Popen[bytes]"]:
+    def run(action="work"):
         folder = tmp_path / "status"
         prepare_status_folder(folder)
         running.append(start_worker(folder, sys.executable, ["counting", str(folder), action]))
@@ -76,7 +75,7 @@ def start(tmp_path, monkeypatch):
         process.wait()
 
 
-def wait(condition: Callable[[], bool], seconds: float = 20.0) -> None:
+def wait(condition, seconds=20.0):
     deadline = time.monotonic() + seconds
     while not condition():
         assert time.monotonic() < deadline
@@ -273,7 +272,7 @@ def test_status_round_trip(tmp_path, monkeypatch):
 def test_full_disk_does_not_stop_the_work(tmp_path, monkeypatch):
     """Catches a worker that fails with its status, and a cause that is not reported."""
 
-    def full(path: Path, value: object, **options: object) -> None:
+    def full(path, value, **options):
         raise StgaError(f"{path}: cannot be written ({os.strerror(errno.ENOSPC)})")
 
     with status.status_writer(tmp_path) as writer:

@@ -6,8 +6,6 @@ import re
 import subprocess
 import sys
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
 
 import pytest
 from batch.simulated import InProcessEngine
@@ -16,7 +14,6 @@ from command_line import refused, stga
 from refusal import refusal
 
 import stga_addon.development.commands  # noqa: F401 (adds its requests)
-from stga_addon.capture.model import Capture
 from stga_addon.cli.main import main
 from stga_addon.development.benchmark import scheduler, variants
 from stga_addon.development.benchmark.benchmark import write_report
@@ -32,7 +29,6 @@ from stga_addon.development.benchmark.worker import QUALITY, work
 from stga_addon.jobs.perform import perform, request_folder, write_request
 from stga_addon.jobs.train import Train
 from stga_addon.progress import Cancelled, Progress
-from stga_addon.progress import Progress as WorkProgress
 from stga_addon.training.run.checkpoint import read_checkpoint
 from stga_addon.training.run.folder import read_run
 from stga_addon.training.run.metrics_log import read_metrics
@@ -42,17 +38,17 @@ TINY = {"lattice": 0, "hull_points": False, "sh_degree": 0, "sh_steps": (), "den
 VARIANTS = {"standard": TINY, "coarse": {**TINY, "scale": 0.5}}
 
 
-def run_in(capture: Capture, out: Path, **changes: Any) -> BenchmarkRun:
+def run_in(capture, out, **changes):
     return BenchmarkRun(
         Train(out, capture.root, make_settings(**{**TINY, **changes}), device="cpu")
     )
 
 
-def progress(share: float, iteration: int = 1) -> Progress:
+def progress(share, iteration=1):
     return Progress(share, figures=lambda: {"iteration": iteration})
 
 
-def test_one_run(toy: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_one_run(toy, tmp_path, monkeypatch):
     """Catches a worker without figures of the finished avatar, and mistakes as tracebacks."""
     monkeypatch.setattr("stga_addon.development.benchmark.worker.WARM_UP_S", 0.01)
     run = run_in(toy, tmp_path / "run", iterations=20)
@@ -81,9 +77,9 @@ def test_a_slice_is_stopped_and_goes_on(toy, tmp_path, monkeypatch):
     monkeypatch.setattr(variants, "MAIN_VARIANTS", VARIANTS)
     monkeypatch.setattr(scheduler, "TURN_S", 0.5)
     request = Benchmark(tmp_path, toy.root, 2.0, seed=4)
-    said: list[str] = []
+    said = []
 
-    def stop(progress: WorkProgress) -> bool:
+    def stop(progress):
         return progress.detail == "Turn 3 of 4"
 
     with pytest.raises(Cancelled):
@@ -92,7 +88,7 @@ def test_a_slice_is_stopped_and_goes_on(toy, tmp_path, monkeypatch):
     kept = {name: read_checkpoint(tmp_path / name).elapsed_s for name in VARIANTS}
     assert all(0.5 <= elapsed < 1.9 for elapsed in kept.values())
     said.clear()
-    shares: list[float] = []
+    shares = []
     perform(request, lambda progress: bool(shares.append(progress.share)), said.append)
     starts = [text for text in said if "Starting" in text]
     assert starts == [f"Starting {name}" for name in VARIANTS]
@@ -144,18 +140,18 @@ def test_workers_that_end_or_fail(toy, tmp_path, monkeypatch):
     interpreter.chmod(0o755)
     monkeypatch.setattr(sys, "executable", str(interpreter))
     monkeypatch.setattr(scheduler, "TURN_S", 0.5)
-    started: list[subprocess.Popen[str]] = []
+    started = []
 
     class Recorded(subprocess.Popen[str]):
-        def __init__(self, *arguments: Any, **options: Any) -> None:
+        def __init__(self, *arguments, **options):
             super().__init__(*arguments, **options)
             started.append(self)
 
-    ended: list[list[bool]] = []
+    ended = []
     monkeypatch.setattr(subprocess, "Popen", Recorded)
     runs = [run_in(toy, tmp_path / name, seconds=1.0) for name in ("first", "second")]
 
-    def look(text: str) -> None:
+    def look(text):
         ended.append([process.returncode is not None for process in started])
 
     train_in_turns(runs, look)
@@ -165,7 +161,7 @@ def test_workers_that_end_or_fail(toy, tmp_path, monkeypatch):
     assert (tmp_path / "python.trained").exists()
 
 
-def test_variants() -> None:
+def test_variants():
     """Catches a variant without settings of its own, and a table without the standard."""
     for table in (MAIN_VARIANTS, SETTING_VARIANTS):
         made = [make_settings(**{"seconds": 1.0, **changes}) for changes in table.values()]

@@ -1,10 +1,10 @@
 """Means, spreads and fronts against ones computed by hand."""
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 from stga_addon.development.benchmark.benchmark import report_text, table_lines
 from stga_addon.development.benchmark.statistics import (
@@ -16,12 +16,12 @@ from stga_addon.development.benchmark.statistics import (
 )
 
 
-def line(seconds: float, psnr: float, iteration: int = 0, **more: Any) -> dict[str, Any]:
+def line(seconds, psnr, iteration=0, **more):
     values = {"seconds": seconds, "psnr": psnr, "iteration": iteration}
     return values | {"splats": 7, "evaluation_s": 0.5, **more}
 
 
-def outcome(variant: str, seed: int, psnr: float, finished: bool = True) -> Outcome:
+def outcome(variant, seed, psnr, finished=True):
     """A run of 10 s and 100 iterations whose curve rises by 1 dB a second to `psnr`."""
     lines = [line(float(s), psnr - 10 + s, 10 * s) for s in range(1, 11)]
     return Outcome(variant, seed, lines, {"val": {"psnr": psnr, "ssim": 0.9}} if finished else {})
@@ -33,21 +33,21 @@ def test_mean_curves():
     fast = Outcome("a", 1, [line(1.0, 11.0), line(5.0, 15.0), line(9.0, 19.0)], {})
     curve = mean_curves([slow, fast, Outcome("b", 0, [line(1.0, 5.0)], {})])["a"]
     assert (curve.seconds[0], curve.seconds[-1]) == (2.0, 9.0)
-    np.testing.assert_allclose(curve.low, curve.seconds + 8)
-    np.testing.assert_allclose(curve.high, curve.seconds + 10)
-    np.testing.assert_allclose(curve.mean, curve.seconds + 9)
+    assert_allclose(curve.low, curve.seconds + 8)
+    assert_allclose(curve.high, curve.seconds + 10)
+    assert_allclose(curve.mean, curve.seconds + 9)
     fitted = Outcome("a", 0, [line(s, 35.0, psnr_unmatched=28.0) for s in (1.0, 5.0)], {})
     curves = mean_curves([fitted, Outcome("b", 0, [line(s, 30.0) for s in (1.0, 5.0)], {})])
-    np.testing.assert_allclose(curves["a"].mean, 28.0)
+    assert_allclose(curves["a"].mean, 28.0)
     assert [name for name, *_ in pareto_front(curves)] == ["b"]
 
 
-def curve(seconds: list[float], psnr: list[float]) -> MeanCurve:
+def curve(seconds, psnr):
     values = np.array(psnr)
     return MeanCurve(np.array(seconds), values, values, values)
 
 
-def test_the_front() -> None:
+def test_the_front():
     """Catches a variant on the front that another beat earlier, and time on it without any gain."""
     curves = {
         "early": curve([1, 2, 10], [20, 30, 30]),

@@ -5,6 +5,7 @@ import struct
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 from refusal import refusal
 
 from stga_addon.driving.inverse import write_performance
@@ -26,7 +27,7 @@ from .test_decoders import APPLY, blend, bundle, osc_text
 LINK = SOURCES["live_link_face"]
 
 
-def jaw(frame: int, value: float, **options) -> bytes:
+def jaw(frame, value, **options):
     return wire.live_link_face({"jawOpen": value}, frame, **options)
 
 
@@ -166,12 +167,12 @@ def test_recording():
         data = wire.live_link_face({"jawOpen": 1.0, "mouthLeft": 0.5}, 100 + frame, (0.4, 0, 0))
         recording.add(stream.receive("a", data, 3.0 * frame), 3.0 * frame)
     take = recording.performance()
-    np.testing.assert_allclose(take.times, np.array([0, 1, 2, 5]) / 60, atol=1e-6)
+    assert_allclose(take.times, np.array([0, 1, 2, 5]) / 60, atol=1e-6)
     assert take.lost == 2
-    np.testing.assert_allclose(take.weights[:, COLUMN["jawOpen"]], 1.0, atol=1e-6)
-    np.testing.assert_allclose(take.weights[:, COLUMN["mouthRight"]], (0.5 - 0.3) / 0.7, atol=1e-6)
-    np.testing.assert_allclose(take.weights[:, COLUMN["mouthLeft"]], 0)
-    np.testing.assert_allclose(take.head[:, 0], 0.3, atol=1e-6)
+    assert_allclose(take.weights[:, COLUMN["jawOpen"]], 1.0, atol=1e-6)
+    assert_allclose(take.weights[:, COLUMN["mouthRight"]], (0.5 - 0.3) / 0.7, atol=1e-6)
+    assert_allclose(take.weights[:, COLUMN["mouthLeft"]], 0)
+    assert_allclose(take.head[:, 0], 0.3, atol=1e-6)
     assert Recording(0, None).performance() is None
 
 
@@ -193,8 +194,8 @@ def test_a_recording_goes_on_where_the_clock_jumps(jump, tmp_path):
         recording.add(stream.receive("a", data, now), now)
     write_performance(tmp_path / "take.csv", recording.performance())
     take = read_performance(tmp_path / "take.csv")
-    np.testing.assert_allclose(take.weights[:, COLUMN["jawOpen"]], np.arange(60) / 100, atol=1e-6)
-    np.testing.assert_allclose(take.times, np.arange(60) / 60, atol=1 / 60)
+    assert_allclose(take.weights[:, COLUMN["jawOpen"]], np.arange(60) / 100, atol=1e-6)
+    assert_allclose(take.times, np.arange(60) / 60, atol=1 / 60)
     assert take.fps == pytest.approx(60, rel=1e-3)
 
 
@@ -210,7 +211,7 @@ def test_vmc_whose_clock_stands_still(sent):
         packet = stream.receive("a", data, number / 60)
         assert stream.shown == pytest.approx(number / 100)
         recording.add(packet, number / 60)
-    np.testing.assert_allclose(recording.performance().times, np.arange(60) / 60, atol=1e-6)
+    assert_allclose(recording.performance().times, np.arange(60) / 60, atol=1e-6)
 
 
 def test_smoothing():

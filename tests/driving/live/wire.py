@@ -16,14 +16,14 @@ for pair in ("jaw", "mouth"):
 
 
 def live_link_face(
-    weights: dict[str, float],
-    frame: int = 0,
-    head: tuple[float, float, float] = (0.0, 0.0, 0.0),
-    subject: str = "phone",
-    device: str = "DEVICE-1",
-    count: int = 61,
-    rate: int = 60,
-) -> bytes:
+    weights,
+    frame=0,
+    head=(0.0, 0.0, 0.0),
+    subject="phone",
+    device="DEVICE-1",
+    count=61,
+    rate=60,
+):
     """Version, device and subject, frame and rate, the values; big-endian."""
     values = [weights.get(name, 0.0) for name in UDP_ORDER] + [*head] + [0.0] * 6
     texts = device.encode(), subject.encode()
@@ -43,13 +43,13 @@ def facial_mocap(weights, head=(0, 0, 0), separator="-"):
     return ("|".join(fields) + rest).encode()
 
 
-def free_port() -> int:
+def free_port():
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         probe.bind(("127.0.0.1", 0))
         return probe.getsockname()[1]
 
 
-def mixed(seed: int) -> dict[str, float]:
+def mixed(seed):
     """A weight per shape that tells the shapes apart."""
     values = np.random.default_rng(seed).random(len(ARKIT_SHAPES)).astype(np.float32)
     return dict(zip(ARKIT_SHAPES, values.tolist(), strict=True))

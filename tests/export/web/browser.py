@@ -6,8 +6,6 @@ import select
 import shutil
 import subprocess
 import time
-from pathlib import Path
-from typing import Any
 
 NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
 FLAGS = (
@@ -25,7 +23,7 @@ FLAGS = (
 TIMEOUT_S = 120.0
 
 
-def find_browser() -> str | None:
+def find_browser():
     """Path of a Chromium; None where there is none."""
     return next((path for path in map(shutil.which, NAMES) if path), None)
 
@@ -34,13 +32,13 @@ class Browser:
     """One browser window. `requests` are the addresses that pages asked for, `errors` what they
     complained of."""
 
-    def __init__(self, executable: str, profile: Path, size: tuple[int, int] = (900, 700)) -> None:
+    def __init__(self, executable, profile, size=(900, 700)):
         """`executable`: of a Chromium (`find_browser`); `profile`: folder of its own files; `size`
         in pixels."""
         out_read, self._out = os.pipe()
         self._in, in_write = os.pipe()
 
-        def place() -> None:  # DevTools reads descriptor 3 and writes descriptor 4
+        def place():  # DevTools reads descriptor 3 and writes descriptor 4
             read = os.dup(out_read)
             write = os.dup(in_write)
             os.dup2(read, 3)
@@ -72,14 +70,14 @@ class Browser:
         for domain in ("Page", "Runtime", "Network", "Log"):
             self.send(f"{domain}.enable")
 
-    def close(self) -> None:
+    def close(self):
         """End the browser's process."""
         self._process.terminate()
         self._process.wait()
         os.close(self._out)
         os.close(self._in)
 
-    def send(self, method: str, **parameters: Any) -> dict[str, Any]:
+    def send(self, method, **parameters):
         """Result of a DevTools command."""
         self._number += 1
         message = {"id": self._number, "method": method, "params": parameters}
@@ -95,7 +93,7 @@ class Browser:
             self._note(answer)
         raise TimeoutError(method)
 
-    def open(self, address: str) -> None:
+    def open(self, address):
         """Load a page and wait until its scripts have run."""
         self.requests.clear()
         self.errors.clear()
@@ -103,7 +101,7 @@ class Browser:
         loaded = "document.readyState === 'complete' ? done() : addEventListener('load', done)"
         self.evaluate(f"new Promise(done => {loaded})")
 
-    def evaluate(self, expression: str) -> Any:
+    def evaluate(self, expression):
         """Value of a JavaScript expression; promises are awaited."""
         result = self.send(
             "Runtime.evaluate", expression=expression, awaitPromise=True, returnByValue=True
@@ -111,7 +109,7 @@ class Browser:
         assert "exceptionDetails" not in result, result["exceptionDetails"]
         return result["result"].get("value")
 
-    def _receive(self, deadline: float) -> dict[str, Any]:
+    def _receive(self, deadline):
         while b"\0" not in self._buffer:
             ready, _, _ = select.select([self._in], [], [], max(0.0, deadline - time.monotonic()))
             if not ready:
@@ -122,7 +120,7 @@ class Browser:
         message, _, self._buffer = self._buffer.partition(b"\0")
         return dict(json.loads(message))
 
-    def _note(self, event: dict[str, Any]) -> None:
+    def _note(self, event):
         details = event.get("params", {})
         if event.get("method") == "Network.requestWillBeSent":
             self.requests.append(details["request"]["url"])

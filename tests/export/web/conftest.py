@@ -1,8 +1,6 @@
 """A FLAME head with splats on it, in a motion of three frames."""
 
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,7 +13,7 @@ from stga_addon.avatar.offsets import OFFSETS
 from stga_addon.avatar.strain import seen_range, strain_basis
 from stga_addon.capture.camera import Camera, look_at
 from stga_addon.export.playback import Playback
-from stga_addon.export.rig import Rig, RiggedAvatar, flame_rig
+from stga_addon.export.rig import RiggedAvatar, flame_rig
 from stga_addon.export.skinned_gltf import skinned_glb
 from stga_addon.export.web.page import page
 from stga_addon.flame.forward import FlameFrame
@@ -33,13 +31,13 @@ READY = """new Promise((done) => {
 
 # not longer: the page would go on playing, on software graphics, beside other tests
 @pytest.fixture(scope="module")
-def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
+def browser(tmp_path_factory):
     opened = Browser(str(find_browser()), tmp_path_factory.mktemp("profile"), (500, 400))
     yield opened
     opened.close()
 
 
-def show(browser: Browser, folder: Path, data: bytes) -> None:
+def show(browser, folder, data):
     """Open the page of a data file from disk."""
     (folder / "a.html").write_text(page("Zoë", "", data), encoding="utf-8")
     browser.open((folder / "a.html").as_uri())
@@ -56,7 +54,7 @@ class Head:
     camera: Camera
 
     @property
-    def rig(self) -> Rig:
+    def rig(self):
         return flame_rig(self.sequence)
 
     def data(self, rig=None, exact=False, controls=None):
@@ -65,7 +63,7 @@ class Head:
         return skinned_glb(rigged, playback, exact)
 
     @property
-    def selection(self) -> list[np.ndarray]:
+    def selection(self):
         faces = np.arange(len(self.avatar.faces))
         return [faces % (number + 2) == 0 for number in range(len(self.meshes))]
 
@@ -117,5 +115,5 @@ def make_head(convention="stga", sh_degree=3, antialiased=True, offsets=tuple(OF
 
 
 @pytest.fixture(scope="session")
-def head() -> Head:
+def head():
     return make_head()

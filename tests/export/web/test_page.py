@@ -5,18 +5,16 @@ import base64
 import io
 import re
 import time
-from collections.abc import Callable
 
 import numpy as np
 import pytest
 from PIL import Image
 
-from export.web.browser import Browser
 from stga_addon.export.rig import baked_rig
 from stga_addon.export.web.page import page
 from stga_addon.render.render import render_avatar, to_uint8
 
-from .conftest import Head, make_head, show
+from .conftest import make_head, show
 
 pytestmark = pytest.mark.needs("chromium")
 
@@ -39,23 +37,23 @@ SNAPSHOT = """(async () => {
 })()"""
 
 
-def snapshot(browser: Browser, frame: int, camera: str = "front") -> str:
+def snapshot(browser, frame, camera="front"):
     """What a camera of the page sees, as a data URL."""
     return str(browser.evaluate(SNAPSHOT % (frame, camera)))
 
 
-def picture(browser: Browser, frame: int, camera: str = "front") -> np.ndarray:
+def picture(browser, frame, camera="front"):
     """What a camera of the page sees: (H, W, 3) in levels."""
     encoded = snapshot(browser, frame, camera).partition(",")[2]
     return np.asarray(Image.open(io.BytesIO(base64.b64decode(encoded))).convert("RGB"), float)
 
 
-def difference(one: np.ndarray, other: np.ndarray) -> float:
+def difference(one, other):
     """PSNR in dB of two pictures in levels."""
     return float(10 * np.log10(255**2 / np.mean((one - other) ** 2)))
 
 
-def psnr(browser: Browser, head: Head, frame: int) -> float:
+def psnr(browser, head, frame):
     """Of the page's picture against the renderer's, both in eight bits."""
     expected = to_uint8(render_avatar(head.avatar, head.meshes[frame], head.camera))
     return difference(picture(browser, frame), expected)
@@ -91,7 +89,7 @@ def test_picture_is_the_renderers(options, exact, browser, tmp_path):
     assert browser.requests == [(tmp_path / "a.html").as_uri()]
 
 
-def cut(text: str, start: str, characters: int = 0) -> str:
+def cut(text, start, characters=0):
     """The text up to some characters behind the first `start`."""
     at = text.index(start) + len(start) + characters
     assert at < len(text)
@@ -102,7 +100,7 @@ DATA = r'id="data">[^<]*'
 INCOMPLETE = "This page is damaged or incomplete, or the browser is too old for it."
 NO_DATA = "This page holds no avatar data."
 DAMAGED = "The avatar data is damaged."
-DAMAGED_PAGES: dict[str, tuple[Callable[[str], str], str]] = {
+DAMAGED_PAGES = {
     "cut in the styles": (lambda page: cut(page, "<style>", 500), INCOMPLETE),
     "cut in the heading": (lambda page: cut(page, '<p id="facts">Load'), INCOMPLETE),
     "cut in the script": (lambda page: cut(page, '<script type="module">', 9000), INCOMPLETE),

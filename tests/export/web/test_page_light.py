@@ -5,11 +5,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
-from export.web.browser import Browser
 from stga_addon.avatar.embedding import face_frames
-from stga_addon.avatar.file import Avatar, AvatarLight
-from stga_addon.avatar.splats import Splats
+from stga_addon.avatar.file import AvatarLight
 from stga_addon.export.playback import Playback
 from stga_addon.export.rig import RiggedAvatar
 from stga_addon.export.skinned_gltf import skinned_glb
@@ -19,7 +18,7 @@ from stga_addon.light.surface import Bounce, transfer_of
 from stga_addon.light.values import Light, Lighting
 from stga_addon.render.render import posed_avatar, render_layers, to_uint8
 
-from .conftest import Head, make_head, show
+from .conftest import make_head, show
 from .test_page import difference, picture, snapshot
 from .web_data import read_web_data
 
@@ -42,7 +41,7 @@ COLORS = """(() => {
 })()"""
 
 
-def lit_head(damping: float = 0.0, lashes: bool = False, **options: object) -> Head:
+def lit_head(damping=0.0, lashes=False, **options):
     """A head whose light is known: brighter from above, with a part of the mesh as wet as eyes.
     lashes: around a nose that is wet as well."""
     head = make_head(**options)
@@ -62,7 +61,7 @@ def lit_head(damping: float = 0.0, lashes: bool = False, **options: object) -> H
     return replace(head, avatar=replace(head.avatar, light=light, splats=splats))
 
 
-def with_lashes(avatar: Avatar, eye: np.ndarray) -> Splats:
+def with_lashes(avatar, eye):
     """The splats of an avatar, the first LASHES of them black and 5 mm above the triangles around
     an eye (V,) bool."""
     middle = avatar.neutral[eye].mean(0)
@@ -82,14 +81,14 @@ def with_lashes(avatar: Avatar, eye: np.ndarray) -> Splats:
     return splats
 
 
-def harmonics() -> np.ndarray:
+def harmonics():
     """(9, 3) of a world that is different in every direction."""
     world = np.random.default_rng(7).normal(0, 0.12, (9, 3))
     world[0] += 1.2
     return world
 
 
-def set_lighting(browser: Browser, lighting: object) -> None:
+def set_lighting(browser, lighting):
     browser.evaluate(f"{{ document.querySelector('stga-avatar').lighting = {lighting}; }}")
 
 
@@ -174,8 +173,8 @@ def test_environments_stand_upright_and_turn(up, browser, tmp_path):
     assert toward @ up == pytest.approx(0.28, abs=0.03)
     # x ↦ up × x, and what lies along `up` stays
     quarter = np.cross(up, np.eye(3)).T + np.outer(up, up)
-    np.testing.assert_allclose(turned_toward, quarter @ toward, atol=1e-9)
-    np.testing.assert_allclose(turned_world, rotated(world, quarter), atol=1e-9)
+    assert_allclose(turned_toward, quarter @ toward, atol=1e-9)
+    assert_allclose(turned_world, rotated(world, quarter), atol=1e-9)
 
 
 def choose(browser, kind):

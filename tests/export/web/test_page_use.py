@@ -5,25 +5,23 @@ import functools
 import json
 import re
 import threading
-from collections.abc import Iterator
 from dataclasses import replace
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
-from export.web.browser import Browser
 from stga_addon.driving.head_map import head_map, page_controls
 from stga_addon.driving.inverse import write_performance
 from stga_addon.driving.performance import ARKIT_SHAPES, COLUMN, COUNT, Performance
 from stga_addon.export.formats import export_avatar
 from stga_addon.export.playback import Playback
 from stga_addon.export.web.page import ELEMENT
-from stga_addon.flame.forward import FlameFrame, flame_forward
+from stga_addon.flame.forward import flame_forward
 
-from .conftest import Head, show
+from .conftest import show
 from .test_page import psnr
 
 pytestmark = pytest.mark.needs("chromium")
@@ -79,7 +77,7 @@ window.playFor = (pictures, rate) => {
 };"""
 
 
-def touch(browser: Browser, *paths: list[tuple[float, float]]) -> None:
+def touch(browser, *paths):
     """Fingers that go along `paths` of equal length together (pixels)."""
     for step, places in enumerate(zip(*paths, strict=True)):
         points = [{"x": x, "y": y, "id": finger} for finger, (x, y) in enumerate(places)]
@@ -88,21 +86,21 @@ def touch(browser: Browser, *paths: list[tuple[float, float]]) -> None:
     browser.send("Input.dispatchTouchEvent", type="touchEnd", touchPoints=[])
 
 
-def line(start: tuple[float, float], end: tuple[float, float]) -> list[tuple[float, float]]:
+def line(start, end):
     return [tuple(place) for place in np.linspace(start, end, 6).tolist()]
 
 
-def press(browser: Browser, key: str) -> None:
+def press(browser, key):
     text = {"text": key} if len(key) == 1 else {}
     browser.send("Input.dispatchKeyEvent", type="keyDown", key=key, **text)
     browser.send("Input.dispatchKeyEvent", type="keyUp", key=key)
 
 
-def of_avatar(browser: Browser, member: str) -> Any:
+def of_avatar(browser, member):
     return browser.evaluate(f"document.querySelector('stga-avatar').{member}")
 
 
-def forward(head: Head, frame: FlameFrame) -> np.ndarray:
+def forward(head, frame):
     sequence = head.sequence
     return flame_forward(sequence.model, sequence.shape, frame, sequence.static_offset)
 
@@ -160,7 +158,7 @@ def test_keyboard(browser, head, tmp_path):
     assert browser.errors == []
 
 
-def click(browser: Browser, selector: str) -> None:
+def click(browser, selector):
     """A click of the mouse on the middle of an element."""
     box = f"document.querySelector('{selector}').getBoundingClientRect().toJSON()"
     found = browser.evaluate(box)
@@ -334,12 +332,12 @@ def test_ten_minutes_of_play_leave_nothing_behind(browser, head, tmp_path):
 
 
 @pytest.fixture
-def server(tmp_path: Path) -> Iterator[str]:
+def server(tmp_path):
     """Address of a plain web server of the folder `site`."""
     (tmp_path / "site").mkdir()
 
     class Quiet(SimpleHTTPRequestHandler):
-        def log_message(self, format: str, *values: Any) -> None: ...
+        def log_message(self, format, *values): ...
 
     handler = functools.partial(Quiet, directory=str(tmp_path / "site"))
     made = ThreadingHTTPServer(("127.0.0.1", 0), handler)
@@ -379,7 +377,7 @@ def test_the_documented_embedding_works(browser, head, tmp_path, server):
     assert browser.errors == []
 
 
-def driven_mesh(head: Head, weights: np.ndarray, angles: np.ndarray | None = None) -> np.ndarray:
+def driven_mesh(head, weights, angles=None):
     """Where ARKit weights (52,) put the head in its first recorded place; angles: yaw, pitch, roll
     of the neck."""
     turned = None if angles is None else angles[None]
@@ -391,7 +389,7 @@ def driven_mesh(head: Head, weights: np.ndarray, angles: np.ndarray | None = Non
     return forward(head, frame)
 
 
-def vertices(browser: Browser, script: str) -> np.ndarray:
+def vertices(browser, script):
     """The mesh after a script about `avatar`."""
     found = browser.evaluate(f"""(() => {{
       const avatar = document.querySelector('stga-avatar');
@@ -419,8 +417,8 @@ def test_face_shapes_and_a_performance(browser, head, tmp_path):
         input.dispatchEvent(new Event('input'));
       }}"""
     found = vertices(browser, script)
-    np.testing.assert_allclose(found, driven_mesh(head, weights), atol=1e-5)
-    np.testing.assert_allclose(vertices(browser, "avatar.release();"), before, atol=1e-12)
+    assert_allclose(found, driven_mesh(head, weights), atol=1e-5)
+    assert_allclose(vertices(browser, "avatar.release();"), before, atol=1e-12)
 
     rows = rng.random((4, COUNT)) * 0.5
     turns = rng.normal(0, 0.2, (4, 3))
@@ -434,10 +432,10 @@ def test_face_shapes_and_a_performance(browser, head, tmp_path):
         (4, rows[3], turns[3]),
     ):
         found = vertices(browser, f"avatar.setPerformance({text}); avatar.frame = {frame};")
-        np.testing.assert_allclose(found, driven_mesh(head, row, turn), atol=1e-5)
+        assert_allclose(found, driven_mesh(head, row, turn), atol=1e-5)
     assert of_avatar(browser, "fps") == pytest.approx(30, rel=1e-3)
     assert browser.evaluate("document.querySelector('#scrub').max") == "4"
     with pytest.raises(AssertionError, match="This file is no table of face shapes"):
         of_avatar(browser, "setPerformance('a,b')")
     found = vertices(browser, "avatar.setPerformance(null);")
-    np.testing.assert_allclose(found, before, atol=1e-12)
+    assert_allclose(found, before, atol=1e-12)

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 from stga_addon.driving.performance import ARKIT_SHAPES, COUNT, resampled
 from stga_addon.driving.performers import read_performance
@@ -19,9 +20,7 @@ HEADER = ["Timecode", "BlendShapeCount", *SHAPES, "HeadYaw", "HeadPitch", "HeadR
 HEAD = np.array([0.1, -0.2, 0.3])
 
 
-def take(
-    codes: list[str], header: list[str] = HEADER, rest: str = "", is_quoted: bool = False
-) -> str:
+def take(codes, header=HEADER, rest="", is_quoted=False):
     """A Live Link Face file in which all weights of row n are n / rows; rest: at the end of rows
     below the header."""
     lines = [header]
@@ -33,7 +32,7 @@ def take(
     return "\r\n".join([first, *(line + rest for line in others)])
 
 
-def drop_frame_codes(first: str, count: int) -> list[str]:
+def drop_frame_codes(first, count):
     """Codes of a 29.97 Hz camera: the numbers 0 and 1 are skipped at each minute but the tenth."""
     hour, minute, second, frame = map(int, first.replace(";", ":").split(":"))
     codes = []
@@ -50,7 +49,7 @@ def drop_frame_codes(first: str, count: int) -> list[str]:
     return codes
 
 
-def read_by_page(texts: list[str], folder: Path) -> list[dict[str, object]]:
+def read_by_page(texts, folder):
     (folder / "texts.json").write_text(json.dumps([ARKIT_SHAPES, *texts]))
     command = ["node", Path(__file__).with_name("performances.mjs"), PLAYER, folder / "texts.json"]
     done = subprocess.run(command, capture_output=True, timeout=120)
@@ -80,7 +79,7 @@ READABLE = {
 }
 
 
-def test_every_form_comes_at_its_times(tmp_path: Path) -> None:
+def test_every_form_comes_at_its_times(tmp_path):
     """Catches drop frames that count as lost, cells that keep their quotes, rows left out for their
     trailing commas, and all else that the add-on reads otherwise."""
     texts = [text for text, _, _ in READABLE.values()]
@@ -93,9 +92,9 @@ def test_every_form_comes_at_its_times(tmp_path: Path) -> None:
         weights = np.tile(np.arange(count)[:, None] / count, COUNT)
         for found in (addon.weights, page["weights"]):
             assert np.shape(found) == (count, COUNT), name
-            np.testing.assert_allclose(found, weights, atol=2e-3, err_msg=name)
+            assert_allclose(found, weights, atol=2e-3, err_msg=name)
         for found in (addon.head, page["head"]):
-            np.testing.assert_allclose(found, np.tile(HEAD, (count, 1)), err_msg=name)
+            assert_allclose(found, np.tile(HEAD, (count, 1)), err_msg=name)
         assert page["fps"] == pytest.approx(fps, rel=1e-4), name
         assert addon.fps == pytest.approx(fps, rel=1e-4), name
 
@@ -122,7 +121,7 @@ REFUSED_BY_THE_PAGE = {
 """The add-on reads these, and says in which unit."""
 
 
-def test_unusable_values_are_refused_in_one_sentence(tmp_path: Path) -> None:
+def test_unusable_values_are_refused_in_one_sentence(tmp_path):
     """Catches a head that vanishes, or a face that stays still, without a warning."""
     refused = REFUSED | REFUSED_BY_THE_PAGE
     pages = read_by_page([text for text, _ in refused.values()], tmp_path)

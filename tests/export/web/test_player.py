@@ -10,7 +10,6 @@ import subprocess
 from collections import Counter
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -33,7 +32,7 @@ pytestmark = pytest.mark.needs("node")
 COLORS = {name for name, offset in OFFSETS.items() if offset.target == COLOR}
 
 
-def evaluated(data: bytes, folder: Path) -> dict[str, Any]:
+def evaluated(data, folder):
     """What evaluate.mjs makes of a data file."""
     (folder / "a.glb").write_bytes(data)
     script = Path(__file__).with_name("evaluate.mjs")
@@ -43,7 +42,7 @@ def evaluated(data: bytes, folder: Path) -> dict[str, Any]:
     return dict(json.loads(done.stdout))
 
 
-def colors(result: dict[str, Any]) -> tuple[np.ndarray, np.ndarray]:
+def colors(result):
     """Change of each triangle's color (F, 3), and what of it is the light of the capture."""
     texels = np.reshape(result["texels"], (-1, 5, 4))
     return texels[:, 3, :3], texels[:, 4, :3]
@@ -142,7 +141,7 @@ def test_smoothed_strain_where_edges_have_any_number_of_triangles(tmp_path):
         assert np.abs(colors(result)[0] - frames.color).max() < 1e-5
 
 
-def with_header(whole: bytes, *keys: str | int, value: Any) -> bytes:
+def with_header(whole, *keys, value):
     """A .glb file with one value of its document, or of the header of the splats, replaced."""
     document, binary = document_of(whole)
     root = document if keys[0] in document else document["extras"]["stga_splats"]

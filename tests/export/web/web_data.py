@@ -4,19 +4,16 @@ files of version 0.2.0."""
 import gzip
 import json
 import struct
-from typing import Any
 
 import numpy as np
 from avatar.conftest import world_splats
 from scipy.spatial.transform import Rotation
 
-from stga_addon.avatar.splats import Splats
-
 COMPONENTS = {5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4, "MAT4": 16}
 
 
-def read_web_data(data: bytes) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+def read_web_data(data):
     """Header and arrays (floats or int64) of a .glb or an older data file."""
     if data[:4] != b"glTF":
         raw = gzip.decompress(data)
@@ -42,17 +39,17 @@ def read_web_data(data: bytes) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     return header, arrays
 
 
-def document_of(data: bytes) -> tuple[dict[str, Any], bytes]:
+def document_of(data):
     """Document and binary chunk of a .glb."""
     magic, version, length, size, kind = struct.unpack_from("<4sIII4s", data)
     assert (magic, version, length, kind) == (b"glTF", 2, len(data), b"JSON")
     return json.loads(data[20 : 20 + size]), data[28 + size :]
 
 
-def accessor(document: dict[str, Any], binary: bytes, index: int) -> np.ndarray:
+def accessor(document, binary, index):
     """Values of an accessor (count, width)."""
 
-    def block(kind: int, count: int, width: int, view: int, offset: int = 0) -> np.ndarray:
+    def block(kind, count, width, view, offset=0):
         at = document["bufferViews"][view]["byteOffset"] + offset
         flat = np.frombuffer(binary, COMPONENTS[kind], count * width, at)
         return flat.reshape(count, width)
@@ -74,7 +71,7 @@ def accessor(document: dict[str, Any], binary: bytes, index: int) -> np.ndarray:
     return values
 
 
-def skin(document: dict[str, Any], binary: bytes) -> dict[str, np.ndarray]:
+def skin(document, binary):
     """Mesh, rig and motion of the standard part, in meters and radians."""
     [owner] = document["skins"]
     primitive = document["meshes"][0]["primitives"][0]
@@ -92,7 +89,7 @@ def skin(document: dict[str, Any], binary: bytes) -> dict[str, np.ndarray]:
             np.add.at(weights, (np.arange(len(base)), joints[:, column]), shares[:, column])
     rest = -bind[:, 3, :3]
     [motion] = document["animations"]
-    found: dict[Any, np.ndarray] = {}
+    found = {}
     for channel in motion["channels"]:
         target = channel["target"]
         output = motion["samplers"][channel["sampler"]]["output"]
@@ -112,7 +109,7 @@ def skin(document: dict[str, Any], binary: bytes) -> dict[str, np.ndarray]:
     }
 
 
-def planes(entries: dict[str, Any], raw: bytes) -> dict[str, np.ndarray]:
+def planes(entries, raw):
     """Arrays of a header's entries, which lie one after the other."""
     at = 0
     arrays = {}
@@ -139,7 +136,7 @@ def planes(entries: dict[str, Any], raw: bytes) -> dict[str, np.ndarray]:
     return arrays
 
 
-def splats_of(arrays: dict[str, np.ndarray]) -> Splats:
+def splats_of(arrays):
     """The splats of a data file, sorted by triangle."""
     count = len(arrays["xyz"])
     largest = arrays["rotation_largest"]

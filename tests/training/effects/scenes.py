@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 import trimesh
@@ -10,7 +9,7 @@ from PIL import Image, ImageDraw
 from scipy.spatial.transform import Rotation
 
 from stga_addon.avatar.strain import deformation, strain_basis
-from stga_addon.capture.camera import Camera, look_at
+from stga_addon.capture.camera import look_at
 from stga_addon.capture.model import Capture, View
 
 SIZE = 100
@@ -25,28 +24,28 @@ Paint = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
 levels (F,) that are added to the triangles' own colors."""
 
 
-def nothing(deformed: np.ndarray, direction: np.ndarray, place: np.ndarray) -> np.ndarray:
+def nothing(deformed, direction, place):
     return np.zeros(len(deformed))
 
 
-def wrinkles(deformed: np.ndarray, direction: np.ndarray, place: np.ndarray) -> np.ndarray:
+def wrinkles(deformed, direction, place):
     """Darker where the first edge shrinks, but no lighter where it grows."""
     return 60 * np.minimum(deformed[:, 0], 0)
 
 
-def sliding(deformed: np.ndarray, direction: np.ndarray, place: np.ndarray) -> np.ndarray:
+def sliding(deformed, direction, place):
     """Stripes that move over triangles which shrink."""
     return 30 * np.sin(12 * (place[:, 0] + 0.3 * np.minimum(deformed[:, 0] + deformed[:, 1], 0)))
 
 
-def gloss(deformed: np.ndarray, direction: np.ndarray, place: np.ndarray) -> np.ndarray:
+def gloss(deformed, direction, place):
     """A light beside the cameras, mirrored where the ball is polished."""
     mirrored = direction - 2 * np.einsum("fi,fi->f", direction, place)[:, None] * place
     light = np.array([0.3, 0.4, 0.86])
     return 60 * np.clip(mirrored @ light, 0, 1) ** 3
 
 
-def unlike_cameras() -> tuple[np.ndarray, np.ndarray]:
+def unlike_cameras():
     """Gain and offset (8, 3) of eight cameras, against their mean."""
     rng = np.random.default_rng(5)
     gain = rng.uniform(0.92, 1.08, (8, 3))
@@ -75,7 +74,7 @@ class Scene:
     window: float = 0.0
 
 
-def photograph(folder: Path, scene: Scene) -> Capture:
+def photograph(folder, scene):
     """Write the scene's images; every camera and timestep is for training."""
     ball = trimesh.creation.icosphere(3, 0.1)
     vertices = np.array(ball.vertices)
@@ -123,18 +122,18 @@ def photograph(folder: Path, scene: Scene) -> Capture:
     )
 
 
-def own_colors(capture: Capture, seed: int = 0) -> np.ndarray:
+def own_colors(capture, seed=0):
     """Levels (F, 3) of a painted capture's triangles, before whatever else colors depend on."""
     return _own_colors(capture.neutral[capture.faces].mean(1) / 0.1, np.random.default_rng(seed))
 
 
-def _own_colors(place: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+def _own_colors(place, rng):
     return np.asarray(
         120 + 40 * np.sin(place @ rng.normal(0, 4, (3, 3))) + rng.uniform(-8, 8, (len(place), 1))
     )
 
 
-def _deform(vertices: np.ndarray, timestep: int, amount: float) -> np.ndarray:
+def _deform(vertices, timestep, amount):
     """Waves along the surface, of another length and phase in every timestep."""
     rng = np.random.default_rng([7, timestep])
     moved = vertices.copy()
@@ -144,7 +143,7 @@ def _deform(vertices: np.ndarray, timestep: int, amount: float) -> np.ndarray:
     return moved
 
 
-def _camera(number: int, count: int) -> Camera:
+def _camera(number, count):
     angle = np.linspace(-0.9, 0.9, count)[number] if count > 1 else 0.0
     height = 0.3 * (-1) ** number
     x, z = np.cos(height) * np.array([np.sin(angle), np.cos(angle)])

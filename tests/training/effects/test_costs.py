@@ -10,7 +10,6 @@ import torch
 from raster import reference
 
 from stga_addon.capture.images import read_view
-from stga_addon.capture.model import View
 from stga_addon.flame.teeth import TEETH_FACES, teeth_faces
 from stga_addon.raster.cpu.rasterize import Parameters
 from stga_addon.training.effects.plan import plan_effects
@@ -79,7 +78,6 @@ def test_exposure_is_taken_away(painted):
     table = np.column_stack([np.arange(8.0), gain, offset])
     rows = tuple(map(tuple, table.tolist()))
     correct = exposure_correction(make_settings(iterations=1, exposure=rows))
-    assert correct is not None
     alike = painted()
     unlike = painted(gain=gain, offset=offset)
     for same, other in zip(alike.views["train"][:8], unlike.views["train"][:8], strict=True):
@@ -144,7 +142,7 @@ def test_antialiasing_reaches_training_and_evaluation(painted):
     assert abs(losses[0] - losses[1]) > 1e-3
 
 
-def reference_image(small: trainer.Trainer, view: View, antialiased: bool) -> torch.Tensor:
+def reference_image(small, view, antialiased):
     """The trainer's splats over white, by the reference renderer in float64."""
     state = small.state
     p = Parameters(*(torch.from_numpy(array).double() for array in state.parameters))

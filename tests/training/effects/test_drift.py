@@ -5,6 +5,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
 from stga_addon.avatar.file import read_avatar
 from stga_addon.training.effects.evidence import fit_turning_light
@@ -51,7 +52,7 @@ def test_drift_is_found(drifting):
     views = [*drifting.views["train"], *drifting.views["val"]]
     found = np.array([exposure(view)[0] for view in views])
     truth = DRIFT[[view.timestep for view in views]]
-    np.testing.assert_allclose(found / found.mean(0), truth / truth.mean(0), atol=0.012)
+    assert_allclose(found / found.mean(0), truth / truth.mean(0), atol=0.012)
     assert (exposure(replace(views[0], timestep=-5)) == exposure(views[0])).all()
     assert exposure(replace(views[0], camera_index=1)) is None
 
@@ -77,7 +78,7 @@ def test_a_head_that_turns_in_window_light_does_not_drift(tmp_path):
     exposure = view_exposure(settings.exposure)
     found = np.array([exposure(view)[0] for view in capture.views["train"]])
     truth = DRIFT[[view.timestep for view in capture.views["train"]]]
-    np.testing.assert_allclose(found / found.mean(0), truth / truth.mean(0), atol=0.09)
+    assert_allclose(found / found.mean(0), truth / truth.mean(0), atol=0.09)
 
 
 def test_timesteps_that_are_left_out_look_like_the_recording(drifting, tmp_path):
@@ -100,4 +101,4 @@ def test_light_of_a_head_that_is_never_seen_twice():
     samples = SimpleNamespace(signals={"normal": np.zeros((3, 5, 3), np.float32)})
     for shown in (color, np.where(np.eye(3, 5)[..., None] > 0, 100.0, color)):
         with np.errstate(all="raise"):
-            np.testing.assert_array_equal(fit_turning_light(samples, shown, rest), 1.0)
+            assert_array_equal(fit_turning_light(samples, shown, rest), 1.0)

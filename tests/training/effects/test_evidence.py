@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
 from stga_addon.training.effects.evidence import consecutive_folds, linear_evidence, scattered_folds
 
@@ -51,7 +52,7 @@ def test_the_range_is_counted_from_rest():
         linear_evidence(color, features + by, FOLDS, rest=rest + by) for by in (0.0, -0.2)
     )
     assert plain.gain > 5
-    np.testing.assert_allclose(shifted.gain, plain.gain, rtol=1e-9)
+    assert_allclose(shifted.gain, plain.gain, rtol=1e-9)
 
 
 def slowly(rng, timesteps, *shape):
@@ -83,7 +84,7 @@ def test_each_timestep_is_held_out_once(timesteps, folds):
     assert len(found) == folds
     assert all(fitted.any() and not (held & fitted).any() for held, fitted in found)
     if timesteps > 3:
-        np.testing.assert_array_equal(sum(held.astype(int) for held, _ in found), 1)
+        assert_array_equal(sum(held.astype(int) for held, _ in found), 1)
     for held, fitted in found:
         distance = np.abs(timestep[held][:, None] - timestep[fitted])
         assert distance.min() == 14

@@ -1,9 +1,9 @@
 """Colors that splats start with, on a ball whose triangles' colors are known."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
+from numpy.testing import assert_allclose, assert_array_equal
 from PIL import Image, ImageDraw
 
 from stga_addon.avatar.splats import SH_C0
@@ -28,7 +28,7 @@ def test_splats_start_with_the_colors_of_the_images(painted, monkeypatch):
     assert not splats.sh[:, 1:].any()
     colors = triangle_colors(capture, capture.views["train"])
     monkeypatch.setattr("stga_addon.training.optimize.initial_splats.MIN_ONE_SIDED_SHARE", 2.0)
-    np.testing.assert_array_equal(colors, triangle_colors(capture, capture.views["train"]))
+    assert_array_equal(colors, triangle_colors(capture, capture.views["train"]))
 
 
 def test_what_no_view_shows_has_the_nearest_color(painted):
@@ -47,7 +47,7 @@ def test_what_no_view_shows_has_the_nearest_color(painted):
         replace(view, camera=replace(view.camera, cx=-1000.0))
         for view in capture.views["train"][:2]
     ]
-    np.testing.assert_array_equal(triangle_colors(capture, views), 0.5)
+    assert_array_equal(triangle_colors(capture, views), 0.5)
 
 
 def test_the_side_that_no_camera_sees_has_the_colors_of_its_mirror_image(painted):
@@ -78,13 +78,13 @@ def test_teeth_behind_closed_lips_have_their_own_color(tmp_path):
     capture = _mouth(tmp_path)
     found = np.split(255 * triangle_colors(capture, capture.views["train"]), 3)
     for colors, plate in zip(found, ("lip", "tooth", "tooth"), strict=True):
-        np.testing.assert_allclose(colors.mean(0), PLATES[plate][-1], atol=2)
+        assert_allclose(colors.mean(0), PLATES[plate][-1], atol=2)
     # without later timesteps, what is hidden has the nearest color
     colors = triangle_colors(capture, capture.views["train"][:1])
-    np.testing.assert_allclose(255 * colors, np.tile(PLATES["lip"][-1], (len(colors), 1)), atol=2)
+    assert_allclose(255 * colors, np.tile(PLATES["lip"][-1], (len(colors), 1)), atol=2)
 
 
-def _mouth(folder: Path) -> Capture:
+def _mouth(folder):
     """Plates of two triangles each: a lip in front of a tooth, which is lifted in the second
     timestep far enough to show the tooth but not the molar, which is nearer to the lip than to the
     tooth."""

@@ -1,17 +1,15 @@
 """The recipe "an effect with a parameter" of docs/architecture.md, followed by a toy."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal, assert_equal
 
-from stga_addon.avatar.embedding import FaceFrames, face_frames, to_world
+from stga_addon.avatar.embedding import face_frames, to_world
 from stga_addon.avatar.file import Avatar, read_avatar
 from stga_addon.avatar.lattice import lattice_splats
 from stga_addon.avatar.offsets import OFFSETS, POSITION, SIGNALS, DrivenOffset
-from stga_addon.avatar.strain import StrainBasis
-from stga_addon.capture.model import Capture
 from stga_addon.errors import StgaError
 from stga_addon.export.formats import FORMATS, export_avatar
 from stga_addon.export.ply import read_ply
@@ -35,14 +33,14 @@ from ..toys import bits, quick_settings, stop_at
 NAME = "toy_growth"
 
 
-def growth(basis: StrainBasis, frames: FaceFrames) -> np.ndarray:
+def growth(basis, frames):
     """(F, 3): how much larger a triangle is than at rest, and the square and cube of that."""
     larger = frames.scale - 1
     return np.stack([larger, larger**2, larger**3], axis=1).astype(np.float32)
 
 
 @pytest.fixture(autouse=True)
-def toy_effect(monkeypatch: pytest.MonkeyPatch) -> None:
+def toy_effect(monkeypatch):
     """What the recipe asks for: a file of its own (`growth`), and a row in each table."""
     monkeypatch.setitem(SIGNALS, NAME, growth)
     monkeypatch.setitem(OFFSETS, NAME, DrivenOffset(NAME, NAME, POSITION, "xyz", 1.0))
@@ -53,12 +51,12 @@ def toy_effect(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.fixture
-def capture(toy: Capture) -> Capture:
+def capture(toy):
     """Without evaluation views: the avatar is then that of the last state."""
     return replace(squeezed(toy), views={"train": toy.views["train"]})
 
 
-def planned(capture: Capture) -> Run:
+def planned(capture):
     others = [each.name for each in EFFECTS.values() if each.offsets not in ((), (NAME,))]
     choices = dict.fromkeys((*others, "view-color", "exposure"), "off")
     settings = quick_settings(
@@ -68,7 +66,7 @@ def planned(capture: Capture) -> Run:
     return Run(capture.root, None, "vhap", *plan_effects(capture, settings))
 
 
-def made(seed: int = 0) -> tuple[Avatar, np.ndarray]:
+def made(seed=0):
     """An avatar with the toy's coefficients, and a posed mesh."""
     rng = np.random.default_rng(seed)
     neutral = np.float32([[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0.3]]) / 10
@@ -79,9 +77,7 @@ def made(seed: int = 0) -> tuple[Avatar, np.ndarray]:
     ), neutral * 1.3
 
 
-def test_it_is_decided_trained_and_resumed_to_the_same_bits(
-    capture: Capture, tmp_path: Path
-) -> None:
+def test_it_is_decided_trained_and_resumed_to_the_same_bits(capture, tmp_path):
     """Catches a parameter that the plan, training, density control, the checkpoint, the avatar file
     or a continuation loses, because one of them goes by names instead of the tables."""
     run = planned(capture)
@@ -92,20 +88,18 @@ def test_it_is_decided_trained_and_resumed_to_the_same_bits(
     assert read_checkpoint(tmp_path / "parts").iteration == 13
     train_run(capture, tmp_path / "parts", run, resume=True)
     whole, parts = (read_checkpoint(tmp_path / name).state for name in ("whole", "parts"))
-    np.testing.assert_equal(bits(parts), bits(whole))
-    np.testing.assert_equal(vars(parts.driven_offsets[NAME]), vars(whole.driven_offsets[NAME]))
+    assert_equal(bits(parts), bits(whole))
+    assert_equal(vars(parts.driven_offsets[NAME]), vars(whole.driven_offsets[NAME]))
     avatar = read_avatar(tmp_path / "parts" / "avatar.npz")
-    np.testing.assert_array_equal(avatar.driven_offsets[NAME], whole.driven_offsets[NAME].average)
+    assert_array_equal(avatar.driven_offsets[NAME], whole.driven_offsets[NAME].average)
     assert np.abs(avatar.driven_offsets[NAME]).max() > 1e-4
     folder = tmp_path / "whole"
     continuation = Continuation(folder, file_digest(folder / "avatar.npz"), 0, 9)
     state = starting_state(continuation, run.settings, len(capture.faces))
-    np.testing.assert_array_equal(
-        state.driven_offsets[NAME].second, whole.driven_offsets[NAME].second
-    )
+    assert_array_equal(state.driven_offsets[NAME].second, whole.driven_offsets[NAME].second)
 
 
-def test_a_device_without_its_kernels_says_so(capture: Capture) -> None:
+def test_a_device_without_its_kernels_says_so(capture):
     """Catches an effect that trains without its parameter on a GPU."""
     with pytest.raises(
         StgaError, match=f"driven offset {NAME}: is trained on the CPU only, not on gpu"
@@ -118,7 +112,7 @@ def test_a_device_without_its_kernels_says_so(capture: Capture) -> None:
 @pytest.mark.parametrize(
     "format", [name for name, row in FORMATS.items() if row.source != "motion"]
 )
-def test_exports_hold_it_or_say_that_they_cannot(format: str, tmp_path: Path) -> None:
+def test_exports_hold_it_or_say_that_they_cannot(format, tmp_path):
     """Catches an export that shows the avatar without the effect."""
     if format == "usd":
         pytest.importorskip("pxr")
@@ -134,21 +128,21 @@ def test_exports_hold_it_or_say_that_they_cannot(format: str, tmp_path: Path) ->
     assert moved != [file.read_bytes() for file in files]
 
 
-def test_it_moves_splats_as_its_file_says(tmp_path: Path) -> None:
+def test_it_moves_splats_as_its_file_says(tmp_path):
     """Catches an offset in other axes or units than the triangle's: against float64."""
     avatar, posed = made()
     [file] = export_avatar(tmp_path / "a.ply", avatar, "ply", [(0, posed)])
     frames = face_frames(posed, avatar.faces, avatar.neutral)
-    np.testing.assert_allclose(frames.scale, 1.3, rtol=1e-6)
+    assert_allclose(frames.scale, 1.3, rtol=1e-6)
     first, second, third = avatar.driven_offsets[NAME].swapaxes(0, 1)
     local = 0.3 * first + 0.09 * second + 0.027 * third
     moves = 1.3 * np.einsum("fij,fj->fi", frames.rotation, local.astype(np.float64))
     expected = to_world(avatar.splats, frames).xyz + moves[avatar.splats.face]
-    np.testing.assert_allclose(read_ply(file).xyz, expected, atol=1e-6)
+    assert_allclose(read_ply(file).xyz, expected, atol=1e-6)
     assert np.abs(moves).max() > 0.01
 
 
-def test_blender_keeps_it() -> None:
+def test_blender_keeps_it():
     """Catches a parameter lost in a .blend file, which viewport and renders pose."""
     bpy = pytest.importorskip("bpy")
     from stga_addon.scene.arrays import triangle_mesh
@@ -158,5 +152,5 @@ def test_blender_keeps_it() -> None:
     head = bpy.data.objects.new("head", triangle_mesh("head", avatar.neutral, avatar.faces))
     bpy.context.scene.collection.objects.link(head)
     stored = stored_avatar(show_avatar(avatar, head))
-    np.testing.assert_array_equal(stored.driven_offsets[NAME], avatar.driven_offsets[NAME])
-    np.testing.assert_allclose(stored.frames(posed).origin, avatar.frames(posed).origin, atol=1e-7)
+    assert_array_equal(stored.driven_offsets[NAME], avatar.driven_offsets[NAME])
+    assert_allclose(stored.frames(posed).origin, avatar.frames(posed).origin, atol=1e-7)
