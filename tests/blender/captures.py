@@ -3,6 +3,7 @@
 import bpy
 import numpy as np
 from flame.small_head import small_head, write_flame
+from numpy.random import default_rng
 
 from stga_addon.capture.model import Capture
 from stga_addon.flame.forward import FlameFrame
@@ -37,11 +38,11 @@ def mesh_capture(
     seed=0,
 ):
     """A mesh capture of random vertices; the mesh of each timestep is another draw."""
-    neutral = np.random.default_rng(seed).normal(0, 0.1, (vertices, 3))
+    neutral = default_rng(seed).normal(0, 0.1, (vertices, 3))
     faces = strip(vertices)
 
     def mesh(timestep):
-        return neutral + np.random.default_rng([seed, timestep]).normal(0, 0.02, neutral.shape)
+        return neutral + default_rng([seed, timestep]).normal(0, 0.02, neutral.shape)
 
     regions = {"mouth": np.arange(len(faces)) % 3 == 0}
     head = {"faces": faces, "neutral": neutral, "regions": regions, "mesh": mesh}
@@ -52,7 +53,7 @@ def mesh_capture(
 
 def flame_model(vertices=80, components=40, identity=10, seed=0):
     """A random model whose joints depend on more terms than one driver holds."""
-    rng = np.random.default_rng(seed)
+    rng = default_rng(seed)
     weights = rng.random((vertices, 5)) ** 4
     regressor = rng.random((5, vertices)) * (rng.random((5, vertices)) < 0.3)
     regressor[:, 0] += 0.1
@@ -70,7 +71,7 @@ def flame_model(vertices=80, components=40, identity=10, seed=0):
 
 def flame_sequence(model, timesteps=(4, 5, 9), seed=0, dynamic=False):
     """Large random poses, so that a transposed rotation or a wrong pivot is centimeters off."""
-    rng = np.random.default_rng(seed)
+    rng = default_rng(seed)
     size = len(model.v_template)
     frames = {
         timestep: FlameFrame(

@@ -9,6 +9,7 @@ import pytest
 import trimesh
 from avatar.conftest import random_splats, world_splats
 from mathutils import Matrix
+from numpy.random import default_rng
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy.spatial.transform import Rotation
 
@@ -37,7 +38,7 @@ IMPORTS = {
     "a.glb": ("gltf", lambda: bpy.ops.import_scene.gltf),
     "a.usdc": ("usd", lambda: bpy.ops.wm.usd_import),
 }
-DIRECTIONS = np.random.default_rng(5).normal(size=(20, 3))
+DIRECTIONS = default_rng(5).normal(size=(20, 3))
 DIRECTIONS /= np.linalg.norm(DIRECTIONS, axis=1, keepdims=True)
 
 
@@ -106,7 +107,7 @@ def imported():
 
 def some_splats(degree=3):
     """Within what SPZ keeps: sizes of centimeters, coefficients below 1 however they turn."""
-    rng = np.random.default_rng(3)
+    rng = default_rng(3)
     splats = random_splats(1, 300, 1)
     size = rng.normal(-3, 0.5, (300, 3))
     sh = rng.uniform(-0.35, 0.35, (300, (degree + 1) ** 2, 3))
@@ -232,7 +233,7 @@ def test_avatars_are_exported_as_they_are_posed(extension, head, tmp_path, displ
     if display == "Native Splats" and not compat.NATIVE_SPLATS:
         pytest.skip("Blender before 5.3 has no native splats")
     avatar = write_ball_avatar(tmp_path / "avatar.npz")
-    sh = np.random.default_rng(0).normal(0, 0.3, avatar.splats.sh.shape).astype(np.float32)
+    sh = default_rng(0).normal(0, 0.3, avatar.splats.sh.shape).astype(np.float32)
     avatar = replace(avatar, splats=replace(avatar.splats, sh=sh))
     write_avatar(tmp_path / "avatar.npz", avatar)
     bpy.ops.stga.show_avatar(filepath=str(tmp_path / "avatar.npz"))

@@ -7,6 +7,7 @@ import pytest
 import torch
 from capture.factory import ball
 from light.scenes import lit_avatar
+from numpy.random import default_rng
 from raster import reference
 
 from stga_addon.avatar.embedding import WORLD, to_world
@@ -42,7 +43,7 @@ TURNED = np.array(
 def avatar(degree, *driven):
     """Splats of every size, opacity and color on a ball, with driven offsets of these names."""
     vertices, faces = ball()
-    rng = np.random.default_rng(degree)
+    rng = default_rng(degree)
     splats = lattice_splats(vertices, faces := faces.astype(np.int32), 3, sh_degree=degree)
     count = len(splats)
     splats = replace(
@@ -58,7 +59,7 @@ def avatar(degree, *driven):
 
 def with_driven(of, *names):
     """With these driven offsets, and ranges of normals that clip small turns."""
-    rng = np.random.default_rng(9)
+    rng = default_rng(9)
     count = len(of.faces)
     units = [5e-3 if OFFSETS[name].target == POSITION else 0.6 for name in names]
     values = [rng.normal(0, unit, (count, 3, 3)).astype(np.float32) for unit in units]
@@ -194,7 +195,7 @@ def relit_layers(mode):
     )
     corners = np.array([[0.1, 0.1, 0.2], [0.2, 0.1, 0.2], [0.15, 0.3, 0.2]])
     wall = Caster(corners, np.array([[0, 1, 2]]))
-    world = np.random.default_rng(3).normal(0, 0.1, (9, 3)) + uniform(np.full(3, 0.4))
+    world = default_rng(3).normal(0, 0.1, (9, 3)) + uniform(np.full(3, 0.4))
     light = Lighting(world, lights, exposure=0.3, white=(1.1, 1.0, 0.9))
     if mode == "mix":
         light = replace(light, mode=mode, mix=0.6)

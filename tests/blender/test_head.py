@@ -6,6 +6,7 @@ import bpy
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
+from refusal import refusal
 
 from stga_addon.errors import StgaError
 from stga_addon.scene import tags
@@ -100,6 +101,6 @@ def test_unreadable_timestep_leaves_the_scene_unchanged(tmp_path):
         return capture.mesh(timestep)
 
     before = block_counts()
-    with pytest.raises(StgaError, match="truncated"):
+    with refusal("truncated"):
         import_head(replace(capture, mesh=mesh))
     assert block_counts() == before

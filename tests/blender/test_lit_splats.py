@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from light.scenes import RADIUS, lit_avatar
 from mathutils import Vector
+from numpy.linalg import norm
 from numpy.testing import assert_allclose, assert_array_equal
 from PIL import Image
 
@@ -81,11 +82,11 @@ def test_lit_splats_have_albedo_and_normals_and_a_mesh_throws_shadows():
     assert not [name for name in cloud if name.startswith("stga")]
     assert cloud["material"] == ["STGA Lit Splats"]
     caster = parts["MESH"]["position"]
-    radius = np.linalg.norm(caster, axis=1)
+    radius = norm(caster, axis=1)
     on_ball = caster[radius < RADIUS]
-    assert_allclose(np.linalg.norm(on_ball, axis=1), RADIUS - SHRINKAGE_M, atol=2e-4)
-    down = on_ball / np.linalg.norm(on_ball, axis=1, keepdims=True)
-    below = plate[BALL:].mean(0) / np.linalg.norm(plate[BALL:].mean(0))
+    assert_allclose(norm(on_ball, axis=1), RADIUS - SHRINKAGE_M, atol=2e-4)
+    down = on_ball / norm(on_ball, axis=1, keepdims=True)
+    below = plate[BALL:].mean(0) / norm(plate[BALL:].mean(0))
     assert (down @ below).max() < 0.99  # near skin throws none onto other
     assert (down @ below).min() < -0.99
     brighter = replace(avatar.light, irradiance=2 * avatar.light.irradiance)

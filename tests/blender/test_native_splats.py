@@ -9,6 +9,7 @@ from pathlib import Path
 import bpy
 import numpy as np
 import pytest
+from numpy.random import default_rng
 from numpy.testing import assert_allclose
 
 from stga_addon.avatar.embedding import to_world
@@ -45,7 +46,7 @@ def test_native_splats_are_those_of_the_posed_avatar(command, tmp_path):
     not move with the mesh, harmonics in another order or turned with triangles, and colors without
     deformation, selection or new light, or that are not those fitted for linear light."""
     avatar = driven_avatar("stga", count=400)
-    rng = np.random.default_rng(4)
+    rng = default_rng(4)
     splats = replace(avatar.splats, sh=rng.normal(0, 0.4, (400, 16, 3)).astype(np.float32))
     avatar = replace(avatar, splats=splats)
     turn = [[0.6, 0.8, 0], [-0.8, 0.6, 0], [0, 0, 1]]
@@ -62,12 +63,12 @@ def test_native_splats_are_those_of_the_posed_avatar(command, tmp_path):
     assert_allclose(found["recorded/position"], wanted.xyz, atol=1e-5)
     assert same_rotation(found["recorded/rotation"], wanted.rotation) < 1e-3
     assert_allclose(found["recorded/scale"], 1.5 * np.exp(wanted.log_scale), rtol=1e-3)
-    fitted = np.random.default_rng(1).uniform(-1, 1, (400, 4))
+    fitted = default_rng(1).uniform(-1, 1, (400, 4))
     opacity = 1 / (1 + np.exp(-np.stack([splats.opacity.astype(np.float64), fitted[:, 3]])))
     driven = wanted.sh[:, 0] - splats.sh[:, 0]  # by the deformation
     bases = dict.fromkeys(("recorded", "constant"), wanted.sh[:, 0])
     bases["fitted"] = fitted[:, :3] + driven
-    relit = np.random.default_rng(0).uniform(0, 2, (400, 4))[:, :3]
+    relit = default_rng(0).uniform(0, 2, (400, 4))[:, :3]
     flat = {"gray": np.array(FROZEN_COLOR[:3]), "relit": relit}
     bases |= {case: (linear_to_srgb(color) - 0.5) / SH_C0 for case, color in flat.items()}
     for case, base in bases.items():
@@ -113,7 +114,7 @@ def test_native_splats_follow_bones_shape_keys_and_strain(tmp_path):
     )
     shown = show_avatar(avatar, head)
     set_input(shown, splat_nodes.DISPLAY, NATIVE)
-    rng = np.random.default_rng(3)
+    rng = default_rng(3)
     sliders = [key for key in keys.key_blocks if key.name.startswith("expr")]
     before = evaluated_vertices(head)
     for _ in range(10):

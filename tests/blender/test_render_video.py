@@ -13,6 +13,7 @@ import bpy
 import numpy as np
 import pytest
 from capture.factory import write_mesh_capture
+from numpy.random import default_rng
 from numpy.testing import assert_allclose, assert_array_equal
 from PIL import Image
 
@@ -38,7 +39,7 @@ def shown(extension, tmp_path):
         directory=str(write_mesh_capture(tmp_path / "capture", range(3), range(3)))
     )
     avatar = write_ball_avatar(tmp_path / "avatar.npz")
-    colors = np.random.default_rng(1).normal(0, 1.5, avatar.splats.sh.shape).astype(np.float32)
+    colors = default_rng(1).normal(0, 1.5, avatar.splats.sh.shape).astype(np.float32)
     write_avatar(tmp_path / "avatar.npz", replace(avatar, splats=replace(avatar.splats, sh=colors)))
     bpy.ops.stga.show_avatar(filepath=str(tmp_path / "avatar.npz"))
     render = bpy.context.scene.render
@@ -183,7 +184,7 @@ def test_turntable_video(shown):
 
 def test_turntable_of_a_ply(extension, tmp_path):
     """Catches a turntable that needs a head, or turns about splats far away."""
-    rng = np.random.default_rng(0)
+    rng = default_rng(0)
     xyz = rng.normal((3, 1, 0), 0.1, (200, 3))
     xyz[0] = 1e4
     floats = {
@@ -255,7 +256,7 @@ CAMERA = Camera(63, 48, 50.0, 50.0, 31.5, 24.0, np.eye(4))
 @pytest.mark.parametrize(("channels", "mode"), [(3, "RGB"), (4, "RGBA")])
 def test_png(channels, mode):
     """Catches rows, channels or checksums that other readers take for something else."""
-    pixels = np.random.default_rng(0).integers(0, 256, (7, 5, channels), np.uint8)
+    pixels = default_rng(0).integers(0, 256, (7, 5, channels), np.uint8)
     with Image.open(io.BytesIO(png_bytes(pixels))) as image:
         assert image.mode == mode
         assert_array_equal(np.asarray(image), pixels)

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 from kept_formats import make
+from numpy.linalg import norm
 from scipy.spatial.transform import Rotation
 
 from export.web.web_data import posed_mesh, read_web_data, splats_of
@@ -53,15 +54,15 @@ def placed(data):
         origin = corners.mean(axis=0)
         normal = np.cross(corners[1] - corners[0], corners[2] - corners[0])
         before = arrays["neutral"][arrays["faces"][face]]
-        rest = np.linalg.norm(np.cross(before[1] - before[0], before[2] - before[0]))
-        size = np.sqrt(np.linalg.norm(normal) / rest)
-        normal /= np.linalg.norm(normal)
-        first = (corners[0] - origin) / np.linalg.norm(corners[0] - origin)
+        rest = norm(np.cross(before[1] - before[0], before[2] - before[0]))
+        size = np.sqrt(norm(normal) / rest)
+        normal /= norm(normal)
+        first = (corners[0] - origin) / norm(corners[0] - origin)
         axes = np.column_stack([first, np.cross(normal, first), normal])
         position = origin + size * axes @ splats.xyz[number]
         own = Rotation.from_quat(splats.rotation[number], scalar_first=True)
         turn = (Rotation.from_matrix(axes) * own).as_quat(canonical=True, scalar_first=True)
-        x, y, z = (position - CAMERA) / np.linalg.norm(position - CAMERA)
+        x, y, z = (position - CAMERA) / norm(position - CAMERA)
         basis = np.array([0.28209479, -0.48860251 * y, 0.48860251 * z, -0.48860251 * x])
         color = np.maximum(0, 0.5 + basis @ splats.sh[number])
         deviations = size * np.exp(splats.log_scale[number])

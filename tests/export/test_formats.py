@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from capture import factory
+from refusal import refusal
 
 from export.web.conftest import make_head
 from stga_addon.avatar.embedding import to_world
@@ -64,7 +65,7 @@ def test_a_sequence_replaces_an_earlier_one(avatar, tmp_path):
     assert contents(tmp_path) == before
     (tmp_path / "00002.ply").write_text("a scan of somebody else")
     before = contents(tmp_path)
-    with pytest.raises(StgaError, match=r"holds 00002\.ply, which was not written here"):
+    with refusal(r"holds 00002\.ply, which was not written here"):
         export_avatar(tmp_path, avatar, "ply-sequence", posed(avatar, 1))
     assert contents(tmp_path) == before
 
@@ -104,7 +105,7 @@ def test_a_sequence_whose_third_rename_fails(avatar, tmp_path, monkeypatch, ends
 def test_frame_rates_that_nothing_plays(format, fps, avatar, tmp_path):
     """Catches a file its viewers refuse, such as a page with damaged data."""
     path = tmp_path / f"a{FORMATS[format].suffixes[0]}"
-    with pytest.raises(StgaError, match=r"frame rate \(--fps\) must be from 0\.01 to 1000"):
+    with refusal(r"frame rate \(--fps\) must be from 0\.01 to 1000"):
         export_avatar(path, avatar, format, [(0, avatar.neutral)], playback=Playback(fps=fps))
     assert list(tmp_path.iterdir()) == []
 
@@ -115,10 +116,10 @@ def test_a_missing_source_and_other_suffixes_are_refused(format, avatar, tmp_pat
     text, and names that no viewer opens."""
     suffixes = FORMATS[format].suffixes
     if format != "usd":  # which may not be installed
-        with pytest.raises(StgaError, match=r"FLAME parameters|no posed mesh"):
+        with refusal(r"FLAME parameters|no posed mesh"):
             export_avatar(tmp_path / f"out{next(iter(suffixes), '')}", avatar, format)
     if suffixes:
-        with pytest.raises(StgaError, match=r"a\.gltf: expected a name that ends in \."):
+        with refusal(r"a\.gltf: expected a name that ends in \."):
             export_avatar(tmp_path / "a.gltf", avatar, format, posed(avatar, 0))
     assert list(tmp_path.iterdir()) == []
 

@@ -6,10 +6,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from avatar.conftest import rendered, world_splats
+from numpy.random import default_rng
 from numpy.testing import assert_allclose, assert_array_equal
+from refusal import refusal
 
 from stga_addon.avatar.embedding import to_world
-from stga_addon.errors import StgaError
 from stga_addon.export.formats import FORMATS, Content, export_avatar
 from stga_addon.export.playback import Playback
 
@@ -18,13 +19,13 @@ MISSING = "the package usd-core is not installed"
 
 
 def moved(avatar, frames=(3, 4, 7)):
-    rng = np.random.default_rng(2)
+    rng = default_rng(2)
     for frame in frames:
         yield frame, avatar.neutral + rng.normal(0, 0.01, avatar.neutral.shape)
 
 
 def colored(avatar):
-    rng = np.random.default_rng(3)
+    rng = default_rng(3)
     shape = (len(avatar.faces), 3, 3)
     driven = {
         name: rng.normal(0, 0.1, shape).astype(np.float32)
@@ -107,7 +108,7 @@ def test_valid(avatar, tmp_path):
 def test_size_is_known_before(avatar, tmp_path):
     """Catches an estimate that would let a range fill the disk."""
     pytest.importorskip("pxr.Usd", reason=MISSING)
-    many = np.random.default_rng(0).integers(0, len(avatar.splats), 5000)
+    many = default_rng(0).integers(0, len(avatar.splats), 5000)
     avatar = replace(avatar, splats=avatar.splats.rows(many))
     for item in (avatar, colored(avatar)):
         export_avatar(tmp_path / "a.usdc", item, "usd", moved(item, (0, 1, 2, 3)))
@@ -120,5 +121,5 @@ def test_without_usd_the_package_is_named(avatar, tmp_path, monkeypatch):
     for name in [name for name in sys.modules if name.partition(".")[0] == "pxr"]:
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, "pxr", None)
-    with pytest.raises(StgaError, match=r"USD files need the package usd-core"):
+    with refusal(r"USD files need the package usd-core"):
         export_avatar(tmp_path / "a.usdc", avatar, "usd", moved(avatar))

@@ -8,6 +8,7 @@ import pytest
 import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from numpy.random import default_rng
 from raster import reference
 
 from .scenes import (
@@ -39,7 +40,7 @@ def scenes(draw):
 
     count = draw(st.integers(1, 30))
     seed = draw(st.integers(0, 2**32 - 1))
-    rng = np.random.default_rng(seed)
+    rng = default_rng(seed)
     size = draw(st.integers(1, 40)), draw(st.integers(1, 40))
     focal = max(size) * 10 ** between(-1.5, 1.5)
     nearest = 10 ** between(-2, 1)
@@ -129,14 +130,14 @@ def test_gradient_is_the_central_difference(name):
     every pixel where the step crosses one of the renderer's jumps (alpha 1/255 and 0.999,
     transmittance 1e-4).
     """
-    scene = facing(25, log_scale=np.random.default_rng(5).normal(-1.8, 0.6, (25, 3)))
+    scene = facing(25, log_scale=default_rng(5).normal(-1.8, 0.6, (25, 3)))
     step = 1e-6
     steady = torch.from_numpy(steady_pixels(scene, margin=1e-3))
     assert steady.float().mean() > 0.8
     cotangents = [v * steady for v in random_cotangents(scene.camera)]
     _, gradients = kernel_gradients(scene, cotangents)
     base = {n: torch.from_numpy(v).double() for n, v in scene.splats.items()}
-    rng = np.random.default_rng(6)
+    rng = default_rng(6)
     for _ in range(4):
         direction = rng.normal(size=base[name].shape)
         ends = []

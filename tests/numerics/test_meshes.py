@@ -3,6 +3,8 @@ rendered of them."""
 
 import numpy as np
 import pytest
+from numpy.linalg import norm
+from numpy.random import default_rng
 from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
@@ -38,7 +40,7 @@ def test_a_line_in_the_neutral_mesh_does_not_grow(convention, name, dtype):
     frames = face_frames(WHOLE, FACES, neutral, convention)
     assert_proper(frames.rotation)
     world = to_world(splats, frames)
-    assert np.linalg.norm(world.xyz - frames.origin, axis=1).max() < 0.04
+    assert norm(world.xyz - frames.origin, axis=1).max() < 0.04
     assert np.exp(world.log_scale).max() < 0.02
     for field in ("xyz", "rotation", "log_scale"):
         assert np.isfinite(getattr(world, field)).all(), field
@@ -54,7 +56,7 @@ def test_a_triangle_that_collapses_in_one_frame(convention, name):
     frames = face_frames(posed, FACES, WHOLE, convention)
     assert_proper(frames.rotation)
     world = to_world(splats, frames)
-    assert np.linalg.norm(world.xyz - frames.origin, axis=1).max() < 0.02
+    assert norm(world.xyz - frames.origin, axis=1).max() < 0.02
     back = to_local(world, frames, splats.face)
     for field in ("xyz", "rotation", "log_scale"):
         assert np.isfinite(getattr(world, field)).all(), field
@@ -70,7 +72,7 @@ def test_rounding_does_not_turn_a_line(convention, name):
     Without the threshold the frame of a closed eyelid turns at random from one frame to the next.
     """
     posed = DEGENERATE[name]
-    noise = np.random.default_rng(0).uniform(-2e-9, 2e-9, (20, 3, 3))
+    noise = default_rng(0).uniform(-2e-9, 2e-9, (20, 3, 3))
     triangles = [posed, *(posed + noise)]
     vertices = np.concatenate(triangles)
     faces = np.arange(63).reshape(-1, 3)
@@ -86,7 +88,7 @@ def test_collapsed_triangles_render_and_train_in_float32():
     neutral, _ = mesh_of([WHOLE] * len(flat) + flat)
     for convention in CONVENTIONS:
         splats = lattice_splats(neutral, faces, 1, 1, opacity_logit=1.0, convention=convention)
-        rng = np.random.default_rng(1)
+        rng = default_rng(1)
         values = {name: getattr(splats, name) for name in NAMES}
         values["rotation"] = rng.normal(size=values["rotation"].shape).astype(np.float32)
         values["sh"] = rng.normal(0, 0.5, values["sh"].shape).astype(np.float32)
@@ -108,10 +110,10 @@ def test_collapsed_triangles_render_and_train_in_float32():
 
 def test_quaternions_near_half_turns_from_float32_matrices():
     """Catches a negative square root, or 0/0, where rounding leaves the trace below −1."""
-    rng = np.random.default_rng(2)
+    rng = default_rng(2)
     axes = rng.normal(size=(500, 3))
     axes[:30] = np.repeat(np.eye(3), 10, axis=0)
-    axes /= np.linalg.norm(axes, axis=1, keepdims=True)
+    axes /= norm(axes, axis=1, keepdims=True)
     angles = np.pi + rng.normal(size=500) * 10.0 ** rng.uniform(-9, -3, 500)
     matrices = Rotation.from_rotvec(axes * angles[:, None]).as_matrix().astype(np.float32)
     assert (np.trace(matrices, axis1=1, axis2=2) < -1).any()

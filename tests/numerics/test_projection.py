@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from numpy.random import default_rng
 from numpy.testing import assert_allclose, assert_array_equal
 
 from stga_addon.avatar.embedding import face_frames
@@ -23,13 +24,13 @@ from .scenes import (
     steady_pixels,
 )
 
-RNG = np.random.default_rng(0)
+RNG = default_rng(0)
 TAN_89 = np.tan(np.radians(89))
 
 
 def log_normal(count, scale, seed=1):
     """Anisotropic, because the rotation of a ball has no gradient to compare."""
-    return np.random.default_rng(seed).normal(np.log(scale), 0.4, (count, 3))
+    return default_rng(seed).normal(np.log(scale), 0.4, (count, 3))
 
 
 def beside(count, reach):
@@ -183,7 +184,7 @@ def test_ten_thousand_opaque_layers(back_end):
     scene = facing(
         10_000,
         size=(18, 17),
-        xyz=np.c_[np.random.default_rng(2).uniform(-0.3, 0.3, (10_000, 2)), depths],
+        xyz=np.c_[default_rng(2).uniform(-0.3, 0.3, (10_000, 2)), depths],
         log_scale=log_normal(10_000, 0.2),
         opacity=np.full(10_000, 7.0),
     )
@@ -206,7 +207,7 @@ def test_ten_thousand_opaque_layers(back_end):
 
 def triangles(seed=3, count=12):
     """Posed and neutral vertices (V, 3) of a head-sized soup of triangles, and its faces."""
-    rng = np.random.default_rng(seed)
+    rng = default_rng(seed)
     faces = np.arange(3 * count).reshape(-1, 3)
     neutral = rng.uniform(-0.1, 0.1, (count, 1, 3)) + rng.normal(0, 0.02, (count, 3, 3))
     neutral = neutral.reshape(-1, 3)
@@ -215,7 +216,7 @@ def triangles(seed=3, count=12):
 
 def embedded(camera):
     """Splats in the frames of the triangles, and face (N,) int32."""
-    rng = np.random.default_rng(4)
+    rng = default_rng(4)
     scene = facing(60, 4, xyz=rng.normal(0, 0.005, (60, 3)), log_scale=log_normal(60, 0.008))
     return replace(scene, camera=camera), rng.integers(0, 12, 60).astype(np.int32)
 

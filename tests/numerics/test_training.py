@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from numpy.random import default_rng
 from numpy.testing import assert_allclose
 from training.test_losses import reference as loss_reference
 from training.toys import random_splats
@@ -18,7 +19,7 @@ RATE = dict.fromkeys((*Parameters._fields, "sh_rest"), 1e-3)
 
 
 def image_of(kind, value):
-    rng = np.random.default_rng(0)
+    rng = default_rng(0)
     noise = rng.random((3, HEIGHT, WIDTH))
     if kind == "constant":
         noise = np.ones_like(noise)
@@ -41,7 +42,7 @@ def loss_errors(image, target):
 
 
 def random_target():
-    return np.random.default_rng(1).integers(0, 256, (HEIGHT, WIDTH, 3)).astype(np.uint8)
+    return default_rng(1).integers(0, 256, (HEIGHT, WIDTH, 3)).astype(np.uint8)
 
 
 EXTREMES = [(kind, value) for kind in ("noise", "sparks") for value in (0.0, 1.0, 10.0, 1e4, 1e8)]
@@ -127,7 +128,7 @@ def adam_path(gradients, steps=0):
 
 def histories():
     """Gradients, steps before them, and a tolerance in units of the rate."""
-    noise = np.random.default_rng(2).normal(size=40)
+    noise = default_rng(2).normal(size=40)
     # Where squares are subnormal, only their order of magnitude is left, beside an ε that outweighs
     # them.
     sizes = (1e-8, 1e-12, 1e-15, 1e-17, 1e-20, 1e-25, 1e-38, 0.0)
@@ -157,7 +158,7 @@ def test_adam_after_a_spike_whose_square_overflows(spike):
 
     Such a gradient counts as broken, like NaN: the row keeps its value and moments for that step.
     """
-    gradients = np.random.default_rng(3).normal(size=40)
+    gradients = default_rng(3).normal(size=40)
     gradients[10] = spike
     path = adam_path(gradients)
     assert path[10] == path[9]

@@ -4,6 +4,7 @@ the CPU."""
 import numpy as np
 import pytest
 from numerics.meshes import bent_ball, collapsed
+from numpy.random import default_rng
 from numpy.testing import assert_allclose, assert_array_equal
 
 from raster import gpu_device
@@ -44,7 +45,7 @@ def view_of(device, splats):
 def test_sorted_keys_are_numpys(device, count, kind):
     """Catches a key lost at a block's edge, a digit's carry, equal keys that change places, and the
     tiles of a large image, which need a second pass."""
-    random = np.random.default_rng(count)
+    random = default_rng(count)
     keys = {
         "random": random.integers(0, 1 << 32, count),
         "few": random.integers(0, 3, count) << 11,
@@ -100,7 +101,7 @@ def on_device(device, image, target, touched, **options):
 
 def pictures(width, height, seed=1):
     """A smooth image with noise, and bytes that resemble it."""
-    rng = np.random.default_rng(seed)
+    rng = default_rng(seed)
     smooth = 0.5 + 0.4 * np.sin(np.linspace(0, 9, width) + np.linspace(0, 5, height)[:, None])
     image = np.stack([smooth, 1 - smooth, smooth**2]) + rng.normal(0, 0.05, (3, height, width))
     target = np.clip(255 * (image + rng.normal(0, 0.1, image.shape)), 0, 255).transpose(1, 2, 0)
@@ -161,7 +162,7 @@ def test_frames_and_signals_are_numpys(device, convention, mesh):
         pose = camera.world_to_camera
         posed = posed + shift
         pose[:3, 3] = -pose[:3, :3] @ shift
-    ends = np.random.default_rng(8).uniform(0, 1.5, (len(faces), 2, 6))
+    ends = default_rng(8).uniform(0, 1.5, (len(faces), 2, 6))
     ends[:, 0] *= -1
     basis = strain_basis(neutral, faces, np.float32(ends) if mesh == "ball" else None)
     in_world = face_frames(posed, faces, neutral, convention, basis)

@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 import torch
+from numpy.random import default_rng
 from numpy.testing import assert_allclose, assert_array_equal
 
 from raster import reference
@@ -62,7 +63,7 @@ def cloud(
 ):
     """`count` random splats around the origin; the image is wide enough to hold most of them at
     zoom 1."""
-    rng = np.random.default_rng(seed)
+    rng = default_rng(seed)
     width, height = size
     focal = zoom * 1.5 * max(width, height)
     splats = {
@@ -183,7 +184,7 @@ def test_image_and_gradients_are_the_references(back_end, name):
 def test_embedded_splats_render_and_train_in_their_frames(back_end, convention):
     """Catches a kernel that turns, scales or differentiates in the wrong frame."""
     scene = cloud(1)
-    rng = np.random.default_rng(30)
+    rng = default_rng(30)
     vertices = rng.normal(size=(12, 3)) * 0.6
     faces = rng.permuted(np.tile(np.arange(12), (9, 1)), axis=1)[:, :3]
     neutral = vertices + rng.normal(size=vertices.shape) * 0.2
@@ -262,7 +263,7 @@ def test_color_is_added_with_the_right_gradient(back_end):
     """Catches color of the wrong triangle or in the wrong unit, and a gradient that misses the
     clamp."""
     scene = SCENES["dark"]
-    rng = np.random.default_rng(31)
+    rng = default_rng(31)
     count = len(scene.splats["xyz"])
     neutral = rng.normal(size=(9, 3))
     faces = rng.permuted(np.tile(np.arange(9), (7, 1)), axis=1)[:, :3]

@@ -5,6 +5,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from numpy.random import default_rng
 from numpy.testing import assert_allclose, assert_array_equal
 
 from stga_addon.avatar.file import Avatar
@@ -23,7 +24,7 @@ from .toys import quick_settings
 
 def squeezed(toy):
     """The toy with a mesh that is narrower along other axes in each timestep."""
-    scales = {t: 1 - 0.06 * np.random.default_rng(t).random(3) for t in toy.timesteps}
+    scales = {t: 1 - 0.06 * default_rng(t).random(3) for t in toy.timesteps}
     return replace(toy, mesh=lambda timestep: toy.neutral * scales[timestep])
 
 
@@ -36,7 +37,7 @@ def make_trainer(capture, *offsets, seed=0):
         "global", lattice=1, driven_offsets=offsets or tuple(OFFSETS), random_background=False
     )
     trainer = Trainer(capture, settings, {})
-    rng = np.random.default_rng(seed)
+    rng = default_rng(seed)
     for name, state in trainer.state.driven_offsets.items():
         state.value[:] = rng.normal(0, SIZES[OFFSETS[name].target], state.value.shape)
     return trainer
@@ -50,9 +51,7 @@ def test_the_step_is_adams_on_the_gradient_of_the_loss(toy, name):
     trainer = make_trainer(capture, name)
     offset = OFFSETS[name]
     view = capture.views["train"][0]
-    target = np.random.default_rng(1).integers(
-        0, 255, (view.camera.height, view.camera.width, 3), np.uint8
-    )
+    target = default_rng(1).integers(0, 255, (view.camera.height, view.camera.width, 3), np.uint8)
     state = trainer.state
     position = state.driven_offsets[name]
     before = position.value.copy()
@@ -94,7 +93,7 @@ def test_the_step_is_adams_on_the_gradient_of_the_loss(toy, name):
 def test_the_step_is_adam_in_float64():
     """Catches a bias correction, an average or a count that is not each triangle's own, gradients
     of splats that were not trained, and a broken gradient that gets in."""
-    rng = np.random.default_rng(2)
+    rng = default_rng(2)
     faces = 6
     rate = 0.02
     ema_share = 0.1

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from capture import factory
+from command_line import stga
 from numpy.testing import assert_array_equal
 from PIL import Image
 
@@ -16,7 +17,6 @@ from stga_addon.avatar.strain import TRAINED_RANGE
 from stga_addon.capture.meshes import read_mesh
 from stga_addon.capture.model import require_same_scale
 from stga_addon.capture.open import open_capture
-from stga_addon.cli.main import main
 from stga_addon.errors import StgaError
 from stga_addon.files import read_npz
 from stga_addon.jobs.train import Extend, prepare
@@ -119,15 +119,13 @@ def test_what_looks_different_is_selected(takes, parent, tmp_path):
         {**middle, "strain_color": original.strain_color}
     )
     path = tmp_path / "selection.npz"
-    assert main(["extend", str(parent), str(takes[1]), "--select-only", str(path)]) == 0
+    assert stga("extend", parent, takes[1], "--select-only", path) == 0
     written = read_npz(path)
     assert list(written) == ["00000", "00001", "00003"]
     for timestep, faces in prepared.selection.items():
         assert_array_equal(written[f"{timestep - 4:05d}"], faces)
     assert not parent.with_name("run_2").exists()
-    assert (
-        main(["extend", str(parent), str(takes[1]), str(takes[0]), "--select-only", str(path)]) == 2
-    )
+    assert stga("extend", parent, takes[1], takes[0], "--select-only", path) == 2
 
 
 @pytest.mark.parametrize("growth", [0.0, 0.5])

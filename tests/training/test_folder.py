@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
+from refusal import refusal
 
-from stga_addon.errors import StgaError
 from stga_addon.training.optimize.state import arrays_of
 from stga_addon.training.run import checkpoint as checkpoint_files
 from stga_addon.training.run import folder, metrics_log
@@ -81,7 +81,7 @@ def test_damaged_runs(tmp_path, field, value, message):
     """Catches a run of another version taken for one's own, and a traceback of one edited."""
     folder.write_run(tmp_path, make_run())
     edit_json(tmp_path / "run.json", **{field: value})
-    with pytest.raises(StgaError, match=rf"run\.json: .*{message}"):
+    with refusal(rf"run\.json: .*{message}"):
         folder.read_run(tmp_path)
 
 
@@ -95,14 +95,13 @@ def test_selection_round_trip(tmp_path):
     for timestep, faces in selection.items():
         assert_array_equal(again[timestep], faces)
         assert again[timestep].dtype == bool
-    other = r"selection\.npz: '00000' is bool \(5,\), expected bool \(6,\)"
-    with pytest.raises(StgaError, match=other):
+    with refusal(r"selection\.npz: '00000' is bool \(5,\), expected bool \(6,\)"):
         checkpoint_files.read_selection(tmp_path, FACES + 1)
     checkpoint_files.write_selection(tmp_path, {0: np.ones(FACES, np.float32)}, "a")
-    with pytest.raises(StgaError, match="float32"):
+    with refusal("float32"):
         checkpoint_files.read_selection(tmp_path, FACES)
     np.savez(tmp_path / "selection.npz", mouth=selection[0])
-    with pytest.raises(StgaError, match="'mouth'"):
+    with refusal("'mouth'"):
         checkpoint_files.read_selection(tmp_path, FACES)
 
 
@@ -184,7 +183,7 @@ def test_damaged_checkpoints(tmp_path, says):
     with np.load(path) as data:
         arrays = dict(data)
     np.savez(path, **{k: v for k, v in {**arrays, **DAMAGES[says]}.items() if v is not None})
-    with pytest.raises(StgaError, match=rf"checkpoint\.npz: .*{says}"):
+    with refusal(rf"checkpoint\.npz: .*{says}"):
         checkpoint_files.read_checkpoint(tmp_path)
 
 
@@ -237,7 +236,7 @@ def test_damaged_metrics(tmp_path, damaged, message):
     """Catches a traceback in resume, curve or summary for a missing or wrong field."""
     for written in (line(5), damaged, line(20)):
         metrics_log.append_metrics(tmp_path, written)
-    with pytest.raises(StgaError, match=rf"metrics\.jsonl: line 2: {message}") as caught:
+    with refusal(rf"metrics\.jsonl: line 2: {message}") as caught:
         metrics_log.read_metrics(tmp_path)
     assert len(str(caught.value)) < 400
 
@@ -247,7 +246,7 @@ def test_second_run_is_refused_while_the_first_lives(tmp_path):
     target = tmp_path / "new" / "run"
     with folder.locked(target):
         mine = rf"another run is working in this folder \(process {os.getpid()}\)"
-        with pytest.raises(StgaError, match=mine), folder.locked(target):
+        with refusal(mine), folder.locked(target):
             pass
         assert (target / "run.lock").exists()  # the refused one must not take the lock away
     assert not (target / "run.lock").exists()
@@ -260,7 +259,7 @@ def test_second_run_is_refused_while_the_first_lives(tmp_path):
         command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
     ) as other:
         assert other.stdout.readline() == "held\n"
-        with pytest.raises(StgaError, match=f"process {other.pid}"), folder.locked(target):
+        with refusal(f"process {other.pid}"), folder.locked(target):
             pass
         other.kill()
     assert lock_owner(target / "run.lock") == other.pid
@@ -273,5 +272,5 @@ def test_second_run_is_refused_while_the_first_lives(tmp_path):
         assert not (tmp_path / "run.lock").exists()
     (tmp_path / "file").write_text("x")
     for path in (tmp_path / "file", tmp_path / "file" / "below"):
-        with pytest.raises(StgaError, match="cannot be written"), folder.locked(path):
+        with refusal("cannot be written"), folder.locked(path):
             pass

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import trimesh
 from flame.small_head import small_head
+from numpy.linalg import norm
 from numpy.testing import assert_allclose, assert_array_equal
 from PIL import Image
 from scipy.spatial.transform import Rotation
@@ -52,9 +53,9 @@ def silhouette(camera, centre, radius):
     rays = np.stack(
         [(columns - camera.cx) / FOCAL, (rows - camera.cy) / FOCAL, np.ones((SIZE, SIZE))], -1
     )
-    rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
+    rays /= norm(rays, axis=-1, keepdims=True)
     seen = camera.world_to_camera[:3, :3] @ centre + camera.world_to_camera[:3, 3]
-    return np.asarray(np.linalg.norm(np.cross(rays, seen), axis=-1) < radius)
+    return np.asarray(norm(np.cross(rays, seen), axis=-1) < radius)
 
 
 def scene(root, centre=CENTRE, radius=RADIUS):
@@ -102,7 +103,7 @@ def test_points_stand_on_the_balls_surface(beside, convention):
     shell with holes."""
     points = hull_points(beside, beside.views["train"], convention, 1)
     world = in_world(beside, points, convention)
-    height = np.linalg.norm(world.xyz - CENTRE, axis=1) - RADIUS
+    height = norm(world.xyz - CENTRE, axis=1) - RADIUS
     assert len(world) > 300
     # The hull of twenty views is a little larger than the ball; the grid point lies within a voxel
     # of its surface.
@@ -112,13 +113,13 @@ def test_points_stand_on_the_balls_surface(beside, convention):
     sphere = CENTRE + RADIUS * np.array(trimesh.creation.icosphere(3).vertices)
     low = beside.mesh(TIMESTEP).min(0)
     high = beside.mesh(TIMESTEP).max(0)
-    margin = 0.25 * np.linalg.norm(high - low) - 2 * VOXEL_SIZE_M
-    head = np.linalg.norm(sphere - beside.mesh(TIMESTEP).mean(0), axis=1) - 1.1 * 0.06
+    margin = 0.25 * norm(high - low) - 2 * VOXEL_SIZE_M
+    head = norm(sphere - beside.mesh(TIMESTEP).mean(0), axis=1) - 1.1 * 0.06
     wanted = ((sphere > low - margin) & (sphere < high + margin)).all(axis=1) & (
         head > MIN_MESH_DISTANCE_M + 2 * VOXEL_SIZE_M
     )
     assert wanted.mean() > 0.7
-    gaps = np.linalg.norm(sphere[wanted][:, None] - world.xyz[None], axis=2).min(axis=1)
+    gaps = norm(sphere[wanted][:, None] - world.xyz[None], axis=2).min(axis=1)
     assert gaps.max() < 2.5 * VOXEL_SIZE_M
 
 
@@ -133,7 +134,7 @@ def test_points_are_unbound_gray_and_embedded_in_the_nearest_triangle(beside):
     assert_allclose(np.exp(world.log_scale), VOXEL_SIZE_M / 2, rtol=1e-5)
     centroids = beside.mesh(TIMESTEP)[beside.faces].mean(1)
     some = np.arange(0, len(points), 7)
-    distances = np.linalg.norm(world.xyz[some, None] - centroids[None], axis=2)
+    distances = norm(world.xyz[some, None] - centroids[None], axis=2)
     bound = distances[np.arange(len(some)), points.face[some]]
     # The nearest triangle need not have the nearest centroid, but on this even mesh it nearly does.
     assert_allclose(bound, distances.min(axis=1), atol=3e-4)
@@ -168,7 +169,7 @@ def test_nothing_near_the_mesh(tmp_path):
     inside the head."""
     capture = scene(tmp_path, np.array([0.04, 0.04, 0.02]), 0.04)
     world = in_world(capture, hull_points(capture, capture.views["train"], "stga", 0))
-    head = np.linalg.norm(world.xyz - capture.mesh(TIMESTEP).mean(0), axis=1) - 1.1 * 0.06
+    head = norm(world.xyz - capture.mesh(TIMESTEP).mean(0), axis=1) - 1.1 * 0.06
     assert len(world) > 100
     # The clearance is measured to vertices and centroids, 2 mm from any point of a triangle of this
     # mesh.
@@ -245,8 +246,8 @@ def test_few_cameras_take_the_torso_from_where_it_was_seen(tmp_path):
     assert len(few) - len(seen) < 0.2 * len(hull)  # above the neck
     assert torso_faces(model)[seen.face].all()
     neutral = face_frames(capture.mesh(TIMESTEP + 1), capture.faces, capture.neutral)
-    assert np.linalg.norm(to_world(seen, neutral).xyz - at.mean(0), axis=1).max() < 0.03
-    assert np.linalg.norm(in_world(capture, seen).xyz - at.mean(0), axis=1).min() > 0.01
+    assert norm(to_world(seen, neutral).xyz - at.mean(0), axis=1).max() < 0.03
+    assert norm(in_world(capture, seen).xyz - at.mean(0), axis=1).min() > 0.01
     assert_array_equal(hull_points(capture, views, "stga", 0, torso=True).xyz, many.xyz)
 
 
@@ -268,9 +269,7 @@ def test_a_single_camera_gets_a_layer_as_deep_as_the_mesh(beside, convention):
         inner & ~silhouette(view.camera, beside.mesh(TIMESTEP).mean(0), 1.1 * 0.06 + 0.01)
     )[:, ::-1]
     assert len(wanted) > 50
-    assert (
-        np.linalg.norm(wanted[:, None] + 0.5 - pixels[None], axis=2).min(axis=1).max() < 1.5 * step
-    )
+    assert norm(wanted[:, None] + 0.5 - pixels[None], axis=2).min(axis=1).max() < 1.5 * step
     assert world.unbound.all()
     assert_allclose(np.exp(world.log_scale), VOXEL_SIZE_M / 2, rtol=1e-5)
 
@@ -278,7 +277,7 @@ def test_a_single_camera_gets_a_layer_as_deep_as_the_mesh(beside, convention):
 def _gap(camera):
     """Distance in meters between head and ball as the camera sees them, without the depth."""
     rotation = camera.world_to_camera[:2, :3]
-    return float(np.linalg.norm(rotation @ CENTRE)) - 1.1 * 0.06 + RADIUS / 2
+    return float(norm(rotation @ CENTRE)) - 1.1 * 0.06 + RADIUS / 2
 
 
 @pytest.mark.parametrize(("right", "up", "continued"), [(0.0, -0.24, True), (0.22, 0.05, False)])

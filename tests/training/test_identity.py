@@ -10,10 +10,10 @@ import pytest
 from capture import factory
 from command_line import stga
 from PIL import Image
+from refusal import refusal
 
 from stga_addon.avatar.file import read_avatar
 from stga_addon.capture.open import open_capture
-from stga_addon.errors import StgaError
 from stga_addon.jobs.perform import request_folder, write_request
 from stga_addon.jobs.train import Resume
 from stga_addon.render import device as device_choice
@@ -105,13 +105,13 @@ def test_changed_captures_are_refused(copy, toy, tmp_path, change, message):
     other = shutil.copytree(toy.root, tmp_path / "other")
     change(other)
     both = rf"was trained on {toy.root} \(4 cameras, 4 timesteps\), but {other} \(.*{message}"
-    with pytest.raises(StgaError, match=both):
+    with refusal(both):
         open_run(copy, other)
-    with pytest.raises(StgaError, match=message):
+    with refusal(message):
         train_run(open_capture(other), copy, make_run(toy), resume=True)
     # replaced in place
     factory.edit(copy / "run.json", lambda document: document.update(capture=str(other)))
-    with pytest.raises(StgaError, match=rf"was trained on {other} .*, but it now has .*{message}"):
+    with refusal(rf"was trained on {other} .*, but it now has .*{message}"):
         open_run(copy)
 
 
@@ -156,10 +156,9 @@ def test_another_flame_model_is_refused(toy, tmp_path):
     moved = shutil.copy(model, tmp_path / "moved.npz")
     assert open_run(out, flame=moved).run.flame == moved
     other = factory.write_flame_model(tmp_path / "other.npz", seed=1)
-    message = f"was trained with FLAME model {model}, but {other} has other content"
-    with pytest.raises(StgaError, match=message):
+    with refusal(f"was trained with FLAME model {model}, but {other} has other content"):
         open_run(out, flame=other)
-    with pytest.raises(StgaError, match=rf"was trained on {root} .* but {toy.root} \(.* has "):
+    with refusal(rf"was trained on {root} .* but {toy.root} \(.* has "):
         open_run(out, toy.root)
     assert stga("train", root, "--out", out, "--resume --flame", other) == 2
     assert stga("train", root, "--out", out, "--resume --flame", moved) == 0
@@ -215,7 +214,7 @@ def test_files_of_another_run_are_refused(copy, toy, tmp_path, name):
     """Catches a checkpoint or a selection that was copied beside the run.json of another run."""
     train_run(toy, tmp_path / "other", make_run(toy, seed=5), report=stop_at(3))
     shutil.copy(tmp_path / "other" / name, copy / name)
-    with pytest.raises(StgaError, match=rf"{name}: belongs to another run than run\.json"):
+    with refusal(rf"{name}: belongs to another run than run\.json"):
         train_run(toy, copy, make_run(toy), resume=True)
 
 
@@ -252,12 +251,11 @@ def test_device_belongs_to_the_run(copy, monkeypatch):
     monkeypatch.setattr(open_run_module, "choose_device", lambda wanted: (wanted, "why"))
     assert device_of(replace(run, device="gpu:Second Card"))[0] == "gpu:Second Card"
     assert device_of(replace(run, device="gpu:Card of another machine"))[0] == "gpu"
-    with pytest.raises(StgaError, match="refines the tracking, which works on the CPU only"):
+    with refusal("refines the tracking, which works on the CPU only"):
         device_of(replace(run, settings=replace(run.settings, tracking=True)), "gpu")
     monkeypatch.undo()
     monkeypatch.setattr(device_choice, "find_spec", lambda name: None)
-    missing = r"trained on gpu: .*wgpu .* is not installed; give --device cpu"
-    with pytest.raises(StgaError, match=missing):
+    with refusal(r"trained on gpu: .*wgpu .* is not installed; give --device cpu"):
         device_of(replace(run, device="gpu:Card"))
     assert device_of(replace(run, device="cuda:0"), "cpu")[0] == "cpu"
 

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 from capture import factory
+from numpy.random import default_rng
 from numpy.testing import assert_allclose, assert_array_equal
 from PIL import Image
 from raster.reference import image_loss
@@ -48,7 +49,7 @@ WIDTH = 24
 
 
 def random_image(seed):
-    return np.random.default_rng(seed).integers(0, 256, (HEIGHT, WIDTH, 3), np.uint8)
+    return default_rng(seed).integers(0, 256, (HEIGHT, WIDTH, 3), np.uint8)
 
 
 def reference_ssim(image, target, where=None):
@@ -72,10 +73,10 @@ def write_views(root, count):
 def test_psnr():
     """Catches wrong axes, a peak of 255, natural logarithms, and a mask ignored."""
     target = random_image(0)
-    image = np.random.default_rng(1).random((3, HEIGHT, WIDTH)).astype(np.float32)
+    image = default_rng(1).random((3, HEIGHT, WIDTH)).astype(np.float32)
     error = (image.astype(float) - np.moveaxis(target / 255, 2, 0)) ** 2
     assert psnr(image, target) == pytest.approx(10 * np.log10(1 / error.mean()), abs=1e-4)
-    where = np.random.default_rng(2).random((HEIGHT, WIDTH)) < 0.2
+    where = default_rng(2).random((HEIGHT, WIDTH)) < 0.2
     wanted = np.mean([error[c][where].mean() for c in range(3)])
     assert psnr(image, target, where) == pytest.approx(10 * np.log10(1 / wanted), abs=1e-4)
     assert psnr((target.transpose(2, 0, 1) / 255).astype(np.float32), target) > 100
@@ -85,7 +86,7 @@ def test_evaluate_means_over_views_and_clips(tmp_path):
     """Catches PSNR of the mean error, another SSIM, and values over one counted double."""
     views = write_views(tmp_path, 3)
     drawn = {
-        view.name: np.random.default_rng(9).normal(0.5, 0.5, (3, HEIGHT, WIDTH)).astype(np.float32)
+        view.name: default_rng(9).normal(0.5, 0.5, (3, HEIGHT, WIDTH)).astype(np.float32)
         for view in views
     }
     drawn["2.png"] = (random_image(2).transpose(2, 0, 1) / 255 * 0.9 + 0.05).astype(np.float32)
@@ -107,7 +108,7 @@ def test_regions_are_measured_by_themselves(tmp_path):
     where = np.zeros((HEIGHT, WIDTH), bool)
     where[4:24, 3:18] = True
     target = read_image(views[0])
-    rng = np.random.default_rng(3)
+    rng = default_rng(3)
     inside = np.clip(target / 255 + rng.normal(0, 0.1, target.shape), 0, 1)
     good = np.where(where[..., None], inside, target / 255)
     bad = np.where(where[..., None], inside, rng.random(target.shape))
@@ -149,7 +150,7 @@ def expected(image, target, where):
 
 def test_against_the_formula():
     """Catches a wrong filter, window, channel weight or region."""
-    rng = np.random.default_rng(0)
+    rng = default_rng(0)
     image = gaussian_filter(rng.random((3, 24, 32), np.float32), (0, 1, 1))
     target = rng.integers(0, 256, (24, 32, 3), np.uint8)
     where = rng.random((24, 32)) < 0.3
@@ -162,7 +163,7 @@ def test_against_the_formula():
 
 def test_detail_that_is_a_pixel_off_beats_blur():
     """Catches a criterion that, like PSNR, keeps the blurred state instead of hair."""
-    rng = np.random.default_rng(1)
+    rng = default_rng(1)
     gray = gaussian_filter(rng.random((96, 96)), (4, 0.8)).astype(np.float32)
     strands = np.repeat((gray - gray.min())[None] / np.ptp(gray), 3, 0)
     target = (255 * strands).round().astype(np.uint8).transpose(1, 2, 0)
@@ -179,7 +180,7 @@ def head_and_image():
     """A mask (H, W) bool and a rendering (3, H, W) float32 over white."""
     head = np.zeros((SIDE, SIDE), bool)
     head[6:26, 8:24] = True
-    noise = np.random.default_rng(0).uniform(0.2, 0.7, (3, SIDE, SIDE))
+    noise = default_rng(0).uniform(0.2, 0.7, (3, SIDE, SIDE))
     return head, np.where(head, noise, 1.0).astype(np.float32)
 
 

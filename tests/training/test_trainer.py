@@ -5,6 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from capture import factory
+from numpy.linalg import norm
+from numpy.random import default_rng
 from numpy.testing import assert_allclose, assert_array_equal
 from PIL import Image
 
@@ -54,12 +56,12 @@ def large(view, factor=3.0):
     """In a larger image, and a noisy target: many tiles and a gradient everywhere."""
     view = replace(view, camera=view.camera.scaled(factor))
     size = view.camera.height, view.camera.width, 3
-    return view, np.random.default_rng(0).integers(0, 256, size, np.uint8)
+    return view, default_rng(0).integers(0, 256, size, np.uint8)
 
 
 def disturb(trainer):
     """Rows unlike each other, and as many coefficients as there may be."""
-    rng = np.random.default_rng(1)
+    rng = default_rng(1)
     for value, average in zip(trainer.state.parameters, trainer.state.average, strict=True):
         value += rng.normal(0, 0.2 if value.ndim != 2 else 1e-3, value.shape).astype(np.float32)
         average[:] = value
@@ -172,14 +174,14 @@ def test_stray_resets_and_density_control_come_when_due(toy):
     for n in range(10):
         if n == 4:
             own = trainer.state.parameters.xyz[trainer.state.face == int(face[7])]
-            assert np.linalg.norm(own, axis=1).max() > 0.9
+            assert norm(own, axis=1).max() > 0.9
         trainer.step(view, image, n / 10)
         counts.append(len(trainer.state))
     first = trainer.initial_count
     assert counts[:2] == [first, first]
     assert first < counts[3] <= counts[5] <= round(first * 1.05)
     assert counts[5:] == [counts[5]] * 5
-    assert np.linalg.norm(trainer.state.parameters.xyz, axis=1).max() < 0.5
+    assert norm(trainer.state.parameters.xyz, axis=1).max() < 0.5
 
 
 def test_initial_splats_with_hull_points(tmp_path):
@@ -222,7 +224,7 @@ def test_unseen_share(toy):
     """Catches seen taken for unseen, another timestep, and shares of bound splats."""
     splats = initial_splats(toy, quick_settings(lattice=0))
     splats.unbound[::2] = True
-    splats.xyz[:] += np.random.default_rng(0).normal(0, 0.1, splats.xyz.shape).astype(np.float32)
+    splats.xyz[:] += default_rng(0).normal(0, 0.1, splats.xyz.shape).astype(np.float32)
     found = unseen_share(toy, "stga", splats)
     first = toy.views["train"][0].timestep
     frames = face_frames(toy.mesh(first), toy.faces, toy.neutral, "stga")
@@ -262,7 +264,7 @@ def test_scale_limits_in_meters(toy, convention):
     share = np.interp(facing, (UNSEEN_COSINE, GRAZING_COSINE), (UNSEEN_LIMIT_SHARE, 1))
     assert 0 < (share < 1).mean() < 0.8
     assert_allclose(bound, 3 * share * store.units, rtol=1e-6)
-    diagonal = np.linalg.norm(toy.neutral.max(0) - toy.neutral.min(0))
+    diagonal = norm(toy.neutral.max(0) - toy.neutral.min(0))
     frames = face_frames(toy.neutral, toy.faces, toy.neutral, convention)
     expected = 2 * max(0.004, diagonal / 200) * share
     assert_allclose(unbound * frames.scale, expected, rtol=1e-5)

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import trimesh
+from numpy.random import default_rng
 from PIL import Image, ImageDraw
 from scipy.spatial.transform import Rotation
 
@@ -47,7 +48,7 @@ def gloss(deformed, direction, place):
 
 def unlike_cameras():
     """Gain and offset (8, 3) of eight cameras, against their mean."""
-    rng = np.random.default_rng(5)
+    rng = default_rng(5)
     gain = rng.uniform(0.92, 1.08, (8, 3))
     offset = rng.normal(0, 3, (8, 3))
     return gain / gain.mean(0), offset - offset.mean(0)
@@ -79,7 +80,7 @@ def photograph(folder, scene):
     ball = trimesh.creation.icosphere(3, 0.1)
     vertices = np.array(ball.vertices)
     faces = np.array(ball.faces, np.int32)
-    rng = np.random.default_rng(scene.seed)
+    rng = default_rng(scene.seed)
     place = vertices[faces].mean(1) / 0.1
     colors = _own_colors(place, rng)
     meshes = {t: _deform(vertices, t, scene.deformed) for t in range(scene.timesteps)}
@@ -124,7 +125,7 @@ def photograph(folder, scene):
 
 def own_colors(capture, seed=0):
     """Levels (F, 3) of a painted capture's triangles, before whatever else colors depend on."""
-    return _own_colors(capture.neutral[capture.faces].mean(1) / 0.1, np.random.default_rng(seed))
+    return _own_colors(capture.neutral[capture.faces].mean(1) / 0.1, default_rng(seed))
 
 
 def _own_colors(place, rng):
@@ -135,7 +136,7 @@ def _own_colors(place, rng):
 
 def _deform(vertices, timestep, amount):
     """Waves along the surface, of another length and phase in every timestep."""
-    rng = np.random.default_rng([7, timestep])
+    rng = default_rng([7, timestep])
     moved = vertices.copy()
     for axis in range(3):
         waves = np.sin(vertices @ rng.normal(0, 30, 3) + rng.uniform(0, 6))

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from numpy.random import default_rng
 from numpy.testing import assert_allclose, assert_array_equal
 
 from stga_addon.training.effects.evidence import consecutive_folds, linear_evidence, scattered_folds
@@ -15,7 +16,7 @@ FOLDS = consecutive_folds(GROUP)
 
 def test_a_linear_dependence_is_found_and_noise_is_not():
     """Catches a gain from samples that the model was fitted to."""
-    rng = np.random.default_rng(0)
+    rng = default_rng(0)
     features = rng.normal(0, 1, (8, TRIANGLES, 3))[GROUP]
     noise = rng.normal(100, 2, (VIEWS, TRIANGLES, 3))
     slope = rng.normal(0, 5, (TRIANGLES, 3, 3))
@@ -26,7 +27,7 @@ def test_a_linear_dependence_is_found_and_noise_is_not():
 
 def test_features_beyond_the_fitted_range_are_clipped():
     """Catches one extrapolated expression that outweighs what all others gain."""
-    rng = np.random.default_rng(1)
+    rng = default_rng(1)
     strength = np.array([0.2, -0.3, 0.5, -0.5, 0.4, -0.2, 0.3, 4.0])
     features = np.zeros((VIEWS, TRIANGLES, 3))
     features[..., 0] = strength[GROUP][:, None]
@@ -44,7 +45,7 @@ def test_features_beyond_the_fitted_range_are_clipped():
 
 def test_the_range_is_counted_from_rest():
     """Catches a margin counted from 0: a constant added to all strain changes nothing."""
-    rng = np.random.default_rng(2)
+    rng = default_rng(2)
     rest = np.zeros((TRIANGLES, 3))
     features = rng.normal(0, 1, (8, TRIANGLES, 3))[GROUP]
     color = 100 + 20 * np.clip(features, -0.6, 0.6) + rng.normal(0, 1, (VIEWS, TRIANGLES, 3))
@@ -68,7 +69,7 @@ def test_what_only_neighboring_timesteps_know(timesteps):
     """Catches slow colors and features of no relation, predicted from neighbors."""
     timestep = np.repeat(np.arange(timesteps), 6)
     for seed in range(4):
-        rng = np.random.default_rng(seed)
+        rng = default_rng(seed)
         features = slowly(rng, timesteps, TRIANGLES, 3)[timestep]
         noise = rng.normal(100, 1, (len(timestep), TRIANGLES, 3))
         color = noise + 6 * slowly(rng, timesteps, TRIANGLES, 3)[timestep]

@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
+from numpy.linalg import norm
 from numpy.testing import assert_allclose, assert_array_equal
 from PIL import Image, ImageDraw
 
@@ -55,9 +56,9 @@ def test_the_side_that_no_camera_sees_has_the_colors_of_its_mirror_image(painted
     capture = painted()
     views = [view for view in capture.views["train"] if view.camera_index == 0]
     center = capture.neutral[capture.faces].mean(1)
-    towards = center @ views[0].camera.position / np.linalg.norm(center, axis=1)
-    towards /= np.linalg.norm(views[0].camera.position)
-    mirrored = np.linalg.norm(center[:, None] * [-1, 1, 1] - center[None], axis=2).argmin(axis=1)
+    towards = center @ views[0].camera.position / norm(center, axis=1)
+    towards /= norm(views[0].camera.position)
+    mirrored = norm(center[:, None] * [-1, 1, 1] - center[None], axis=2).argmin(axis=1)
     other = (towards < -0.2) & (towards[mirrored] > 0.5)
     assert other.mean() > 0.1
     colors = triangle_colors(capture, views)

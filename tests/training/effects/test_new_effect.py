@@ -5,12 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal, assert_equal
+from refusal import refusal
 
 from stga_addon.avatar.embedding import face_frames, to_world
 from stga_addon.avatar.file import Avatar, read_avatar
 from stga_addon.avatar.lattice import lattice_splats
 from stga_addon.avatar.offsets import OFFSETS, POSITION, SIGNALS, DrivenOffset
-from stga_addon.errors import StgaError
 from stga_addon.export.formats import FORMATS, export_avatar
 from stga_addon.export.ply import read_ply
 from stga_addon.files import file_digest
@@ -101,9 +101,7 @@ def test_it_is_decided_trained_and_resumed_to_the_same_bits(capture, tmp_path):
 
 def test_a_device_without_its_kernels_says_so(capture):
     """Catches an effect that trains without its parameter on a GPU."""
-    with pytest.raises(
-        StgaError, match=f"driven offset {NAME}: is trained on the CPU only, not on gpu"
-    ):
+    with refusal(f"driven offset {NAME}: is trained on the CPU only, not on gpu"):
         Trainer(
             capture, quick_settings("global", lattice=0, driven_offsets=(NAME,)), {}, device="gpu"
         )
@@ -119,7 +117,7 @@ def test_exports_hold_it_or_say_that_they_cannot(format, tmp_path):
     avatar, posed = made()
     path = tmp_path / f"avatar{(FORMATS[format].suffixes or ('',))[0]}"
     if FORMATS[format].has_rig:
-        with pytest.raises(StgaError, match=f"no driven offset {NAME}"):
+        with refusal(f"no driven offset {NAME}"):
             export_avatar(path, avatar, format, [(0, posed)])
         return
     files = export_avatar(path, avatar, format, [(0, posed)])

@@ -4,7 +4,7 @@ import re
 
 import pytest
 from capture import factory
-from command_line import stga
+from command_line import refused, stga
 
 from stga_addon.capture.open import open_capture
 from stga_addon.flame.parts import PARTS
@@ -55,8 +55,9 @@ def test_the_run_keeps_its_plan(trained, root, monkeypatch, capsys):
     assert read_run(trained) == before
     lines = [" ".join(line.split()) for line in capsys.readouterr().out.splitlines()]
     assert any(line.startswith("strain-color on, as asked:") for line in lines)
-    assert stga(*train, "strain-color=off") == 2
-    assert "differs from what was decided for this run" in capsys.readouterr().err
+    assert "differs from what was decided for this run" in refused(
+        capsys, *train, "strain-color=off"
+    )
 
 
 @pytest.mark.parametrize("effect", ["strain-color", "normal-color"])
@@ -113,5 +114,6 @@ def test_baselines_decide_nothing(root, tmp_path, capsys):
         run = read_run(out)
         assert (run.effect_plan, run.settings.effects) == ((), None)
         assert not run.settings.driven_offsets
-        assert stga(*train, tmp_path / "no", "--effect strain-color=on") == 2
-        assert "--effect cannot be combined with" in capsys.readouterr().err
+        assert "--effect cannot be combined with" in refused(
+            capsys, *train, tmp_path / "no", "--effect strain-color=on"
+        )
