@@ -1,12 +1,13 @@
 """What outlines tell of a head's surface, and what splats are like that no view tells of."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 from PIL import Image
-from scipy.ndimage import binary_dilation
+from scipy.ndimage import binary_dilation, binary_erosion
 
 from stga_addon.avatar.file import UNSEEN_REGION, Avatar
 from stga_addon.avatar.filmed import filmed_sides
@@ -185,6 +186,31 @@ def test_what_views_tell_is_kept(filmed):
     edges = np.diff(filmed.neutral[filmed.faces[state.face[rows]]], axis=1).swapaxes(0, 1)
     skin = -0.1 * np.sqrt(np.linalg.norm(np.cross(*edges), axis=1))
     assert_allclose(height, np.where(outer > 0, outer, skin), atol=1e-5)
+
+
+def test_lids_close(filmed):
+    """Catches lids that were trained on open eyes and, closed, are shreds with the eye behind."""
+    model = flame_model(None)
+    capture = replace(filmed, flame=SimpleNamespace(model=model))
+    names = [model.expression_names.index(f"eyeBlink{side}") for side in ("Left", "Right")]
+    blink = capture.neutral + model.shapedirs[:, :, model.n_identity :][:, :, names].sum(2)
+    frames = FrameStore(capture, "stga", moved_mesh=lambda timestep: (None, blink)[timestep])
+    state = Trainer(capture, quick_settings(sh_degree=0, sh_steps=()), {}).state
+    lids = frames.surface.lids
+    assert 100 < lids.sum() < 1000
+    rng = np.random.default_rng(0)
+    state.parameters.opacity[:] = -4
+    state.parameters.log_scale[:] -= rng.uniform(0, 2, state.parameters.log_scale.shape)
+    SurfacePrior(frames).apply(Rows(state), Turn(20, 0.5, len(state)))
+    splats = state.splats()
+    splats = splats.rows(lids[splats.face] & ~splats.unbound)
+    camera = look_at([0, 0.03, 0.6], [0, 0.03, 0], 320, 200, 900)
+    triangle, _ = rasterize(blink, capture.faces, camera)
+    closed = binary_erosion((triangle >= 0) & lids[triangle])
+    assert closed.sum() > 500
+    black, white = (render(splats, camera, (c, c, c), frames=frames.of(1)).mean(0) for c in (0, 1))
+    alpha = 1 - white + black
+    assert np.quantile(alpha[closed], 0.02) > 0.8
 
 
 def test_the_sides_that_were_filmed(filmed):

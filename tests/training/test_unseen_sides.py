@@ -141,11 +141,13 @@ def test_a_glance_counts(from_one_side):
 HAIR = np.array([40, 25, 15], np.uint8)
 SKIN = np.array([220, 170, 150], np.uint8)
 CLOTH = np.array([30, 60, 160], np.uint8)
+EYES = np.array([200, 180, 170], np.uint8)
 
 
 def test_hair_goes_round_the_head(from_one_side, tmp_path):
     """Catches a back of the head in the color of skin, a neck with hair or in the color of clothes,
-    clothes that end where the camera does, and a closed mouth that is skin inside."""
+    clothes that end where the camera does, a closed mouth that is skin inside, teeth that are too
+    white, and lips with a dark rim."""
     model = flame_model(None)
     neutral = model.v_template
     centers = neutral[model.faces].mean(1)
@@ -161,6 +163,8 @@ def test_hair_goes_round_the_head(from_one_side, tmp_path):
     hairline = np.interp(centers[:, 2], (-0.02, 0.06), (-1.1, 0.75))
     color = np.where((level > hairline)[:, None], HAIR, SKIN)
     color[level < -2.2] = CLOTH
+    for eye in ("left_eyeball", "right_eyeball"):
+        color[faces_within(model.faces, model.masks[eye])] = EYES
     views = []
     for number, angle in enumerate(np.radians((-45, -20, 0, 20, 45))):
         eye = [np.sin(angle), 0, np.cos(angle)]
@@ -186,10 +190,15 @@ def test_hair_goes_round_the_head(from_one_side, tmp_path):
         assert (off < 25).mean() > 0.9, (part, np.median(255 * sides.color[rows], 0))
     teeth = faces_within(model.faces, model.masks["teeth"])
     assert sides.triangles[teeth].all()
-    assert (sides.color[teeth].min(1) > 0.6).all()
     part = connected_parts(len(neutral), model.faces)[model.faces[:, 0]]
     mouth = centers[key_regions(model)["mouth"]].mean(0)
-    throat = sides.triangles & (part == part[0]) & ~Surface(bare).outside
-    throat &= np.linalg.norm(centers - mouth, axis=1) < 0.04
-    assert throat.sum() > 20
-    assert (sides.color[throat].max(1) < 0.3).all()
+    off = np.linalg.norm(centers - mouth, axis=1)
+    front = teeth & (off < 0.02) & (centers[:, 2] > np.quantile(centers[teeth, 2], 0.8))
+    assert_allclose(np.median(sides.color[front], 0), 0.85 * EYES / 255, rtol=0.1)
+    inside = sides.triangles & ~Surface(bare).outside & ~teeth & (off < 0.06)
+    throat = inside & (off > 0.04)
+    for rows in (throat & (part == part[0]), throat & (part != part[0])):
+        assert rows.sum() > 20
+        assert sides.color[rows].max(1).mean() < 0.3
+    lips = np.argsort(np.where(inside & (part == part[0]), off, np.inf))[:10]
+    assert (np.median(sides.color[lips], 0) > 0.4 * SKIN / 255).all()

@@ -45,16 +45,21 @@ SMOOTHED = 24
 """A scalp's triangle has hair if its color is that far from the skin's, as a share of the scalp's
 most different ones, and so are most of that many around it."""
 
-MOUTH_REACH = 1.1
-"""How far a mouth's inside is from its middle, in that unit."""
-LINING_SHARES = np.array([0.2, 0.1, 0.1])
-GUM_SHARES = (0.7, 0.3)
-GUM_REACH = (0.3, 1.0)
-TOOTH_COLOR = np.array([0.86, 0.82, 0.74])
-LIT_SKIN = 0.85
-"""A mouth's lining (red, green, blue), gums and tongue, as shares of the lips' color, the latter
-near the mouth's middle and far from it, in that unit; sRGB of teeth in a light in which skin has so
-much red."""
+EYEBALLS = ("left_eyeball", "right_eyeball")
+LINING_REACH = 1.1
+TONGUE_REACH = 0.5
+"""How far a mouth's lining is from its middle, in that unit; what else reaches so near to it is
+teeth, gums and tongue."""
+DEPTHS = (0.0, 0.25, 0.45, 0.75)
+LIP_SHARE = 0.75
+GUM_SHARES = np.array([[0.43, 0.24, 0.22], [0.22, 0.1, 0.09], [0.12, 0.04, 0.03]])
+TOOTH_DEPTHS = (0.05, 0.15, 0.5)
+TOOTH_SHARES = (0.92, 0.74, 0.23)
+WHITE_QUANTILE = 0.8
+WHITE = np.array([0.75, 0.67, 0.63])
+"""The less light, the farther from the lips that views show, in that unit: what a mouth's lining
+has of the lips' color, gums and tongue and, elsewhere, teeth of the eyes' white, the mean of their
+brightest triangles beyond that quantile; that in daylight, for heads without eyes."""
 
 
 @dataclass(frozen=True)
@@ -151,7 +156,7 @@ def inside_colors(
     capture: Capture, color: np.ndarray, shown: np.ndarray, inside: np.ndarray
 ) -> np.ndarray:
     """Colors (M, 3) of triangles `inside` (F,) bool, which show where mouth or lids move as in no
-    view: teeth, gums and a dark lining near the mouth, in the light on the person's lips and skin;
+    view: teeth, gums and lining near the mouth, in the light on the person's lips and eyes;
     elsewhere as the skin around. color, shown: of `mean_colors`."""
     faces = capture.faces
     centers = np.asarray(capture.neutral)[faces].mean(1)
@@ -165,20 +170,31 @@ def inside_colors(
     if at is None:
         return np.asarray(found)
     mouth = capture.regions["mouth"]
-    lips = mouth & shown
-    nose = capture.regions.get("nose", lips) & shown
-    if not lips.any() or not nose.any():
+    lips = mouth & skin & shown
+    if not lips.any():
         return np.asarray(found)
-    light = min(1.0, float(np.median(color[nose], axis=0).max()) / LIT_SKIN)
-    away = np.linalg.norm(centers - centers[mouth].mean(0), axis=1)
-    near = away < MOUTH_REACH * at.unit
-    teeth = teeth_of(capture)
-    found[(near & skin)[inside]] = LINING_SHARES * np.median(color[lips], axis=0)
-    share = np.interp(away[inside] / at.unit, GUM_REACH, GUM_SHARES)
-    gums = (near & ~skin)[inside]
-    found[gums] = share[gums, None] * np.median(color[lips], axis=0)
-    found[(teeth & near)[inside]] = light * TOOTH_COLOR
+    away = np.linalg.norm(centers - centers[mouth].mean(0), axis=1) / at.unit
+    part = connected_parts(len(capture.neutral), faces)[faces[:, 0]]
+    in_mouth = np.isin(part, part[~skin & (away < TONGUE_REACH)])
+    within = inside & (in_mouth | (skin & (away < LINING_REACH)))
+    depth = cKDTree(centers[lips]).query(centers[within])[0] / at.unit
+    white = _white_of_eyes(capture, color, shown)
+    colors = np.vstack([LIP_SHARE * np.median(color[lips], axis=0), GUM_SHARES * white])
+    inner = np.stack([np.interp(depth, DEPTHS, channel) for channel in colors.T], axis=1)
+    teeth = teeth_of(capture)[within]
+    inner[teeth] = np.interp(depth[teeth], TOOTH_DEPTHS, TOOTH_SHARES)[:, None] * white
+    found[within[inside]] = inner
     return np.asarray(found)
+
+
+def _white_of_eyes(capture: Capture, color: np.ndarray, shown: np.ndarray) -> np.ndarray:
+    masks = {} if capture.flame is None else capture.flame.model.masks
+    eyes = [masks[name] for name in EYEBALLS if name in masks]
+    rows = [np.flatnonzero(faces_within(capture.faces, eye) & shown) for eye in eyes]
+    bright = sorted(np.concatenate([*rows, []]).astype(int), key=lambda row: color[row].sum())
+    if not bright:
+        return WHITE
+    return np.asarray(color[bright[int(WHITE_QUANTILE * len(bright)) :]].mean(0))
 
 
 def skin_of(capture: Capture) -> np.ndarray:

@@ -41,6 +41,11 @@ OUTLINE_VOXELS = 1.5
 silhouette."""
 AROUND = 30
 """Measured triangles of whose heights one that is in no outline has the median."""
+BLINKS = ("eyeBlinkLeft", "eyeBlinkRight")
+LID_STRETCH = 1.8
+MIN_SQUARED_AREA = 1e-28
+"""Expressions that pull lids out of their folds, and how much longer they make them; squared
+meters, of triangles without area."""
 STANDING_VOXELS = 1.5
 STANDING_REACH_VOXELS = 4
 """A surface is not known to be flat that is so near to where hair, or a collar, is so high."""
@@ -101,6 +106,22 @@ class Surface:
         """(F,) bool: triangles of the outside that face away from all cameras."""
         limit = HIDDEN_COSINE if self.has_few_cameras else UNSEEN_COSINE
         return np.asarray(self.outside & (self.facing < limit))
+
+    @cached_property
+    def lids(self) -> np.ndarray:
+        """(F,) bool: triangles that a blink pulls out of a fold, in heads whose expressions have
+        ARKit's names."""
+        flame = self.capture.flame
+        neutral = np.asarray(self.capture.neutral, np.float64)
+        stretch = np.ones(len(self.capture.faces))
+        names = () if flame is None else flame.model.expression_names
+        for name in set(BLINKS) & set(names):
+            moved = flame.model.shapedirs[:, :, flame.model.n_identity + names.index(name)]
+            rows = np.flatnonzero(moved.any(1)[self.capture.faces].any(1))
+            corners = self.capture.faces[rows]
+            growth = _largest_stretch(neutral[corners], (neutral + moved)[corners])
+            stretch[rows] = np.maximum(stretch[rows], growth)
+        return np.asarray(stretch > LID_STRETCH)
 
     @cached_property
     def border(self) -> np.ndarray:
@@ -213,3 +234,22 @@ def _centers_and_normals(capture: Capture, timestep: int) -> tuple[np.ndarray, n
 
 def _cosine(center: np.ndarray, normal: np.ndarray, view: View) -> np.ndarray:
     return np.asarray((normal * unit(view.camera.position - center, 1e-20)).sum(1))
+
+
+def _largest_stretch(rest: np.ndarray, posed: np.ndarray) -> np.ndarray:
+    """(F,) how much longer the direction in each triangle (F, 3, 3) has become that did most."""
+    p, q, r = _edges_products(rest)
+    area = p * r - q**2 + MIN_SQUARED_AREA
+    a, b, c = _edges_products(posed)
+    half = (a * r + c * p - 2 * b * q) / (2 * area)
+    ratio = (a * c - b**2) / area
+    return np.asarray(np.sqrt(half + np.sqrt(np.maximum(half**2 - ratio, 0))))
+
+
+def _edges_products(corners: np.ndarray) -> np.ndarray:
+    """Dot products (3, F) of two edges of triangles (F, 3, 3): of the first with itself, with the
+    second, and of the second with itself."""
+    first = corners[:, 1] - corners[:, 0]
+    second = corners[:, 2] - corners[:, 0]
+    pairs = (first, first), (first, second), (second, second)
+    return np.stack([np.einsum("fi,fi->f", *pair) for pair in pairs])

@@ -7,8 +7,8 @@ from functools import cached_property
 
 import numpy as np
 
-from ...avatar.lattice import NORMAL_AXIS, lattice_splats
-from ...avatar.splats import SH_C0, Splats
+from ...avatar.lattice import FLATNESS, NORMAL_AXIS, SCALE, lattice_splats
+from ...avatar.splats import SH_C0, Splats, joined
 from ...flame.quaternions import from_matrices, to_matrices
 from ..settings import TrainingSettings
 from .backend import Backend
@@ -30,6 +30,10 @@ HIDDEN_OPACITY = 3.0
 HIDDEN_FLATNESS = 0.25
 """Of the layer on hidden triangles: order of the lattice where none is chosen, logit, and how much
 thinner it is than the lattice's splats."""
+LID_DEPTH_SHARE = 0.5
+LID_EDGE_SHARE = 0.6
+"""Of the depth of the layer under lids, below which a splat belongs to it; of its scale, at lids'
+edges, where it would stand out beside the eye."""
 BORDER_INSET = 0.6
 """Of the distance from the middle of a triangle, and of the scale, at the mesh's edge."""
 HEAD_RADIUS_VOXELS = 22.5
@@ -82,6 +86,7 @@ class SurfacePrior:
         self._pull_colors(backend, bound, columns)
         self._pull_shapes(backend, bound, columns)
         self._flatten(backend, bound, columns)
+        self._keep_layer(backend, bound, columns)
 
     def _doubt(self, second: np.ndarray, face: np.ndarray) -> np.ndarray:
         """Share (N,) in 0…1 of what is plausible: 1 where views tell nothing, a half where
@@ -144,6 +149,21 @@ class SurfacePrior:
         moments = dict.fromkeys(("first/rotation", "first/log_scale"), 0.0)
         backend.assign(bound[rows[thick]], {**values, **moments})
 
+    def _keep_layer(
+        self, backend: Backend, bound: np.ndarray, columns: Mapping[str, np.ndarray]
+    ) -> None:
+        """Splats of the mouth's unseen inside, and those under lids, stay as `layer_on` has them:
+        views of closed mouths and open eyes would make them any size."""
+        face = columns["face"]
+        height = columns["parameters/xyz"][:, NORMAL_AXIS[self._frames.convention]]
+        is_under = height < LID_DEPTH_SHARE * self._frames.layer_height[face]
+        is_inside = (self.sides.triangles & ~self._surface.outside)[face]
+        rows = np.flatnonzero(is_inside | (self._surface.lids[face] & is_under))
+        values = layer_on(self._frames, face[rows])
+        sh = np.zeros_like(columns["parameters/sh"][rows])
+        sh[:, 0] = (self.sides.color[face[rows]] - 0.5) / SH_C0
+        backend.assign(bound[rows], parameters_and_average({**values, "sh": sh}))
+
 
 def parameters_and_average(values: Mapping[str, np.ndarray]) -> dict[str, np.ndarray | float]:
     """The columns that give splats these values at once, in the avatar as well."""
@@ -173,7 +193,8 @@ def flattened(
 
 def hidden_splats(frames: FrameStore, settings: TrainingSettings) -> Splats:
     """A dense opaque layer on the hidden triangles, in which no view splits splats: on skin and
-    clothes, or where the outer layer of hair is."""
+    clothes, or where the outer layer of hair is. Under lids as well, whose own splats, trained on
+    open eyes, would leave gaps when they close."""
     capture = frames.capture
     surface = frames.surface
     axis = NORMAL_AXIS[frames.convention]
@@ -185,6 +206,9 @@ def hidden_splats(frames: FrameStore, settings: TrainingSettings) -> Splats:
         HIDDEN_OPACITY,
         convention=frames.convention,
     )
+    lids = np.flatnonzero(surface.lids & ~surface.hidden)
+    under = layer.rows(np.searchsorted(layer.face, lids))
+    under = replace(under, **layer_on(frames, lids))
     layer = layer.rows(surface.hidden[layer.face])
     face = layer.face
     inset = np.where(surface.border, BORDER_INSET, 1.0)[face]
@@ -193,4 +217,25 @@ def hidden_splats(frames: FrameStore, settings: TrainingSettings) -> Splats:
     lifted = inset * (1 + surface.hair_height[face] / (HEAD_RADIUS_VOXELS * frames.voxel))
     log_scale = layer.log_scale + np.log(lifted)[:, None]
     log_scale[:, axis] += np.log(HIDDEN_FLATNESS)
-    return replace(layer, xyz=xyz.astype(np.float32), log_scale=log_scale.astype(np.float32))
+    layer = replace(layer, xyz=xyz.astype(np.float32), log_scale=log_scale.astype(np.float32))
+    return joined([layer, under])
+
+
+def layer_on(frames: FrameStore, face: np.ndarray) -> dict[str, np.ndarray]:
+    """xyz, rotation, log_scale and opacity of one splat under the middle of each of these triangles
+    (N,), so large that a closed lid has no gaps."""
+    axis = NORMAL_AXIS[frames.convention]
+    lids = frames.surface.lids
+    inner = np.ones(len(frames.capture.neutral), bool)
+    inner[frames.capture.faces[~lids]] = False
+    share = np.where(inner[frames.capture.faces[face]].all(1), 1.0, LID_EDGE_SHARE)
+    xyz = np.zeros((len(face), 3), np.float32)
+    xyz[:, axis] = frames.layer_height[face]
+    log_scale = np.log(SCALE * share * frames.units[face])[:, None].repeat(3, axis=1)
+    log_scale[:, axis] += np.log(FLATNESS * HIDDEN_FLATNESS)
+    return {
+        "xyz": xyz,
+        "rotation": np.eye(1, 4, dtype=np.float32).repeat(len(face), axis=0),
+        "log_scale": log_scale.astype(np.float32),
+        "opacity": np.full(len(face), HIDDEN_OPACITY, np.float32),
+    }

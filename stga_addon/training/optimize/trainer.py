@@ -252,7 +252,8 @@ def _placed_splats(frames: FrameStore, settings: TrainingSettings) -> tuple[Trai
     hidden = ~splats.unbound & frames.surface.hidden[splats.face]
     layer = hidden_splats(frames, settings)
     color = np.zeros((triangles, 3), np.float32)
-    color[splats.face[hidden]] = splats.sh[hidden, 0]
+    bound = ~splats.unbound
+    color[splats.face[bound]] = splats.sh[bound, 0]
     layer.sh[:, 0] = color[layer.face]
     splats = splats.rows(~hidden)
     orders = settings.lattice_order, settings.first_lattice_order

@@ -57,7 +57,7 @@ def unseen_sides(surface: Surface) -> UnseenSides:
     facing = density[cosine > SOURCE_COSINE]
     usual = np.median(facing[facing > 0]) if facing.any() else 0.0
     shown = density > MIN_SHOWN_SHARE * usual
-    is_source = (pixels > 0) & is_outside & (cosine > SOURCE_COSINE)
+    is_source = (pixels > 0) & is_outside & (cosine > SOURCE_COSINE) & ~surface.lids
     sources = np.flatnonzero(is_source)
     if not len(sources):
         return UnseenSides(np.zeros_like(shown), shown, color)
@@ -65,7 +65,7 @@ def unseen_sides(surface: Surface) -> UnseenSides:
     found = color.copy()
     centers = np.asarray(capture.neutral)[capture.faces].mean(1)
     part = connected_parts(len(capture.neutral), capture.faces)[capture.faces[:, 0]]
-    hidden = unseen | ~shown
+    hidden = unseen | ~shown | surface.lids
     for number in np.unique(part[hidden]):
         rows = np.flatnonzero(hidden & (part == number))
         own = sources[part[sources] == number] if (part[sources] == number).any() else sources
