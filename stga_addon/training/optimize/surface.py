@@ -111,17 +111,20 @@ class Surface:
     def lids(self) -> np.ndarray:
         """(F,) bool: triangles that a blink pulls out of a fold, in heads whose expressions have
         ARKit's names."""
-        flame = self.capture.flame
+        lids = np.zeros(len(self.capture.faces), bool)
+        if self.capture.flame is None:
+            return lids
+        model = self.capture.flame.model
         neutral = np.asarray(self.capture.neutral, np.float64)
-        stretch = np.ones(len(self.capture.faces))
-        names = () if flame is None else flame.model.expression_names
-        for name in set(BLINKS) & set(names):
-            moved = flame.model.shapedirs[:, :, flame.model.n_identity + names.index(name)]
+        for name in set(BLINKS) & set(model.expression_names):
+            number = model.n_identity + model.expression_names.index(name)
+            moved = np.asarray(model.shapedirs)[:, :, number]
             rows = np.flatnonzero(moved.any(1)[self.capture.faces].any(1))
             corners = self.capture.faces[rows]
-            growth = _largest_stretch(neutral[corners], (neutral + moved)[corners])
-            stretch[rows] = np.maximum(stretch[rows], growth)
-        return np.asarray(stretch > LID_STRETCH)
+            lids[rows] |= (
+                _largest_stretch(neutral[corners], (neutral + moved)[corners]) > LID_STRETCH
+            )
+        return lids
 
     @cached_property
     def border(self) -> np.ndarray:
