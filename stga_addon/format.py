@@ -59,9 +59,10 @@ def describe_left(figures: Mapping[str, float]) -> str:
 
 
 def describe_figures(figures: Mapping[str, float]) -> list[str]:
-    """Figures of any work as short lines for a narrow panel, without those that are not known yet.
+    """Figures of any work as short lines for a narrow panel, without those that are not known yet
+    and the time that is left.
 
-    per_second  iterations; left_s: seconds that are left
+    per_second  iterations
     psnr, psnr_unmatched   of the last evaluation, dB, the second one without fitting the exposure
                            of views
     error_px, unexplained  of a tracked head: median distance from its landmarks, share of the face
@@ -73,7 +74,7 @@ def describe_figures(figures: Mapping[str, float]) -> list[str]:
         matched = ("psnr", "PSNR {:.2f} dB (exposure fitted)")
         quality = ((matched, ("psnr_unmatched", "{:.2f} dB without")), (loss,))
     pairs = (
-        (("per_second", "{:.1f} it/s"), ("left_s", "{} left")),
+        (("per_second", "{:.1f} it/s"),),
         *quality,
         (
             ("error_px", "{:.1f} px off landmarks"),
@@ -87,6 +88,6 @@ def describe_figures(figures: Mapping[str, float]) -> list[str]:
         for name, text in pair:
             value = figures.get(name)
             if value and not math.isnan(value):
-                parts.append(text.format(format_duration(value) if name == "left_s" else value))
+                parts.append(text.format(value))
         lines.append("   ".join(parts).replace(",", "\u202f"))
     return [line for line in lines if line]

@@ -15,7 +15,7 @@ Item = TypeVar("Item")
 
 PACE_SHARE = 0.1  # Share of the work, the last that was done, whose pace says how much time is left
 MAX_OVERRUN_RATIO = 1.25  # Times what was said to be left, from which on that was too little
-PROMISE_RATIO = 0.9  # Of what was said to be left, below which it is a new promise
+MIN_PACE_S = 5.0  # For which the work's own forecast is watched before it is corrected
 MAX_STEP_SHARE = 0.03  # Of a step; beyond, an interrupted call had done it before
 
 
@@ -91,25 +91,37 @@ class Clock:
     def __init__(self, clock: Callable[[], float] = monotonic) -> None:
         self.share = 0.0
         self._clock = clock
+        self._by_share = TimeLeft(clock)
         self._left_s = math.inf
-        self._promise = math.inf, 0.0
-        """Seconds that were said to be left, and when."""
+        self._asked: deque[tuple[float, float]] = deque()
+        """When work lately said how many seconds are left, and how many."""
 
     def told(self, progress: Progress) -> dict[str, float]:
-        """The finite figures of some progress; `left_s` is the least so far, and `longer` 1 where
-        it is known to be too little, or as long ago."""
+        """The finite figures of some progress; `left_s`, by the share where the work does not say,
+        is the least so far, and `longer` 1 where that is, or the work knows it to be, too
+        little."""
         self.share = max(self.share, min(progress.share, MAX_TOLD_SHARE))
-        figures = {n: value for n, value in progress.figures().items() if math.isfinite(value)}
+        figures = {"left_s": self._by_share.after(progress.share), **progress.figures()}
+        figures = {name: value for name, value in figures.items() if math.isfinite(value)}
         if "left_s" in figures:
-            asked_s = figures["left_s"]
-            now = self._clock()
-            self._left_s = min(self._left_s, asked_s)
-            if asked_s < PROMISE_RATIO * self._promise[0]:
-                self._promise = asked_s, now
-            missed_s = max(asked_s, now - self._promise[1])
-            longer = missed_s > MAX_OVERRUN_RATIO * self._promise[0] + 1
-            figures |= {"left_s": self._left_s, **({"longer": 1.0} if longer else {})}
+            expected_s = self._expected_s(figures["left_s"])
+            self._left_s = min(self._left_s, expected_s)
+            figures["left_s"] = self._left_s
+            if expected_s > MAX_OVERRUN_RATIO * self._left_s + 1:
+                figures["longer"] = 1.0
         return figures
+
+    def _expected_s(self, asked_s: float) -> float:
+        """What is left where it goes on to fall as slowly as it lately did."""
+        now = self._clock()
+        self._asked.append((now, asked_s))
+        while len(self._asked) > 2 and now - self._asked[1][0] >= max(2 * MIN_PACE_S, asked_s / 2):
+            self._asked.popleft()
+        (then, before) = self._asked[0]
+        if now - then < MIN_PACE_S:
+            return asked_s
+        fallen = before - asked_s
+        return asked_s * max(1.0, (now - then) / fallen) if fallen > 0 else math.inf
 
 
 class Cancelled(Exception):

@@ -94,9 +94,8 @@ def draw_running(layout: Any, context: Any, kind: Kind) -> bool:
 
 def draw_figures(layout: Any, context: Any, status: WorkerStatus) -> None:
     """Draw a word for how good the result is; figures, and what more time brings, unfold."""
-    figures = {name: value for name, value in status.figures.items() if name != "left_s"}
-    lines = describe_figures(figures)
-    word = describe_quality(figures)
+    lines = describe_figures(status.figures)
+    word = describe_quality(status.figures)
     column = layout.column(align=True)
     if not lines:
         draw_text(column, context, status.detail)

@@ -20,7 +20,7 @@ from ..errors import StgaError, printable
 from ..export.formats import FORMATS
 from ..export.splat_files import is_splats
 from ..files import write_npz
-from ..format import describe_figures, format_table
+from ..format import describe_figures, describe_left, format_table
 from ..jobs.analyze import Analyze, Select, TimePresets
 from ..jobs.avatar_source import OpenHead, avatar_path
 from ..jobs.convert_motion import ConvertMotion
@@ -39,7 +39,7 @@ from ..jobs.track import (
 )
 from ..jobs.train import Extend, Refine, Resume, Selected, SelectForTake, Train
 from ..options import add_options, flag_of, given_options, like, option, option_fields
-from ..progress import Progress, ignore
+from ..progress import Clock, Progress, ignore
 from ..selection import SelectionOptions
 from ..training.run.folder import AVATAR, RUN, Run, claimed_folder, has_run, read_run
 from ..training.settings import TrainingSettings, make_settings
@@ -56,7 +56,6 @@ EXTEND_SECONDS = 60.0
 
 
 LAYOUT = "{desc}{percentage:3.0f}%|{bar}| {elapsed}{postfix}"
-LAYOUT_WITH_TIME_LEFT = LAYOUT.replace("{elapsed}", "{elapsed}<{remaining}")
 
 
 def carry_out(request: Request, with_bar: bool = True) -> Result:
@@ -74,6 +73,7 @@ class ProgressBar(ExitStack[None]):
     """A bar on stderr with stage and figures; what is said or logged goes above it."""
 
     _bar: "tqdm[Any] | None" = None
+    _clock: Clock
     _stage = ""
 
     def __exit__(self, *details: Any) -> None:
@@ -89,12 +89,12 @@ class ProgressBar(ExitStack[None]):
 
             bar = tqdm(total=1.0, bar_format=LAYOUT, mininterval=0.5, dynamic_ncols=True)
             self._bar = self.enter_context(bar)
+            self._clock = Clock()
             self.enter_context(logging_redirect_tqdm())
         self._bar.set_description(progress.stage, refresh=progress.stage != self._stage)
         self._stage = progress.stage
-        figures = progress.figures()
-        self._bar.bar_format = LAYOUT if "left_s" in figures else LAYOUT_WITH_TIME_LEFT
-        told = [*describe_figures(figures), printable(progress.detail)]
+        figures = self._clock.told(progress)
+        told = [describe_left(figures), *describe_figures(figures), printable(progress.detail)]
         self._bar.set_postfix_str("; ".join(filter(None, told)), refresh=False)
         self._bar.update(progress.share - self._bar.n)
         return False

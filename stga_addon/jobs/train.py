@@ -247,6 +247,7 @@ def train_and_finish(request: Training, report: Report, say: Say) -> Written:
         return tell(progress, after[0] + progress.share)
 
     avatar = prepared.train_as_asked(report_training)
+    tell(Progress(stage="Drawing the curve"), 0.0)
     lines = report_run(folder)
     # whoever stops a training does not wait; `stga relight` finds the light out later
     if not is_stopped:
@@ -353,7 +354,8 @@ def _new_run(request: Train, report: Report, say: Say) -> Prepared:
     begin_compiling()
     device, why = choose_device(request.device)
     capture = open_capture(request.capture, request.flame, request.principal_point)
-    report(Progress(stage="Analyzing the capture"))
+    expected_s = (request.settings.seconds or math.nan) + AFTER_S
+    report(Progress(stage="Analyzing the capture", figures=lambda: {"left_s": expected_s}))
     settings, plan = plan_effects(capture, request.settings, device)
     settings = with_budget(settings, len(capture.views.get("train", ())))
     if settings.iterations != request.settings.iterations:

@@ -180,17 +180,17 @@ FITTED = {"psnr": 31.0, "psnr_unmatched": 25.0}
 
 
 @pytest.mark.parametrize(
-    ("figures", "shown", "guesses"),
+    ("figures", "shown"),
     [
-        (FITTED, "PSNR 31.00 dB (exposure fitted)   25.00 dB", True),
-        ({"left_s": 31.0}, "31 s left", False),
+        (FITTED, "PSNR 31.00 dB (exposure fitted)   25.00 dB"),
+        ({"left_s": 31.0}, "About 31 s left"),
     ],
 )
-def test_figures(capsys, figures, shown, guesses):
+def test_figures(capsys, figures, shown):
     """Catches a fitted PSNR that is not called so, and the bar's guess beside the work's."""
     with ProgressBar() as bar:
         for share in (0.0, 0.5):
             bar.report(Progress(share, "Landmarks", figures=lambda: figures))
     written = capsys.readouterr().err
     assert shown in written
-    assert ("<" in written) == guesses
+    assert "<" not in written

@@ -189,13 +189,47 @@ def test_a_clock_never_goes_back(tmp_path):
     assert [status.progress for status in told] == [0.0, 0.3, 0.3, 0.4, 0.5, 0.6, 0.9, 0.99, 0.99]
 
 
+def as_told(series):
+    """The seconds that are left and the sentence about them, after each report of a series: when,
+    what the work says is left, and whether it knows that to be too little."""
+    times = [0.0]
+    clock = Clock(lambda: times[-1])
+    for now, left_s, *longer in series:
+        times.append(now)
+        figures = {"left_s": left_s, **dict.fromkeys(["longer"] if any(longer) else [], 1.0)}
+        told = clock.told(Progress(figures=lambda figures=figures: figures))
+        yield told["left_s"], describe_left(told)
+
+
+END_S = 154.5
+UNDER_LOAD = (
+    (26.2, 28.0, True),
+    (70.8, 28.0),
+    (73.7, 25.1),
+    (83.6, 25.4),
+    (84.6, 24.5),
+    (87.8, 21.9),
+    (89.8, 20.2),
+    (90.8, 20.2),
+    (125.3, 20.0),
+)
+"""A training of 8 s beside 15 other processes that compiled its kernels before, and its end."""
+
+
+def test_no_more_is_left_than_is_told():
+    """Catches "About 28 s left" when 128 were, and a time that rises."""
+    told = list(as_told(UNDER_LOAD))
+    left = [left_s for left_s, _ in told]
+    assert left == sorted(left, reverse=True)
+    for (now, *_), (left_s, sentence) in zip(UNDER_LOAD, told, strict=True):
+        assert "More than" in sentence or END_S - now <= 1.25 * left_s + 1, (now, sentence)
+
+
 def test_what_has_not_come_true_is_not_said_again():
     """Catches "About 20 s left" for a minute and a half."""
-    seconds = iter((0.0, 20.0, 90.0))
-    clock = Clock(lambda: next(seconds))
-    left = (Progress(figures=lambda s=s: {"left_s": s}) for s in (20.0, 19.9, 19.8))
-    said = [describe_left(clock.told(each)) for each in left]
-    assert said == ["About 20 s left", "About 20 s left", "More than 20 s left"]
+    series = ((0.0, 20.0), (20.0, 19.9), (90.0, 19.8))
+    said = [sentence for _, sentence in as_told(series)]
+    assert said == ["About 20 s left", "More than 20 s left", "More than 20 s left"]
 
 
 def test_what_follows_training_is_told_ahead(tmp_path, monkeypatch):
@@ -232,9 +266,9 @@ def test_what_follows_training_is_told_ahead(tmp_path, monkeypatch):
 
     train.train_and_finish(Prepared.request, report, print)
     shares, left = zip(*told, strict=True)
-    assert shares == pytest.approx([0.0, 0.45, 0.9, 0.925, 0.975])
+    assert shares == pytest.approx([0.0, 0.45, 0.9, 0.9, 0.925, 0.975])
     assert math.isnan(left[0])
-    assert left[1:] == pytest.approx([70.0, 41.0, 30.0, 10.0])
+    assert left[1:] == pytest.approx([70.0, 41.0, 40.0, 30.0, 10.0])
 
 
 @pytest.mark.slow

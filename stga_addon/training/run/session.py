@@ -213,7 +213,7 @@ class _Session:
         if self.trainer.tracking is not None and self._without_training_views():
             self.fitting_s = TRACKING_TIME_SHARE * (self.run.settings.seconds or 0.0)
         # meanwhile, the splats are shown as they begin
-        self._tell("Compiling kernels")
+        self._tell("Compiling kernels", longer=1.0)
         precompile_kernels(self.run.device)
         lines = self.evaluator.lines
         self.began = perf_counter() - (lines[-1]["wall_s"] if lines else 0.0)
@@ -524,8 +524,8 @@ class _Session:
     def _is_finished(self) -> bool:
         return self.evaluator.is_finished(self._spent())
 
-    def _tell(self, stage: str) -> bool:
-        """Report how far the run is; returns whether to stop."""
+    def _tell(self, stage: str, **more: float) -> bool:
+        """Report how far the run is, with more figures; returns whether to stop."""
         spent = self._spent()
         evaluator = self.evaluator
         last = [{}, *self.evaluator.lines][-1]
@@ -538,6 +538,7 @@ class _Session:
             "psnr": last.get("psnr"),
             "psnr_unmatched": last.get(UNMATCHED),
             "splats": len(self.trainer),
+            **more,
         }
 
         def known() -> dict[str, float]:
