@@ -9,7 +9,7 @@ from types import NoneType
 from typing import Any
 
 import bpy
-from bpy_extras.io_utils import ImportHelper
+from bpy_extras.io_utils import ExportHelper, ImportHelper
 
 from ..stga_addon.capture.open import open_capture
 from ..stga_addon.capture.transforms import DEFAULT_PRINCIPAL_POINT
@@ -17,6 +17,7 @@ from ..stga_addon.errors import StgaError, telling_refusals
 from ..stga_addon.flame.sequence import FlameSequence
 from ..stga_addon.progress import Cancelled
 from ..stga_addon.scene import tags
+from ..stga_addon.scene.objects import mover_of
 from ..stga_addon.scene.rig.head import rig_of
 from ..stga_addon.scene.rig.keyframes import shape_key_names
 from ..stga_addon.schema import alternatives, type_hints
@@ -344,6 +345,20 @@ class FileImport(ImportHelper):
             beside = head[tags.CAPTURE]
         if beside:  # else Blender proposes the .blend file's own name
             self.filepath = os.path.join(os.path.dirname(beside), "")
+        return super().invoke(context, event)
+
+
+class FileExport(ExportHelper):
+    """Mixin of operators that export a file: proposes the head's name beside its run, until the
+    .blend file has a name."""
+
+    def invoke(self: Any, context: Any, event: Any) -> set[str]:
+        settings = context.scene.stga
+        if not (self.filepath or bpy.data.filepath) and is_head(settings.head):
+            run = bpy.path.abspath(settings.run_folder).rstrip("/\\")
+            name = bpy.path.clean_name(mover_of(settings.head).name)
+            self.filepath = os.path.join(os.path.dirname(run), name)
+            self.check(context)  # which appends the suffix
         return super().invoke(context, event)
 
 

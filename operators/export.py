@@ -15,7 +15,6 @@ from typing import Any
 
 import bpy
 import numpy as np
-from bpy_extras.io_utils import ExportHelper
 
 from ..stga_addon.avatar.file import read_avatar
 from ..stga_addon.avatar.splats import Splats
@@ -51,6 +50,7 @@ from ..stga_addon.tracking.head_model import shape_arrays, write_linear_model
 from . import common, options
 from .common import (
     Action,
+    FileExport,
     StepGenerator,
     Stepwise,
     file_path,
@@ -71,7 +71,7 @@ SEPARATORS = ("/", os.sep)
 SUFFIXES = tuple(suffix for format in FORMATS.values() for suffix in format.suffixes)
 
 
-class SplatExport(Stepwise, ExportHelper):
+class SplatExport(Stepwise, FileExport):
     """Mixin of operators that export splats frame by frame, in one of the formats that they
     offer."""
 
@@ -80,7 +80,7 @@ class SplatExport(Stepwise, ExportHelper):
 
     @property
     def filename_ext(self: Any) -> str:
-        """What ExportHelper appends to the path."""
+        """What FileExport appends to the path."""
         return next(iter(FORMATS[self.format].suffixes), "")
 
     def check(self: Any, context: Any) -> bool:
@@ -404,7 +404,7 @@ def exact_motion(head: Any, frames: range, warn: Warn) -> FlameSequence | None:
 # Other files
 
 
-class ExportPerformance(Action, bpy.types.Operator, ExportHelper):
+class ExportPerformance(Action, bpy.types.Operator, FileExport):
     """Export expression, jaw, eyes and neck of the head in the scene's frame range as curves of
     ARKit's 52 shapes"""
 
@@ -425,7 +425,7 @@ class ExportPerformance(Action, bpy.types.Operator, ExportHelper):
         self.inform(f"Exported {len(frames)} frames to {path}")
 
 
-class ExportCameras(Action, bpy.types.Operator, ExportHelper):
+class ExportCameras(Action, bpy.types.Operator, FileExport):
     """Export cameras at the current frame as calibration of footage: each has a folder, video or
     image of its name"""
 
@@ -444,7 +444,7 @@ class ExportCameras(Action, bpy.types.Operator, ExportHelper):
         self.inform(f"Exported {count} cameras to {path}")
 
 
-class ExportHeadModel(Action, bpy.types.Operator, ExportHelper):
+class ExportHeadModel(Action, bpy.types.Operator, FileExport):
     """Export the active object's shape keys as a head model for tracking; keys named identity… make
     other persons"""
 

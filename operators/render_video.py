@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import bpy
-from bpy_extras.io_utils import ExportHelper
 
 from ..stga_addon.capture.camera import Camera, to_and_fro
 from ..stga_addon.errors import StgaError
@@ -34,6 +33,7 @@ from ..stga_addon.worker.status import status_writer
 from . import monitor, options
 from .common import (
     AtEnd,
+    FileExport,
     StepGenerator,
     Stepwise,
     file_path,
@@ -57,7 +57,7 @@ def render_device() -> str:
     return str(stored.render_device) if stored else "auto"
 
 
-class RenderVideo(Stepwise, bpy.types.Operator, ExportHelper):
+class RenderVideo(Stepwise, bpy.types.Operator, FileExport):
     """Render the splats as an MP4 video or as PNGs, in a process beside Blender: go on working
     meanwhile"""
 

@@ -25,7 +25,7 @@ from ..stga_addon.scene.display.splat_attributes import SplatAttributes, avatar_
 from ..stga_addon.scene.objects import Identity, mover_of
 from ..stga_addon.scene.vertex_groups import write_selection
 from ..stga_addon.tracking.folder import is_flame
-from ..stga_addon.training.run.folder import AVATAR, TRACKING, read_run
+from ..stga_addon.training.run.folder import AVATAR, TRACKING, has_run, read_run
 from ..stga_addon.worker.status import WorkerState
 from .common import is_head
 from .select import count_selected
@@ -180,7 +180,9 @@ def follow_head(settings: Any) -> None:
 
 
 def keep_run_folder(settings: Any) -> None:
-    """Store the panel's run folder with its head, for when that is chosen again."""
+    """Store the panel's run folder with its head, for when that is chosen again, and whether it
+    holds a run."""
+    settings.holds_run = has_run(Path(bpy.path.abspath(settings.run_folder)))
     if is_head(settings.head) and settings.head.library is None:
         settings.head[tags.RUN_FOLDER] = settings.run_folder
 

@@ -49,14 +49,17 @@ class NextStepPanel(SidebarPanel, bpy.types.Panel):
             draw_text(layout, context, f"{done}: the head is imported when it is done. {GO_ON}")
         elif not is_head(settings.head) and settings.splats is None:
             tracked = "a tracked head, its cameras and their images"
-            hint = f"Choose a video of a face. Or import a capture: {tracked}"
-            draw_text(layout, context, hint)
+            has_demo = OpenDemo.poll(context)
+            lack = "" if has_demo else " (this edition has no demo)"
+            hint = f"Choose a video of a face{lack}. Or import a capture: {tracked}"
+            first = "" if has_training_python(context) else "Choose a Python with PyTorch first. "
+            draw_text(layout, context, first + hint)
             draw_missing_python(layout, context)
             text = "Avatar from Video…"
             icon = "FILE_MOVIE"
             layout.operator("stga.avatar_from_video", text=text, icon=icon)
             layout.operator("stga.import_capture", icon="IMPORT")
-            if OpenDemo.poll(context):
+            if has_demo:
                 layout.operator("stga.open_demo", icon="USER")
         elif settings.splats is not None:
             _draw_what_to_try(layout, context, settings)

@@ -132,6 +132,7 @@ class SceneSettings(TrainOptions, bpy.types.PropertyGroup):
         default="//stga_run",
         update=lambda settings, context: keep_run_folder(settings),
     )
+    holds_run: _hidden(bpy.props.BoolProperty)  # the run folder, which panels do not look into
     refine: bpy.props.PointerProperty(type=RefineSettings)
     extend: bpy.props.PointerProperty(type=ExtendSettings)
     preset: preset_property(update=_take_minutes)

@@ -69,9 +69,10 @@ class TrainPanel(SidebarPanel, bpy.types.Panel):
         draw_train_button(row, settings)
         is_known = training.subject is not None and training.place == _run_folder(settings)
         is_known &= not is_of_another
-        finished = training.snapshot.state == WorkerState.FINISHED
-        is_more = finished if is_known else bool(settings.avatar)
-        draw_train_button(row, settings, goes_on="more" if is_more else "resume")
+        if is_known or settings.holds_run:
+            finished = training.snapshot.state == WorkerState.FINISHED
+            is_more = finished if is_known else bool(settings.avatar)
+            draw_train_button(row, settings, goes_on="more" if is_more else "resume")
         draw_missing_python(layout, context)
 
 

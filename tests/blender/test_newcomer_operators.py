@@ -3,6 +3,7 @@
 import shutil
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import bpy
 import numpy as np
@@ -115,6 +116,39 @@ def test_the_chosen_row_is_that_of_the_frame(head):
     assert scene.stga.selected_row == 0
     scene.frame_set(999)
     assert scene.stga.selected_row == -1
+
+
+def test_what_the_small_edition_begins_with(extension, monkeypatch):
+    """Catches an edition without demo and Python that does not say what to click instead."""
+    for has_demo, has_python in ((False, False), (True, True)):
+        poll = staticmethod(lambda context, has_demo=has_demo: has_demo)
+        monkeypatch.setattr(extension.ui.next_step.OpenDemo, "poll", poll)
+        for panel in (extension.ui.next_step, extension.ui.train_panel):
+            there = lambda context, has_python=has_python: has_python  # noqa: E731
+            monkeypatch.setattr(panel, "has_training_python", there)
+        said = " ".join(draw(extension, "next_step"))
+        assert ("no demo" in said, "Open Demo Capture" in said) == (not has_demo, has_demo)
+        assert ("first. " in said, "Choose a Python " in said) == (not has_python, not has_python)
+
+
+def test_exports_propose_the_name_of_the_head(extension, head, tmp_path):
+    """Catches "Untitled" as the name of a first video."""
+    helper = extension.operators.common.FileExport
+
+    class Video(helper):
+        filepath = ""
+        filename_ext = ".mp4"
+
+    asked = []
+    manager = SimpleNamespace(fileselect_add=asked.append)
+    context = SimpleNamespace(scene=bpy.context.scene, window_manager=manager, blend_data=bpy.data)
+    head.parent.name = "anna 1/2"
+    bpy.context.scene.stga.run_folder = str(tmp_path / "run") + "/"
+    Video().invoke(context, None)
+    assert [each.filepath for each in asked] == [str(tmp_path / "anna_1_2.mp4")]
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "saved.blend"))
+    Video().invoke(context, None)
+    assert asked[1].filepath == str(tmp_path / "saved.mp4")
 
 
 def test_a_display_is_chosen_with_a_shading_that_shows_it(extension, head, tmp_path):

@@ -104,9 +104,9 @@ def test_panels(extension, trained, monkeypatch, capsys):
     )
 
 
-def test_a_word_for_the_quality_and_more_training(extension, trained):
-    """Catches figures that only an expert reads, and a finished run that can only be resumed, which
-    trains nothing."""
+def test_a_word_for_the_quality_and_more_training(extension, trained, tmp_path):
+    """Catches figures that only an expert reads, a finished run that can only be resumed, which
+    trains nothing, and *Resume* where there is no run."""
     settings = bpy.context.scene.stga
     settings.run_folder = str(trained)
     settings.minutes = 3.0
@@ -116,8 +116,14 @@ def test_a_word_for_the_quality_and_more_training(extension, trained):
     assert {"Train", "Train 3 min More"} <= set(texts)
     settings.show_figures = True
     assert "PSNR 27.00 dB" in draw(extension, "STGA_PT_train")
-    settings.run_folder = "//another"
+    another = tmp_path / "another"
+    settings.run_folder = str(another)
     settings.avatar = ""
+    texts = draw(extension, "STGA_PT_train")
+    assert ("Train" in texts, "Resume" in texts) == (True, False)
+    another.mkdir()
+    (another / "run.json").write_text("{}")
+    settings.run_folder = str(another)
     assert {"Train", "Resume"} <= set(draw(extension, "STGA_PT_train"))
 
 
