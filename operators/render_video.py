@@ -5,7 +5,7 @@ import shutil
 import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
-from math import pi
+from math import nan, pi
 from pathlib import Path
 from typing import Any
 
@@ -165,6 +165,8 @@ class RenderVideo(Stepwise, bpy.types.Operator, FileExport):
                 recorder = Recorder(folder / RECORDING)
                 recording.callback(recorder.close)
                 drawn = DrawnVideo(folder, output, background) if python is None else None
+                # what the worker takes is not known yet
+                left = {} if drawn is not None else {"left_s": nan}
                 status.report(Progress(stage="Recording"))
                 monitor.follow(scene, Kind.VIDEO, output, folder)
                 kept.callback(_dismiss, view.scene)
@@ -178,7 +180,8 @@ class RenderVideo(Stepwise, bpy.types.Operator, FileExport):
                         if is_new or any(layer.relit for layer in layers):
                             posed = [layer.posed(camera.position) for layer in layers]
                         recorder.add(posed, camera)
-                    if status.report(Progress((number + 1) / len(frames), "Recording")):
+                    share = (number + 1) / len(frames)
+                    if status.report(Progress(share, "Recording", figures=lambda: left)):
                         raise Cancelled(f"{output}: cancelled")
                     yield
                 if drawn is not None:

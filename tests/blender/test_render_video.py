@@ -90,8 +90,9 @@ def around_each_image(extension, monkeypatch, before, after):
 
 
 def test_image_sequence_of_the_scene(extension, shown, monkeypatch):
-    """Catches another camera, size, frame, transparency or scene than the engine's, and splats of
-    every recorded frame that stay in memory until the video is rendered."""
+    """Catches another camera, size, frame, transparency or scene than the engine's, splats of every
+    recorded frame that stay in memory until the video is rendered, and the time that recording
+    takes told as that of the video."""
     own = bpy.context.scene
     render = {"path": "scene", "format": "png"}
     bpy.ops.stga.render_video(filepath=str(shown / "images"), **render)
@@ -103,12 +104,19 @@ def test_image_sequence_of_the_scene(extension, shown, monkeypatch):
     window = bpy.context.window_manager.windows[0]
     posed = extension.operators.render_video.PosedSplats
     counts = []
+    figures = []
+    writer = extension.stga_addon.worker.status.StatusWriter
+
+    def report(writer, progress, own=writer.report):
+        figures.append(progress.figures())
+        return own(writer, progress)
 
     def count():
         gc.collect()
         # Not isinstance, which raises for a weak proxy whose object has gone.
         counts.append(sum(type(each) is posed for each in gc.get_objects()))
 
+    monkeypatch.setattr(writer, "report", report)
     look = lambda: setattr(window, "scene", other)  # noqa: E731
     around_each_image(extension, monkeypatch, look, count)
     try:
@@ -118,6 +126,7 @@ def test_image_sequence_of_the_scene(extension, shown, monkeypatch):
     finally:
         window.scene = own
     assert len(counts) == 3
+    assert [np.isnan(each["left_s"]) for each in figures[1:4]] == [True, True, True]
     assert 0 < max(counts) <= 2
     for frame, path in enumerate(written):
         image = np.asarray(Image.open(path)).astype(int)
