@@ -149,7 +149,8 @@ def _choose_head() -> None:
             if settings.splats is None and len(shown) == 1:
                 settings.splats = shown[0]
                 settings.avatar = settings.avatar or avatar_of(shown[0])
-        if not has_run(Path(bpy.path.abspath(settings.run_folder))):
+        settings.holds_run = has_run(Path(bpy.path.abspath(settings.run_folder)))
+        if not settings.holds_run:
             settings.run_folder = run_of(settings.avatar) or settings.run_folder
 
 

@@ -73,10 +73,13 @@ def test_the_file_knows_its_run(extension, head, tmp_path):
     assert (settings.run_folder, settings.avatar) == ("//run", "//run/avatar.npz")
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "copy.blend"), copy=True)
     assert settings.run_folder == "//run"
+    settings.holds_run = False
+    bpy.ops.wm.save_mainfile()
     shutil.move(folder, tmp_path / "moved")
     bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "moved/head.blend"))
     settings = bpy.context.scene.stga
     assert Path(bpy.path.abspath(settings.run_folder)) == tmp_path / "moved/run"
+    assert settings.holds_run, "as in a file that an older version saved"
     (tmp_path / "elsewhere").mkdir()
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "elsewhere/head.blend"))
     assert settings.run_folder == str(tmp_path / "moved/run")
