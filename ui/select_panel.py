@@ -23,10 +23,10 @@ class CapturePanel(SidebarPanel, bpy.types.Panel):
         layout = self.layout
         head = context.scene.stga.head
         layout.operator("stga.import_capture", icon="IMPORT")
-        row = layout.row(align=True)
-        row.operator("stga.import_avatar", text="Avatar", icon="USER")
-        row.operator("stga.import_motion", text="FLAME Motion", icon="ARMATURE_DATA")
-        row.operator("stga.import_meshes", text="Meshes", icon="MESH_DATA")
+        column = layout.column(align=True)
+        column.operator("stga.import_avatar", text="Avatar", icon="USER")
+        column.operator("stga.import_motion", text="FLAME Motion", icon="ARMATURE_DATA")
+        column.operator("stga.import_meshes", text="Meshes", icon="MESH_DATA")
         layout.prop(context.scene.stga, "head")
         if not is_head(head):
             return

@@ -139,9 +139,8 @@ class ContinuePanel(ClosedPanel, bpy.types.Panel):
         residuals.of = "RESIDUAL"
         if not editing:
             column.prop_search(options, "group", head, "vertex_groups", text="Region")
-        row = column.row(align=True)
-        row.prop(options, "all_frames", toggle=True)
-        frames = row.row(align=True)
+        column.prop(options, "all_frames", toggle=True)
+        frames = column.row(align=True)
         frames.active = not options.all_frames
         frames.prop(options, "first", text="")
         frames.prop(options, "last", text="")

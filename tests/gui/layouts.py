@@ -42,11 +42,16 @@ class Layout:
         return " ".join(leaf.text for leaf in self.leaves)
 
     @property
+    def cells(self):
+        rows = [item.cells if item.kind == "row" else [item] for item in self.items]
+        return [cell for row in rows for cell in row]
+
+    @property
     def width(self):
         """That the texts need."""
         widths = [item.width for item in self.items] or [0.0]
-        if self.kind == "row":  # whose items are equally wide
-            return len(widths) * max(widths)
+        if self.kind == "row":  # whose items, also those of rows in it, are equally wide
+            return len(self.cells) * max(cell.width for cell in self.cells)
         if self.kind == "split":
             return widths[0] / self.options.get("factor", 0.5)
         return max(widths) * max(self.options.get("columns", 1), 1)
