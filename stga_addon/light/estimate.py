@@ -38,7 +38,7 @@ def observe(
     colors = []
     cameras = []
     for n, (time, views) in enumerate(times.items()):
-        report(Progress(n / len(times), "Estimating the light"))
+        report(Progress(n / (len(times) + ITERATIONS), "Estimating the light"))
         mesh = np.asarray(capture.mesh(time), np.float64)
         seen = np.stack([_view_colors(capture, mesh, view, exposure(view)) for view in views])
         ordered = np.sort(seen, axis=0)  # NaN comes last
