@@ -7,21 +7,22 @@ coverage is that share of the way from the backdrop's color around the pixel to 
 the pixel's color lies at; where both colors are alike, the band is a smooth edge.
 """
 
+import math
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from PIL import Image
 from scipy.ndimage import binary_fill_holes
 
 from ..capture.model import parts_of
-from ..files import read_json, replacing, write_json
+from ..files import read_json, write_json
 from ..worker.helpers import Step
+from .appearance import sampled
 from .face_networks import PersonNetwork
 from .folder import MATTES_FILE, mask_name
-from .footage.model import Footage, FootageCamera
+from .footage.model import Footage, FootageCamera, write_png
 from .stages import Crew, Stage
 
 PART_TIMESTEPS = 24  # At most, of the parts of a camera that are worked on at once
@@ -111,8 +112,7 @@ def _write_mattes(
             is_person = network.probability(image) if plate is None else by_plate(image, plate)
             seen = float(np.median(is_person[head])) if head.any() else 1.0
             recognized[timestep] = seen >= MIN_HEAD_PROBABILITY
-            with replacing(file) as new:
-                Image.fromarray(find_matte(image, is_person, head)).save(new, format="PNG")
+            write_png(file, find_matte(image, is_person, head))
         step()
     return recognized
 
@@ -129,27 +129,46 @@ def find_matte(image: np.ndarray, probability: np.ndarray, head: np.ndarray) -> 
     whole = image.shape[1::-1]
     scale = min(1.0, MAX_CUT_SIDE_PX / max(whole))
     small = tuple(max(1, round(scale * side)) for side in whole)
-    seeds = [image, probability, head.astype(np.float32)]
-    pixels, likely, heads = (cv2.resize(v, small, interpolation=cv2.INTER_AREA) for v in seeds)
+    pixels = cv2.resize(image, small, interpolation=cv2.INTER_AREA)
+    seeds = probability, head.astype(np.float32)
+    likely, heads = (_reduced(cv2, own, small) for own in seeds)
     cut = _cut(cv2, pixels, likely, heads > 0.5, scale * size).astype(np.float32)
     person = cv2.resize(cut, whole, interpolation=cv2.INTER_LINEAR) > 0.5
-    # coverage in a band along the person's outline
+    # coverage in a band along the person's outline, and what is near it
     band = max(1.0, BAND_SHARE * size)
-    inside = _shrunk(cv2, person, band)
-    outside = ~_grown(cv2, person, band)
-    unknown = ~inside & ~outside
-    if not (unknown.any() and inside.any() and outside.any()):
-        return np.where(person, 255, 0).astype(np.uint8)
-    backdrop = _mean_around(cv2, image, outside, size)[unknown]
-    towards = _mean_around(cv2, image, inside, size)[unknown] - backdrop
+    matte = np.where(person, np.uint8(255), np.uint8(0))
+    near = _box(person, math.ceil(band) + 2)
+    inside = _shrunk(cv2, person[near], band)
+    outside = ~_grown(cv2, person[near], band)
+    unknown = np.nonzero(~inside & ~outside)
+    if not (len(unknown[0]) and inside.any() and outside.any()):
+        return matte
+    places = np.stack([own + side.start for own, side in zip(unknown, near, strict=True)], axis=1)
+    both = []
+    for known, beyond in ((outside, 1), (inside, 0)):
+        whole = np.full(person.shape, beyond, np.uint8)
+        whole[near] = known
+        both.append(_mean_around(cv2, image, whole, size, places))
+    backdrop = both[0]
+    towards = both[1] - backdrop
     contrast = (towards**2).sum(axis=1)
-    share = ((image[unknown] - backdrop) * towards).sum(axis=1) / np.maximum(contrast, 1e-3)
-    smooth = cv2.GaussianBlur(person.astype(np.float32), (0, 0), max(0.7, band / 3))[unknown]
+    colors = image[near][unknown]
+    share = ((colors - backdrop) * towards).sum(axis=1) / np.maximum(contrast, 1e-3)
+    edge = cv2.GaussianBlur(person[near].astype(np.float32), (0, 0), max(0.7, band / 3))
     trust = contrast / (contrast + 3 * SIMILAR_COLORS_LEVELS**2)
-    coverage = trust * np.clip(share, 0, 1) + (1 - trust) * smooth
-    matte = np.where(inside, 255, 0).astype(np.uint8)
-    matte[unknown] = (255 * coverage + 0.5).astype(np.uint8)
+    coverage = trust * np.clip(share, 0, 1) + (1 - trust) * edge[unknown]
+    matte[near][unknown] = (255 * coverage + 0.5).astype(np.uint8)
     return matte
+
+
+def _box(where: np.ndarray, margin: int) -> tuple[slice, slice]:
+    """Rows and columns of the pixels (H, W) bool, and of a margin around them; none without any."""
+    sides = []
+    for axis in (1, 0):
+        used = np.flatnonzero(where.any(axis))
+        first = max(0, used[0] - margin) if len(used) else 0
+        sides.append(slice(first, used[-1] + 1 + margin if len(used) else 0))
+    return sides[0], sides[1]
 
 
 def by_plate(image: np.ndarray, plate: np.ndarray) -> np.ndarray:
@@ -179,8 +198,11 @@ def _cut(
     if 0 < np.isin(marks, (cv2.GC_FGD, cv2.GC_PR_FGD)).mean() < 1:  # it learns the colors of both
         cv2.setRNGSeed(0)  # of the clusters that the color models begin with
         models = (np.zeros((1, 65)), np.zeros((1, 65)))
-        colors = image[..., ::-1].copy()
-        cv2.grabCut(colors, marks, None, *models, CUT_ITERATIONS, cv2.GC_INIT_WITH_MASK)
+        near = _box(marks != cv2.GC_BGD, math.ceil(REACH_SHARE * size))
+        colors = image[near][..., ::-1].copy()
+        part = marks[near].copy()
+        cv2.grabCut(colors, part, None, *models, CUT_ITERATIONS, cv2.GC_INIT_WITH_MASK)
+        marks[near] = part
     found = np.isin(marks, (cv2.GC_FGD, cv2.GC_PR_FGD)).astype(np.uint8)
     found = (cv2.medianBlur(found, 3) > 0).astype(np.uint8)
     _, label = cv2.connectedComponents(found, connectivity=4)
@@ -193,22 +215,34 @@ def _cut(
     return kept | filled[label]
 
 
-def _mean_around(cv2: Any, image: np.ndarray, known: np.ndarray, size: float) -> np.ndarray:
-    """(H, W, 3) float32 mean of known pixels around each; those far away where none is near."""
+def _mean_around(
+    cv2: Any, image: np.ndarray, known: np.ndarray, size: float, places: np.ndarray
+) -> np.ndarray:
+    """(N, 3) float32 mean of pixels that are known, (H, W) 0 or 1, around places (N, 2), rows and
+    columns; those far away where none is near."""
     # wide neighborhoods need few pixels
     scale = min(1.0, MIN_NEIGHBORHOOD_PX / (NEIGHBORHOOD_SHARES[0] * size))
     small = tuple(max(1, round(scale * side)) for side in image.shape[1::-1])
-    weight = known.astype(np.float32)
-    weighted = cv2.resize(image * weight[..., None], small, interpolation=cv2.INTER_AREA)
-    weight = cv2.resize(weight, small, interpolation=cv2.INTER_AREA)
+    both = cv2.bitwise_and(image, image, mask=known), 255 * known
+    weighted, weight = (_reduced(cv2, own, small) for own in both)
+    weighted = weighted.astype(np.float32)
+    weight = weight.astype(np.float32) / 255
     total = np.zeros_like(weighted)
     norm = np.full_like(weight, 1e-9)
     for share, importance in zip(NEIGHBORHOOD_SHARES, (1.0, FAR_WEIGHT), strict=True):
         sigma = max(0.7, scale * share * size)
         total += importance * cv2.GaussianBlur(weighted, (0, 0), sigma)
         norm += importance * cv2.GaussianBlur(weight, (0, 0), sigma)
-    mean = cv2.resize(total / norm[..., None], image.shape[1::-1], interpolation=cv2.INTER_LINEAR)
-    return np.asarray(mean, np.float32)
+    at = (places[:, ::-1] + 0.5) * (np.array(small) / image.shape[1::-1])
+    return sampled([total / norm[..., None]], at)[0]
+
+
+def _reduced(cv2: Any, image: np.ndarray, size: tuple[int, ...]) -> np.ndarray:
+    """The image's means over the areas of a smaller one's pixels; by halves, which is fast."""
+    while not any(side % 2 or side < 2 * s for side, s in zip(image.shape[1::-1], size, strict=True)):
+        half = image.shape[1] // 2, image.shape[0] // 2
+        image = cv2.resize(image, half, interpolation=cv2.INTER_AREA)
+    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA))
 
 
 def _shrunk(cv2: Any, where: np.ndarray, pixels: float) -> np.ndarray:

@@ -50,6 +50,14 @@ class ImageFrames:
         return image if is_plain(image) else None
 
 
+def write_png(path: Path, pixels: np.ndarray) -> None:
+    """Write gray pixels (H, W) or BGR (H, W, 3), uint8: by OpenCV, in a fifth of Pillow's time."""
+    import cv2
+
+    with replacing(path) as partial:
+        partial.write_bytes(cv2.imencode(".png", pixels)[1].tobytes())
+
+
 Frames = ImageFrames | VideoFrames  # The frames of one camera as they were recorded
 
 
@@ -90,10 +98,7 @@ class FootageCamera:
             return read_image(View(timestep, 0, self.camera, self.name, kept))
         image = self._undistorted(self.frames.image(timestep))
         if kept is not None:
-            import cv2  # writes PNGs in a fifth of Pillow's time
-
-            with replacing(kept) as partial:
-                partial.write_bytes(cv2.imencode(".png", image[..., ::-1])[1].tobytes())
+            write_png(kept, image[..., ::-1])
         return image
 
     def mask(self, timestep: int) -> np.ndarray | None:
