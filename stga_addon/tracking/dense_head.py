@@ -2,14 +2,14 @@
 optical flow."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from ..capture.mesh_geometry import vertex_normals
 from ..flame.forward import RIGID_SIZE, flame_forward, frame_of
-from ..flame.model import EYEBALL_WEIGHT, JOINTS
+from ..flame.model import EYEBALL_WEIGHT, JOINTS, FlameModel
 from ..flame.quaternions import unit
 from . import appearance
 from .appearance import Sample, Texture, Views
@@ -56,6 +56,11 @@ ALL_POINTS = HELD_OUT_LEVEL + 1
 NO_TEXTURE = Texture({}, {}, np.zeros(0))
 
 
+def in_single_precision(model: FlameModel) -> FlameModel:
+    names = ("v_template", "shapedirs", "posedirs", "j_regressor", "weights")
+    return replace(model, **{name: getattr(model, name).astype(np.float32) for name in names})
+
+
 @dataclass(frozen=True)
 class Misfit:
     """How badly points are explained, from 0 to 1: over all, and by region (R,); 0 where no point
@@ -96,7 +101,8 @@ class DenseHead:
         fitted = np.flatnonzero(~held)
         others = np.flatnonzero(held)
         self.rows = [*(fitted[::step] for step in STEPS), others, np.arange(len(self.points))]
-        self._posed = [PosedPoints(model, self.points[rows]) for rows in self.rows]
+        single = in_single_precision(model)  # images tell no more
+        self._posed = [PosedPoints(single, self.points[rows]) for rows in self.rows]
         height = at[:, 1]
         low = height[reliable].min()
         high = height[reliable].max()

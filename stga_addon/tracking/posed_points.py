@@ -62,12 +62,13 @@ class PosedPoints:
     pose and translation.
 
     Coefficients are those of `dirs`: identity and expression, or fewer. Pose is (5, 3) axis-angle,
-    as in `FlameFrame`.
+    as in `FlameFrame`. Results have the precision of `dirs`.
     """
 
     def __init__(self, model: FlameModel, points: SurfacePoints) -> None:
         rows = model.faces[points.face].ravel()
-        self.barycentric = points.barycentric
+        self._precision = model.shapedirs.dtype
+        self.barycentric = points.barycentric.astype(self._precision)
         self.template = model.v_template[rows]
         self.dirs = model.shapedirs[rows]
         self.weights = model.weights[rows]
@@ -76,12 +77,13 @@ class PosedPoints:
         self.joints = model.j_regressor @ model.v_template
         self.joint_dirs = np.tensordot(model.j_regressor, model.shapedirs, 1)
         # (J, J): 1 where a joint (column) is one (row) or is carried by it
-        self._below = np.eye(len(self.parents))
+        self._below = np.eye(len(self.parents), dtype=self._precision)
         for joint, parent in enumerate(self.parents):
             if parent >= 0:
                 self._below[:, joint] += self._below[:, parent]
-        weights = self.weights * self.barycentric.reshape(-1, 1)
-        self._corner_weights = weights.T.reshape(len(self.parents), -1, 3)
+        self._used = np.flatnonzero(self.weights.any(0))  # joints that carry any of the points
+        weights = self.weights[:, self._used] * self.barycentric.reshape(-1, 1)
+        self._corner_weights = weights.T.reshape(len(self._used), -1, 3)
         self._last: tuple[bytes, _Posed] | None = None
 
     def positions(self, coefficients: np.ndarray, rigid: np.ndarray) -> np.ndarray:
@@ -99,30 +101,32 @@ class PosedPoints:
         """Positions (N, 3) and their derivatives (N, 3, K + 18)."""
         posed = self._posed(coefficients, rigid)
         count = len(self.barycentric)
-        turns = np.stack([left_jacobian(angles) for angles in posed.angles])
+        turns = np.stack([left_jacobian(angles) for angles in posed.angles]).astype(self._precision)
         first = self.dirs.shape[2]
+        used = self._used
         share = self._corner_weights.sum(2)
-        found = np.empty((count, 3, first + RIGID_SIZE))
+        found = np.empty((count, 3, first + RIGID_SIZE), self._precision)
         by_pose = found[..., first:-TRANSLATION_SIZE]
         # Blending and skinning are one product of (N, 3, 9) and (N, 9, K).
         skin = self._weighted(posed.skin).transpose(0, 2, 1, 3).reshape(count, 3, 9)
         places = joint_places(self.parents, posed.rotations, self.joint_dirs)
         moved: np.ndarray = places - posed.rotations @ self.joint_dirs
         found[..., :first] = skin @ self.dirs.reshape(count, 9, first)
-        found[..., :first] += np.tensordot(share.T, moved, 1)
+        found[..., :first] += np.tensordot(share.T, moved[used], 1)
         # Turning a joint turns about it what it and the joints below it carry, each with its share
         # of the skin.
-        turned = posed.corrected @ posed.rotations.swapaxes(1, 2) + posed.moved[:, None]
+        turned = posed.corrected @ posed.rotations[used].swapaxes(1, 2) + posed.moved[used, None]
         corners = turned.reshape(*self._corner_weights.shape, 3)
         carried = np.einsum("jnc,jncx->jnx", self._corner_weights, corners)
-        below = (self._below @ share)[..., None] * posed.places[:, None]
-        arms = np.tensordot(self._below, carried, 1) - below
+        below = (self._below[:, used] @ share)[..., None] * posed.places[:, None]
+        arms = np.tensordot(self._below[:, used], carried, 1) - below
         parents = [np.eye(3) if parent < 0 else posed.rotations[parent] for parent in self.parents]
         across = np.einsum("yxz,jyc->jzxc", cross_matrices(np.eye(3)), parents @ turns)
+        across = across.astype(self._precision)
         by_joint = (arms @ across.reshape(-1, 3, 9)).reshape(*arms.shape, 3)
         by_pose[:] = by_joint.transpose(1, 2, 0, 3).reshape(count, 3, POSE_SIZE)
         if self.posedirs is not None:  # by all joints but the root
-            bent = np.zeros((self.posedirs.shape[2], POSE_SIZE))
+            bent = np.zeros((self.posedirs.shape[2], POSE_SIZE), self._precision)
             for joint in range(1, len(turns)):
                 changes = (cross_matrices(turns[joint].T) @ posed.local[joint]).reshape(3, 9)
                 bent[9 * (joint - 1) : 9 * joint, 3 * joint : 3 * joint + 3] = changes.T
@@ -136,17 +140,18 @@ class PosedPoints:
         if self._last is not None and self._last[0] == key:
             return self._last[1]
         angles = rigid[:POSE_SIZE].reshape(-1, 3)
-        local = axis_angle_matrices(angles)
+        coefficients = coefficients.astype(self._precision)
+        local = axis_angle_matrices(angles).astype(self._precision)
         rotations = world_turns(self.parents, local)
         joints = self.joints + self.joint_dirs @ coefficients
         places = joint_places(self.parents, rotations, joints)
         moved = places - (rotations @ joints[..., None])[..., 0]
         corrected = self.template + self.dirs @ coefficients
         if self.posedirs is not None:
-            corrected += self.posedirs @ (local[1:] - np.eye(3)).ravel()
+            corrected += self.posedirs @ (local[1:] - np.eye(3, dtype=local.dtype)).ravel()
         skin = (self.weights @ rotations.reshape(-1, 9)).reshape(-1, 3, 3)
         posed = np.einsum("nij,nj->ni", skin, corrected) + self.weights @ moved
-        positions = self._weighted(posed).sum(1) + rigid[POSE_SIZE:]
+        positions = self._weighted(posed).sum(1) + rigid[POSE_SIZE:].astype(self._precision)
         found = _Posed(positions, angles, local, rotations, places, moved, corrected, skin, posed)
         self._last = key, found
         return found

@@ -137,6 +137,8 @@ def by_images(
         return fit_surface(head, fit, take, crew), {}
     take = replace(take, landmarks=dense.landmarks)
     fit = fit_surface(head, dense.fit, take, crew, dense=True)
+    if fit is dense.fit:  # again, from where it is, would move it by hundredths of a millimeter
+        return fit, _misfits(dense)
     dense = fit_dense(fit, take, crew, settled=True)
     assert dense is not None
     return dense.fit, _misfits(dense)

@@ -21,7 +21,7 @@ from stga_addon.tracking.appearance import (
 )
 from stga_addon.tracking.correspondence import shaded_image
 from stga_addon.tracking.dense import fit_dense
-from stga_addon.tracking.dense_head import REGIONS
+from stga_addon.tracking.dense_head import REGIONS, in_single_precision
 from stga_addon.tracking.fit import RecordedTake, fit_head
 from stga_addon.tracking.head_model import HeadModel
 from stga_addon.tracking.posed_points import PosedPoints
@@ -247,3 +247,36 @@ def test_raised_brows_are_not_lowered_by_images_that_prove_little():
     found = fit_dense(first, replace(take.take, images=images), Crew(Helpers(1)))
     assert brow_errors(take, first).max() < 1
     assert brow_errors(take, found.fit).max() < 3
+
+
+def test_a_surface_that_is_not_found_is_not_refined(monkeypatch):
+    """Catches a second round of dense tracking for a single camera, which moves nothing and takes
+    as long as the first."""
+    fit = object()
+    rounds = []
+
+    def fit_once(fit, take, crew, settled=False):
+        rounds.append(settled)
+        return dense.DenseFit(fit, {}, {0: np.arange(len(REGIONS))})
+
+    monkeypatch.setattr("stga_addon.tracking.seen.fit_dense", fit_once)
+    monkeypatch.setattr("stga_addon.tracking.seen.fit_surface", lambda _, fit, *__, **___: fit)
+    take = RecordedTake(None, None, {}, no_image)
+    found, misfit = by_images(None, fit, take, Crew(Helpers(1)))
+    assert found is fit
+    assert rounds == [False]
+    assert misfit == {name: {0: row} for row, name in enumerate(REGIONS)}
+
+
+def test_single_precision_is_enough_for_points(head):
+    """Catches derivatives that lose a joint, or their digits, where arrays are of single
+    precision: correctives of the pose are added in it too."""
+    rng = default_rng(3)
+    one = person(head, np.zeros(head.model.n_identity)).model
+    bent = replace(one, posedirs=rng.normal(0, 1e-3, (*one.v_template.shape, 36)))
+    values = rng.normal(0, 0.3, one.n_expression), rng.normal(0, 0.3, 18)
+    exact = PosedPoints(bent, places_on(head, 60)).linearized(*values)
+    single = PosedPoints(in_single_precision(bent), places_on(head, 60)).linearized(*values)
+    for found, expected in zip(single, exact, strict=True):
+        assert found.dtype == np.float32
+        assert_allclose(found, expected, atol=2e-6)
