@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -50,11 +51,23 @@ MIN_OBSERVATIONS = 1.0  # Sum of its views' weights, below which a point's textu
 
 @dataclass(frozen=True)
 class Level:
-    """An image: camera, channels (H, W, 3), derivatives by x and y (2, H, W, 3); float32."""
+    """An image: camera, channels (H, W, 3) float32."""
 
     camera: Camera
     channels: np.ndarray
-    gradient: np.ndarray
+
+    @cached_property
+    def gradient(self) -> np.ndarray:
+        """(2, H, W, 3) float32 derivatives by x and y."""
+        import cv2
+
+        along = np.array([[-0.5, 0, 0.5]], np.float32)
+        return np.stack([cv2.filter2D(self.channels, -1, own) for own in (along, along.T)])
+
+    @cached_property
+    def luma(self) -> np.ndarray:
+        """(H, W) uint8."""
+        return np.clip(self.channels[..., 0], 0, 255).astype(np.uint8)
 
 
 @dataclass(frozen=True)
@@ -108,12 +121,9 @@ def pyramid(
         small = camera.scaled(min(1.0, max(pixel, 1e-9) / size))
         image = cv2.resize(image, (small.width, small.height), interpolation=cv2.INTER_AREA)
         colors = cv2.GaussianBlur(image.astype(np.float32) @ COLORS.T, (0, 0), BLUR_PX)
-        brightness, redness = np.moveaxis(colors, 2, 0)
+        brightness, redness = cv2.split(colors)
         detail = brightness - cv2.GaussianBlur(brightness, (0, 0), DETAIL_PX)
-        channels = np.stack([brightness, detail, redness], axis=2)
-        along = np.array([[-0.5, 0, 0.5]], np.float32)
-        gradient = np.stack([cv2.filter2D(channels, -1, own) for own in (along, along.T)])
-        levels.append(Level(small, channels, gradient))
+        levels.append(Level(small, cv2.merge([brightness, detail, redness])))
     return levels
 
 
@@ -131,6 +141,16 @@ def sampled(images: Sequence[np.ndarray], pixels: np.ndarray) -> list[np.ndarray
     return [
         np.concatenate([cv2.remap(image, *part, **border)[0] for part in parts]) for image in images
     ]
+
+
+def box_of(where: np.ndarray, margin: int) -> tuple[slice, slice]:
+    """Rows and columns of the pixels (H, W) bool, with a margin around them; none without any."""
+    sides = []
+    for axis in (1, 0):
+        used = np.flatnonzero(where.any(axis))
+        first = max(0, used[0] - margin) if len(used) else 0
+        sides.append(slice(first, used[-1] + 1 + margin if len(used) else 0))
+    return sides[0], sides[1]
 
 
 def inside(camera: Camera, pixels: np.ndarray, depth: np.ndarray) -> np.ndarray:
@@ -165,13 +185,8 @@ def flow_targets(at: np.ndarray, before: Views, now: Views) -> Any:
         shape = level.channels.shape
         if old is not None and old.channels.shape == shape and min(shape[:2]) >= MIN_FLOW_SIDE_PX:
             pixels, _ = old.camera.project(at)
-            motion = flow.calc(luma(old), luma(level), None)
+            motion = flow.calc(old.luma, level.luma, None)
             yield view.key, level.camera, pixels + sampled([motion], pixels)[0]
-
-
-def luma(level: Level) -> np.ndarray:
-    """(H, W) uint8 of an image."""
-    return np.clip(level.channels[..., 0], 0, 255).astype(np.uint8)
 
 
 def light_basis(normals: np.ndarray) -> np.ndarray:

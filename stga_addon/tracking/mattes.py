@@ -19,7 +19,7 @@ from scipy.ndimage import binary_fill_holes
 from ..capture.model import parts_of
 from ..files import read_json, write_json
 from ..worker.helpers import Step
-from .appearance import sampled
+from .appearance import box_of, sampled
 from .face_networks import PersonNetwork
 from .folder import MATTES_FILE, mask_name
 from .footage.model import Footage, FootageCamera, write_png
@@ -137,7 +137,7 @@ def find_matte(image: np.ndarray, probability: np.ndarray, head: np.ndarray) -> 
     # coverage in a band along the person's outline, and what is near it
     band = max(1.0, BAND_SHARE * size)
     matte = np.where(person, np.uint8(255), np.uint8(0))
-    near = _box(person, math.ceil(band) + 2)
+    near = box_of(person, math.ceil(band) + 2)
     inside = _shrunk(cv2, person[near], band)
     outside = ~_grown(cv2, person[near], band)
     unknown = np.nonzero(~inside & ~outside)
@@ -159,16 +159,6 @@ def find_matte(image: np.ndarray, probability: np.ndarray, head: np.ndarray) -> 
     coverage = trust * np.clip(share, 0, 1) + (1 - trust) * edge[unknown]
     matte[near][unknown] = (255 * coverage + 0.5).astype(np.uint8)
     return matte
-
-
-def _box(where: np.ndarray, margin: int) -> tuple[slice, slice]:
-    """Rows and columns of the pixels (H, W) bool, and of a margin around them; none without any."""
-    sides = []
-    for axis in (1, 0):
-        used = np.flatnonzero(where.any(axis))
-        first = max(0, used[0] - margin) if len(used) else 0
-        sides.append(slice(first, used[-1] + 1 + margin if len(used) else 0))
-    return sides[0], sides[1]
 
 
 def by_plate(image: np.ndarray, plate: np.ndarray) -> np.ndarray:
@@ -198,7 +188,7 @@ def _cut(
     if 0 < np.isin(marks, (cv2.GC_FGD, cv2.GC_PR_FGD)).mean() < 1:  # it learns the colors of both
         cv2.setRNGSeed(0)  # of the clusters that the color models begin with
         models = (np.zeros((1, 65)), np.zeros((1, 65)))
-        near = _box(marks != cv2.GC_BGD, math.ceil(REACH_SHARE * size))
+        near = box_of(marks != cv2.GC_BGD, math.ceil(REACH_SHARE * size))
         colors = image[near][..., ::-1].copy()
         part = marks[near].copy()
         cv2.grabCut(colors, part, None, *models, CUT_ITERATIONS, cv2.GC_INIT_WITH_MASK)
@@ -239,7 +229,9 @@ def _mean_around(
 
 def _reduced(cv2: Any, image: np.ndarray, size: tuple[int, ...]) -> np.ndarray:
     """The image's means over the areas of a smaller one's pixels; by halves, which is fast."""
-    while not any(side % 2 or side < 2 * s for side, s in zip(image.shape[1::-1], size, strict=True)):
+    while not any(
+        side % 2 or side < 2 * s for side, s in zip(image.shape[1::-1], size, strict=True)
+    ):
         half = image.shape[1] // 2, image.shape[0] // 2
         image = cv2.resize(image, half, interpolation=cv2.INTER_AREA)
     return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA))

@@ -20,7 +20,7 @@ from ..capture.mesh_geometry import rasterize
 from ..flame.model import FlameModel, torso_faces
 from ..worker.helpers import Step
 from . import appearance
-from .appearance import NOISE_LEVELS, inside, luma, sampled
+from .appearance import NOISE_LEVELS, box_of, inside, sampled
 from .fit import posed_mesh
 from .folder import TorsoPoints
 from .posed_points import head_rotation
@@ -36,6 +36,7 @@ FLOW_SHARE = 0.15
 FLOW_OUTLIER_PX = 4.0
 CHANGE_OUTLIER_LEVELS = 5 * NOISE_LEVELS
 """Distance, and difference of what flow matches, beyond which flow is wrong."""
+FLOW_MARGIN_PX = 32  # Around the sheet in the images of optical flow
 PIXEL_STEP = 3  # One of so many pixels is fitted
 MIN_GAIN = 0.05  # Share by which the misfit has to fall for the torso to bend
 STEPS = 4  # Gauss–Newton steps for each timestep
@@ -182,10 +183,12 @@ def found_bending(
 
 @dataclass(frozen=True)
 class _Reference:
-    """What a camera shows of the sheet at the first timestep, in P pixels: where (H, W), its luma
-    (H, W) uint8, of the pixels rows (P, 3) of the sheet's vertices, barycentric coordinates (P, 3),
-    and whether they are fitted (P,)."""
+    """What a camera, whose images have a shape, shows of the sheet at the first timestep, in P
+    pixels of a part (H, W) of its image: where they are, the part's luma (H, W) uint8, of the
+    pixels rows (P, 3) of the sheet's vertices, barycentric coordinates (P, 3), and whether they are
+    fitted (P,)."""
 
+    shape: tuple[int, ...]
     shown: np.ndarray
     luma: np.ndarray
     corners: np.ndarray
@@ -201,7 +204,7 @@ class _Reference:
 
 @dataclass(frozen=True)
 class _Returned:
-    """An image of another timestep brought back to the reference: its luma (H, W), and of the P
+    """An image of another timestep brought back to the reference: its luma (H, W), of the P
     pixels the positions (P, 3), the pixels (P, 2) that show them there, and whether they do
     (P,)."""
 
@@ -245,7 +248,9 @@ class _Cloth:
             shown[rows, columns] = visible
             fitted = (rows // BLOCK_PX + columns // BLOCK_PX) % HELD_OUT != 0
             chosen = corners[visible], weights[visible], fitted[visible]
-            self._references[number] = _Reference(shown, luma(view.levels[0]), *chosen)
+            part = box_of(shown, FLOW_MARGIN_PX)
+            bright = view.levels[0].luma[part].copy()  # in one piece
+            self._references[number] = _Reference(shown.shape, shown[part], bright, *chosen)
 
     def follow(self, way: Sequence[int], step: Step) -> Rows:
         """Offsets at the timesteps of a way, which begins with the first one, where they are 0."""
@@ -284,7 +289,7 @@ class _Cloth:
             for number, own in self._references.items()
             if number in shot.views
             and own.corners.size
-            and shot.views[number].levels[0].channels.shape[:2] == own.shown.shape
+            and shot.views[number].levels[0].channels.shape[:2] == own.shape
             and min(own.shown.shape) >= appearance.MIN_FLOW_SIDE_PX
         ]
 
@@ -310,7 +315,7 @@ class _Cloth:
         at = np.einsum("pk,pki->pi", reference.barycentric, corners)
         source, _ = shot.views[number].levels[0].camera.project(at)
         returned = reference.luma.copy()
-        values = sampled([luma(shot.views[number].levels[0]).astype(np.float32)], source)[0]
+        values = sampled([shot.views[number].levels[0].luma.astype(np.float32)], source)[0]
         returned[reference.pixels] = values.astype(np.uint8)
         return _Returned(returned, at, source, self._visible(shot, number, at))
 

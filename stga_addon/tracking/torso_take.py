@@ -163,21 +163,36 @@ class TorsoTake:
         for number, source in enumerate(self.cameras):
             mask = source.mask(timestep) if timestep in source.timesteps else None
             if mask is not None:
-                image = source.image(timestep).copy()
-                edge = (mask > 0) & (mask < 255)
-                share = mask[edge][:, None].astype(np.float32) / 255
-                image[edge] = image[edge] * share + PLAIN_LEVEL * (1 - share) + 0.5
-                image[mask == 0] = PLAIN_LEVEL
                 camera = self.fit.to_capture.camera(source.camera)
+                image = masked(source.image(timestep), mask)
                 levels = appearance.pyramid(camera, image, self._center)
                 views[number] = PyramidView(bytes([number]), camera, levels)
                 masks[number] = mask
-                heads[number] = self.head_pixels(mesh, levels[EVIDENCE_LEVEL].camera)
+                heads[number] = self.beside_head(mesh, levels[EVIDENCE_LEVEL].camera)
         return TorsoShot(timestep, views, masks, heads)
 
-    def head_pixels(self, mesh: np.ndarray, camera: Camera) -> np.ndarray:
-        """(H, W) bool: the head without its torso, and what is beside it."""
-        return grown(silhouette(mesh, self.model.faces[~self.torso], camera), HEAD_MARGIN)
+    def beside_head(self, mesh: np.ndarray, camera: Camera) -> np.ndarray:
+        """(H, W) bool: the head without its torso, and what is beside it, farther than its
+        triangles are wide."""
+        corners = mesh[self.model.faces[~self.torso]]
+        at = np.concatenate([corners.reshape(-1, 3), corners.mean(1)])
+        pixels, depth = camera.project(at)
+        x, y = pixels[inside(camera, pixels, depth)].astype(int).T
+        found = np.zeros((camera.height, camera.width), bool)
+        found[y, x] = True
+        return grown(found, HEAD_MARGIN)
+
+
+def masked(image: np.ndarray, mask: np.ndarray) -> np.ndarray:
+    """The image (H, W, 3) uint8, plain outside its mask (H, W) uint8."""
+    import cv2
+
+    found = np.full_like(image, PLAIN_LEVEL)
+    cv2.copyTo(image, cv2.compare(mask, 255, cv2.CMP_EQ), found)
+    edge = np.nonzero(cv2.inRange(mask, 1, 254))
+    share = mask[edge][:, None].astype(np.float32) / 255
+    found[edge] = image[edge] * share + PLAIN_LEVEL * (1 - share) + 0.5
+    return found
 
 
 class BothWays:
@@ -297,7 +312,8 @@ def seen_points(take: TorsoTake, timestep: int) -> SeenPoints:
         places = (np.stack([columns.ravel(), rows.ravel()], axis=1) + 0.5) * step
         x, y = places.astype(int).T
         _, nearest = cKDTree(pixels).query(places)
-        shown = grown(mask > 127, MASK_MARGIN) & ~take.head_pixels(mesh, camera)
+        head = silhouette(mesh, take.model.faces[~take.torso], camera)
+        shown = grown(mask > 127, MASK_MARGIN) & ~grown(head, HEAD_MARGIN)
         kept = np.flatnonzero(shown[y, x] & take.torso[nearest])
         kept = kept[:: max(1, -(-len(kept) // MAX_POINTS))]
         if not len(kept):
