@@ -84,10 +84,13 @@ def joint_places(parents: Iterable[int], world: np.ndarray, joints: np.ndarray) 
 
 def cross_matrices(vectors: np.ndarray) -> np.ndarray:
     """(N, 3, 3): the matrices of x ↦ vector × x, of vectors (N, 3)."""
-    x, y, z = vectors.T
-    zero = np.zeros_like(x)
-    rows = ([zero, -z, y], [z, zero, -x], [-y, x, zero])
-    return np.stack([np.stack(row, -1) for row in rows], -2)
+    found = np.zeros((*vectors.shape, 3), vectors.dtype)
+    for axis, component in enumerate(vectors.T):
+        first = (axis + 1) % 3
+        second = (axis + 2) % 3
+        found[:, second, first] = component
+        found[:, first, second] = -component
+    return found
 
 
 def moved_pose(
@@ -174,12 +177,14 @@ def _joints(vectors: np.ndarray) -> np.ndarray:
     return vectors.reshape(*vectors.shape[:-1], -1, 3)
 
 
-def left_jacobian(angles: np.ndarray) -> np.ndarray:
-    """(3, 3): the small rotation, before that of an axis-angle (3,), that its change amounts to."""
-    angle = float(np.linalg.norm(angles))
-    cross = cross_matrices(angles[None])[0]
+def left_jacobians(angles: np.ndarray) -> np.ndarray:
+    """(J, 3, 3): the small rotations, before those of axis-angles (J, 3), that their changes amount
+    to."""
+    angle = np.linalg.norm(angles, axis=1)[:, None, None]
+    cross = cross_matrices(angles)
     second = 0.5 * np.sinc(angle / (2 * np.pi)) ** 2  # (1 − cos) / angle²
-    third = (1 - np.sinc(angle / np.pi)) / angle**2 if angle > SMALL_ANGLE else 1 / 6
+    third = (1 - np.sinc(angle / np.pi)) / np.maximum(angle, SMALL_ANGLE) ** 2
+    third = np.where(angle > SMALL_ANGLE, third, 1 / 6)
     return np.eye(3) + second * cross + third * cross @ cross
 
 
@@ -188,9 +193,9 @@ def by_change(parameters: np.ndarray) -> np.ndarray:
     whose rotations are less than a whole turn."""
     derivative = np.eye(len(parameters))
     first = len(parameters) - RIGID_SIZE
-    for joint, angles in enumerate(frame_of(parameters).pose):
+    for joint, turn in enumerate(left_jacobians(frame_of(parameters).pose)):
         own = slice(first + 3 * joint, first + 3 * joint + 3)
-        derivative[own, own] = np.linalg.inv(left_jacobian(angles))
+        derivative[own, own] = np.linalg.inv(turn)
     return derivative
 
 
@@ -254,7 +259,8 @@ def parameters_gradient(
     by_local[1:] += np.tensordot(by_corrected, model.posedirs, 2).reshape(-1, 3, 3)
     twist = by_local @ posed.local.swapaxes(1, 2)
     torque = np.stack([twist[:, k - 1, k - 2] - twist[:, k - 2, k - 1] for k in range(3)], 1)
-    by_pose = [left_jacobian(own).T @ turn for own, turn in zip(frame.pose, torque, strict=True)]
+    jacobians = left_jacobians(frame.pose)
+    by_pose = [own.T @ turn for own, turn in zip(jacobians, torque, strict=True)]
     by_shaped = by_corrected + model.j_regressor.T @ by_joint
     by_expression = np.tensordot(by_shaped, expressions, 2)
     return np.concatenate([by_expression, *by_pose, vertex_gradient.sum(0)])

@@ -12,7 +12,7 @@ from ..flame.forward import (
     axis_angle_matrices,
     cross_matrices,
     joint_places,
-    left_jacobian,
+    left_jacobians,
     world_turns,
 )
 from ..flame.model import FlameModel
@@ -101,7 +101,7 @@ class PosedPoints:
         """Positions (N, 3) and their derivatives (N, 3, K + 18)."""
         posed = self._posed(coefficients, rigid)
         count = len(self.barycentric)
-        turns = np.stack([left_jacobian(angles) for angles in posed.angles]).astype(self._precision)
+        turns = left_jacobians(posed.angles).astype(self._precision)
         first = self.dirs.shape[2]
         used = self._used
         share = self._corner_weights.sum(2)
