@@ -17,6 +17,7 @@ from ..stga_addon.render.client import missing_packages
 from ..stga_addon.scene import compat, tags
 from ..stga_addon.scene.compat import modifier_input_owner
 from ..stga_addon.scene.display import splat_nodes, splat_object
+from ..stga_addon.scene.display.splat_attributes import UNSEEN
 from ..stga_addon.scene.display.splat_nodes import AS_TRAINED, LIMITS, NATIVE, QUADS
 from ..stga_addon.scene.display.splat_object import shows_nodes
 from ..stga_addon.scene.gpu.context import has_gpu_context
@@ -34,6 +35,8 @@ DISPLAY_INPUTS = (
     splat_nodes.SHOW_SELECTION,
     splat_nodes.SELECTED_ONLY,
 )
+UNSEEN_INPUTS = (splat_nodes.SHOW_UNSEEN, splat_nodes.FILMED_ONLY)
+"""Of avatars that know what was filmed."""
 _is_told = False
 """Whether the render job in progress has said what it does not show."""
 
@@ -61,7 +64,8 @@ class ShowPanel(SidebarPanel, bpy.types.Panel):
         mode = splat_object.display_mode(settings.splats)
         layout.operator_menu_enum("stga.choose_display", "display", text=f"Display: {mode}")
         column = layout.column(align=True)
-        for name in DISPLAY_INPUTS:
+        knows = UNSEEN in settings.splats.data.attributes
+        for name in (*DISPLAY_INPUTS, *(UNSEEN_INPUTS if knows else ())):
             draw_input(column, modifier, name)
         if viewport_display.display.problem:
             draw_text(layout, context, viewport_display.display.problem, "ERROR")

@@ -13,7 +13,11 @@ from ..light.values import Caster, Lighting
 from ..raster.posed_splats import PosedSplats
 
 FROZEN_COLOR = (0.25, 0.25, 0.25, 1.0)  # linear; splats that the current frame does not train
-FROZEN_COLOR_SRGB = tuple(float(channel) for channel in linear_to_srgb(np.array(FROZEN_COLOR[:3])))
+UNSEEN_COLOR = (0.02, 0.2, 0.6, 1.0)  # linear; splats that no camera saw
+FROZEN_COLOR_SRGB, UNSEEN_COLOR_SRGB = (
+    tuple(float(channel) for channel in linear_to_srgb(np.array(color[:3])))
+    for color in (FROZEN_COLOR, UNSEEN_COLOR)
+)
 
 
 @dataclass(frozen=True)
@@ -26,6 +30,8 @@ class DisplaySettings:
     view_dependent: bool = True
     show_selection: bool = False
     selected_only: bool = False
+    show_unseen: bool = False
+    filmed_only: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,8 +59,9 @@ class Relit:
 @dataclass(frozen=True)
 class SceneLayer:
     """A visible splat object: its splats, how they are posed (as `PosedSplats`) and displayed.
-    frozen (F,) bool: triangles that the frame does not train, None where nobody asks. relit: None
-    where colors are as recorded. holdout: it makes what it covers transparent."""
+    frozen (F,) bool: triangles that the frame does not train, None where nobody asks; unseen (F,)
+    bool: those that no camera saw, None where the avatar does not know. relit: None where colors
+    are as recorded. holdout: it makes what it covers transparent."""
 
     splats: Splats
     frames: FaceFrames
@@ -62,6 +69,7 @@ class SceneLayer:
     antialiased: bool = False
     settings: DisplaySettings = DisplaySettings()
     frozen: np.ndarray | None = None
+    unseen: np.ndarray | None = None
     relit: Relit | None = None
     holdout: bool = False
 
@@ -70,7 +78,7 @@ class SceneLayer:
         sh = np.full((len(self.splats), 1, 3), (value - 0.5) / SH_C0, np.float32)
         splats = replace(self.splats, sh=sh)
         frames = replace(self.frames, color=NO_COLUMNS)
-        settings = replace(self.settings, show_selection=False)
+        settings = replace(self.settings, show_selection=False, show_unseen=False)
         return replace(self, splats=splats, frames=frames, settings=settings, relit=None)
 
     def posed(self, eye: np.ndarray | None = None) -> PosedSplats:
@@ -84,17 +92,21 @@ class SceneLayer:
             frames = replace(frames, color=NO_COLUMNS)
         visible = 1 / (1 + np.exp(-splats.opacity)) >= settings.opacity_threshold
         visible &= random_percentage(len(splats)) < settings.percentage
-        if self.frozen is not None:
-            frozen = self.frozen[splats.face]
-            if settings.show_selection:
+        for faces, is_shown, is_hidden, paint in (
+            (self.frozen, settings.show_selection, settings.selected_only, FROZEN_COLOR_SRGB),
+            (self.unseen, settings.show_unseen, settings.filmed_only, UNSEEN_COLOR_SRGB),
+        ):
+            if faces is None:
+                continue
+            rows = faces[splats.face]
+            if is_shown:
                 sh = splats.sh.copy()
-                gray = (np.array(FROZEN_COLOR_SRGB) - 0.5) / SH_C0
-                sh[frozen] = 0
-                sh[frozen, 0] = gray
+                sh[rows] = 0
+                sh[rows, 0] = (np.array(paint) - 0.5) / SH_C0
                 splats = replace(splats, sh=sh)
-                color = np.where(self.frozen[:, None], np.float32(0), frames.color)
+                color = np.where(faces[:, None], np.float32(0), frames.color)
                 frames = replace(frames, color=color)
-            visible &= ~(frozen & settings.selected_only)
+            visible &= ~(rows & is_hidden)
         if splats.sh_degree > 0 and not settings.view_dependent:
             splats = replace(splats, sh=splats.sh[:, :1])
         if settings.size != 1:

@@ -305,7 +305,8 @@ def test_depth_in_meters(tmp_path):
 def test_display_settings_apply_to_renders(tmp_path):
     """Catches settings that only affect the viewport."""
     avatar = textured(avatar_of("stga"))
-    shown, head = show(avatar)
+    unseen = np.arange(len(avatar.faces)) % 3 == 0
+    shown, head = show(replace(avatar, regions={"unseen": unseen}))
     camera = expected_camera(camera_at(), shown)
     faint = 1 / (1 + np.exp(-avatar.splats.opacity)) < 0.5
     selected = np.zeros(len(avatar.faces), bool)
@@ -320,6 +321,7 @@ def test_display_settings_apply_to_renders(tmp_path):
     cases = {
         splat_nodes.OPACITY_THRESHOLD: (0.5, 0.0, avatar.splats.rows(~faint)),
         splat_nodes.SELECTED_ONLY: (True, False, avatar.splats.rows(~frozen)),
+        splat_nodes.FILMED_ONLY: (True, False, avatar.splats.rows(~unseen[avatar.splats.face])),
         splat_nodes.VIEW_DEPENDENT: (False, True, constant),
         splat_nodes.SIZE: (2.0, 1.0, larger),
         splat_nodes.PERCENTAGE: (0.0, 100.0, avatar.splats.rows(np.zeros(3000, bool))),

@@ -89,6 +89,10 @@ def cases():
     display = DisplaySettings(0.7, 0.3, 60.0, False, True, False)
     frozen = np.arange(len(avatar(0).faces)) % 3 == 0
     only = DisplaySettings(selected_only=True)
+    unseen = np.arange(len(avatar(0).faces)) % 2 == 0
+    both = DisplaySettings(show_selection=True, show_unseen=True)
+    filmed = DisplaySettings(show_selection=True, filmed_only=True)
+    marked = {"frozen": frozen, "unseen": unseen}
     three = [layer(avatar(0)), layer(avatar(3, "strain_color"), TURNED), unembedded(avatar(2))]
     return {
         "sh 0": ([layer(avatar(0))], near),
@@ -101,6 +105,8 @@ def cases():
         "two and world": (three, near),
         "display settings": ([layer(avatar(2, *OFFSETS), settings=display, frozen=frozen)], near),
         "selected only": ([layer(avatar(0), settings=only, frozen=frozen)], near),
+        "unseen": ([layer(avatar(2, *OFFSETS), settings=both, **marked)], near),
+        "filmed only": ([layer(avatar(0), settings=filmed, **marked)], near),
     }
 
 

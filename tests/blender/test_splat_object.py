@@ -390,6 +390,31 @@ def test_selection_grays_out_frozen_splats():
     assert len(evaluated_splats(shown)[0]) == 1000
 
 
+def test_unseen_splats_are_colored_or_hidden():
+    """Catches triangles that were filmed colored as unseen, views that add to the color, the mark
+    of an avatar that knows it on one that does not, and a mark that stored avatars lose."""
+    avatar = avatar_of("stga", 1000)
+    unseen = np.arange(len(avatar.faces)) % 3 == 0
+    marked = replace(avatar, regions={"unseen": unseen})
+    head = animated_head(avatar.neutral, avatar.faces)
+    shown = show_avatar(marked, head)
+    hidden = unseen[avatar.splats.face]
+
+    def blue():
+        return np.isclose(displayed_colors(shown), splat_nodes.UNSEEN_COLOR[:3]).all(1)
+
+    assert not blue().any()
+    set_input(shown, splat_nodes.SHOW_UNSEEN, True)
+    assert_array_equal(blue(), hidden)
+    set_input(shown, splat_nodes.FILMED_ONLY, True)
+    assert len(evaluated_splats(shown)[0]) == 1000 - hidden.sum()
+    found = stored_avatar(shown).regions["unseen"]
+    assert_array_equal(found[avatar.splats.face], hidden)
+    update_splats(shown, avatar_attributes(avatar))
+    assert len(evaluated_splats(shown)[0]) == 1000
+    assert not stored_avatar(shown).regions
+
+
 TREES = [("stga", 3, ("normal_color",)), (None, 0, ()), ("gaussian_avatars", 3, tuple(OFFSETS))]
 
 

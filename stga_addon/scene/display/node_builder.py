@@ -37,7 +37,7 @@ def is_current(tree: bpy.types.NodeTree) -> bool:
 
 
 def _version() -> str:
-    return f"{__version__} with lit native splats" if compat.NATIVE_SPLATS else __version__
+    return f"{__version__} with unseen{' and lit native' if compat.NATIVE_SPLATS else ''} splats"
 
 
 def new_socket(tree: bpy.types.NodeTree, name: str, side: str, kind: str) -> Any:

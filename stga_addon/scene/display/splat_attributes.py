@@ -9,7 +9,7 @@ from uuid import uuid4
 import numpy as np
 
 from ...avatar.embedding import face_areas
-from ...avatar.file import Avatar, AvatarLight
+from ...avatar.file import UNSEEN_REGION, Avatar, AvatarLight
 from ...avatar.offsets import OFFSETS
 from ...avatar.splats import SH_C0, Splats, in_world
 from ...avatar.strain import STRAIN_COMPONENTS, strain_basis
@@ -32,6 +32,7 @@ LINEAR_SH = "stga_linear_sh"  # the first of these, and opacity, for linear ligh
 LINEAR_OPACITY = "stga_linear_opacity"
 ALBEDO = "stga_albedo"  # linear, and roughness, where the capture's light is known
 FACE = "stga_face"
+UNSEEN = "stga_unseen"  # on a triangle of `UNSEEN_REGION`, where the avatar knows it
 NEUTRAL_AREA = "stga_neutral_area"  # of its triangle, m²; also on faces with driven offsets
 
 DISPLAY_COLOR = "stga_display_color"  # scene-linear, stored by the nodes
@@ -45,6 +46,7 @@ MIN_OPACITY = 1e-6  # and at most 1 less that, of what becomes a logit
 _FIELDS = {
     "FLOAT": ("value", 1),
     "INT": ("value", 1),
+    "BOOLEAN": ("value", 1),
     "FLOAT_VECTOR": ("vector", 3),
     "QUATERNION": ("value", 4),
     "FLOAT4": ("vector", 4),
@@ -83,6 +85,9 @@ def avatar_attributes(avatar: Avatar) -> SplatAttributes:
     splats = splat_attributes(avatar.splats)
     splats[FACE] = "INT", "value", np.ascontiguousarray(avatar.splats.face, np.int32)
     splats[NEUTRAL_AREA] = _number(areas[avatar.splats.face])
+    unseen = avatar.regions.get(UNSEEN_REGION)
+    if unseen is not None:
+        splats[UNSEEN] = "BOOLEAN", "value", unseen[avatar.splats.face]
     splats |= linear_attributes(avatar) | albedo_attribute(avatar)
     neutral: Attributes = {}  # what nodes need to have splats follow the deformation
     if avatar.follows_strain:
@@ -159,7 +164,7 @@ def write_splats(mesh: Any, attributes: Attributes) -> None:
         mesh.vertices.add(len(positions) // 3)
     # Through the attribute, which takes all values at once; `MeshVertex.co` takes them one by one.
     write_attributes(mesh, attributes | {"position": attributes[XYZ]}, "POINT")
-    for name in {LINEAR_SH, LINEAR_OPACITY, ALBEDO} - attributes.keys():  # of splats before
+    for name in {LINEAR_SH, LINEAR_OPACITY, ALBEDO, UNSEEN} - attributes.keys():  # of splats before
         if name in mesh.attributes:
             mesh.attributes.remove(mesh.attributes[name])
     mesh[tags.REVISION] = uuid4().hex
@@ -205,6 +210,11 @@ def read_linear_base(mesh: Any) -> np.ndarray | None:
         return None
     opacity = _logit(read_attribute(mesh, LINEAR_OPACITY))
     return np.column_stack([read_attribute(mesh, LINEAR_SH), opacity])
+
+
+def read_unseen(mesh: Any) -> np.ndarray | None:
+    """(N,) bool: splats on unseen triangles; None where the avatar does not know them."""
+    return read_attribute(mesh, UNSEEN) if UNSEEN in mesh.attributes else None
 
 
 def read_native_splats(cloud: Any) -> Splats | None:
@@ -255,7 +265,7 @@ def read_attribute(mesh: Any, name: str) -> np.ndarray:
     colors."""
     attribute = mesh.attributes[name]
     field, width = _FIELDS[attribute.data_type]
-    dtype = np.int32 if attribute.data_type == "INT" else np.float32
+    dtype = {"INT": np.int32, "BOOLEAN": bool}.get(attribute.data_type, np.float32)
     values = read_values(attribute.data, field, width, dtype)
     return values[:, 0] if width == 1 else values
 

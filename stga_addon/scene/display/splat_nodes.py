@@ -10,7 +10,7 @@ from ...avatar.offsets import COLOR, OFFSETS
 from ...avatar.splats import SH_C0, harmonics
 from ...capture.meshes import SELECTED_WEIGHT
 from .. import compat, tags
-from ..layers import FROZEN_COLOR
+from ..layers import FROZEN_COLOR, UNSEEN_COLOR
 from . import splat_attributes as stored
 from .frame_nodes import DEFORMED, FACE_COLOR, FRAMES, PLACED, SIGNALS, driven
 from .lit_nodes import LIGHTS, LIT, RECORDED, SCENE_LIGHT, SURFACE
@@ -26,6 +26,8 @@ PERCENTAGE = "Percentage"
 VIEW_DEPENDENT = "View-Dependent Color"
 SHOW_SELECTION = "Show Selection"
 SELECTED_ONLY = "Selected Only"
+SHOW_UNSEEN = "Show Unseen"
+FILMED_ONLY = "Filmed Only"
 NATIVE_LIGHT = "Native Light"
 
 
@@ -236,14 +238,14 @@ range of all splats, which one of them may make wide."""
 
 class _NativeInputs(NamedTuple):
     """Sockets of NATIVE_GROUPS. added: as of `constant_color`; view_dependent: whether harmonics
-    are added; gray: splats in one color, DISPLAY_COLOR, as those that are relit."""
+    are added; painted: splats in one color, DISPLAY_COLOR, as those that are relit."""
 
     splats: Any
     visible: Any
     size: Any
     added: Any
     view_dependent: Any
-    gray: Any
+    painted: Any
 
 
 def _radiance(nodes: Nodes, added: Any, flat: Any) -> bpy.types.NodeSocket:
@@ -273,7 +275,7 @@ def _native(degree: int, nodes: Nodes, *sockets: Any) -> bpy.types.NodeSocket:
     as _NativeInputs."""
     given = _NativeInputs(*sockets)
     _, is_relit = nodes.attribute_if_any(stored.RELIT_COLOR, "FLOAT_COLOR")
-    flat = nodes.logic("OR", given.gray, is_relit)
+    flat = nodes.logic("OR", given.painted, is_relit)
     radiance = nodes.group(_RADIANCE, given.added, flat)
     splats = nodes.store(given.splats, stored.RADIANCE, radiance, "FLOAT_COLOR")
     scale = nodes.scale(nodes.attribute(stored.WORLD_SCALE), given.size)
@@ -291,7 +293,7 @@ MODES = {
     POINTS: NodeGroup("STGA Points", _INPUTS, "Geometry", _points),
     QUADS: NodeGroup("STGA Camera Quads", _INPUTS, "Geometry", _quads),
 }
-_NATIVE_INPUTS = _INPUTS | {"Added": "Vector", "View-Dependent": "Bool", "Gray": "Bool"}
+_NATIVE_INPUTS = _INPUTS | {"Added": "Vector", "View-Dependent": "Bool", "Painted": "Bool"}
 NATIVE_GROUPS = tuple(
     NodeGroup(f"STGA Native Splats {n}", _NATIVE_INPUTS, "Geometry", partial(_native, n))
     for n in range(4)
@@ -391,8 +393,15 @@ def _add_interface(tree: bpy.types.NodeTree, embedded: bool, degree: int) -> Non
         description = "Colors as the scene's active camera sees them; off: their constant part"
         add(VIEW_DEPENDENT, "Bool", description, default_value=True)
     frozen = "splats that the current frame's selection freezes"
-    for name, verb in ((SHOW_SELECTION, "Gray out"), (SELECTED_ONLY, "Hide")) if embedded else ():
-        add(name, "Bool", f"{verb} {frozen}", default_value=False)
+    unseen = "splats that no camera saw, which are plausible only"
+    flags = {
+        SHOW_SELECTION: f"Gray out {frozen}",
+        SELECTED_ONLY: f"Hide {frozen}",
+        SHOW_UNSEEN: f"Color {unseen}, blue",
+        FILMED_ONLY: f"Hide {unseen}",
+    }
+    for name, description in flags.items() if embedded else ():
+        add(name, "Bool", description, default_value=False)
     if embedded and compat.NATIVE_SPLATS:
         add(NATIVE_LIGHT, "Menu", "Light that native splats show in EEVEE and Cycles")
 
@@ -407,7 +416,7 @@ def _build(nodes: Nodes, options: TreeOptions) -> None:
     random = nodes.out("FunctionNodeRandomValue", {"Min": 1e-6, "Max": 100.0}, data_type="FLOAT")
     visible = nodes.logic("AND", opaque, nodes.compare("LESS_EQUAL", random, inputs[PERCENTAGE]))
     added = None
-    gray = False
+    painted = False
     if options.convention is None:
         splats = nodes.group(PLACED[None], splats)
         color = _color(nodes, inputs, None, options.degree)
@@ -427,15 +436,20 @@ def _build(nodes: Nodes, options: TreeOptions) -> None:
             added = nodes.sample(mesh, nodes.attribute(FACE_COLOR), face, "FLOAT_VECTOR")
         color = _color(nodes, inputs, added, options.degree)
         splats = nodes.store(splats, _FROZEN, nodes.group(_FROZEN_SPLATS, head), "BOOLEAN")
-        frozen = nodes.attribute(_FROZEN, "BOOLEAN")
-        gray = nodes.logic("AND", frozen, inputs[SHOW_SELECTION])
-        color = nodes.switch("RGBA", gray, color, FROZEN_COLOR)
-        visible = nodes.logic("NIMPLY", visible, nodes.logic("AND", frozen, inputs[SELECTED_ONLY]))
+        for attribute, show, only, paint in (
+            (_FROZEN, SHOW_SELECTION, SELECTED_ONLY, FROZEN_COLOR),
+            (stored.UNSEEN, SHOW_UNSEEN, FILMED_ONLY, UNSEEN_COLOR),
+        ):
+            rows = nodes.attribute(attribute, "BOOLEAN")
+            is_shown = nodes.logic("AND", rows, inputs[show])
+            color = nodes.switch("RGBA", is_shown, color, paint)
+            painted = nodes.logic("OR", is_shown, painted)
+            visible = nodes.logic("NIMPLY", visible, nodes.logic("AND", rows, inputs[only]))
     splats = nodes.store(splats, stored.DISPLAY_COLOR, nodes.group(_RELIT, color), "FLOAT_COLOR")
     native = None
     if compat.NATIVE_SPLATS:
         view_dependent = inputs[VIEW_DEPENDENT] if options.degree > 0 else False
-        fields = inputs[SIZE], (0, 0, 0) if added is None else added, view_dependent, gray
+        fields = inputs[SIZE], (0, 0, 0) if added is None else added, view_dependent, painted
         lit = given = None
         if options.convention is not None:
             choices = {RECORDED: False, SCENE_LIGHT: True}

@@ -9,7 +9,7 @@ from uuid import uuid4
 import bpy
 import numpy as np
 
-from ...avatar.file import Avatar, AvatarLight
+from ...avatar.file import UNSEEN_REGION, Avatar, AvatarLight
 from ...avatar.filmed import filmed_sides
 from ...avatar.offsets import OFFSETS
 from ...avatar.splats import Splats
@@ -366,16 +366,24 @@ def display_settings(modifier: Any) -> DisplaySettings:
 
 
 def stored_avatar(splat_object: Any) -> Avatar:
-    """The avatar of `show_avatar`, with unit rotations and without regions."""
+    """The avatar of `show_avatar`, with unit rotations; of regions, the unseen triangles that have
+    splats."""
     splat_modifier(splat_object)
     neutral = _stored_neutral(splat_object)
     if neutral is None:
         raise StgaError(f"{splat_object.name}: its neutral mesh is missing; show the avatar again")
+    splats = stored.read_splats(splat_object.data)
+    faces = mesh_triangles(neutral)
+    unseen = stored.read_unseen(splat_object.data)
+    regions = {}
+    if unseen is not None:
+        regions[UNSEEN_REGION] = np.isin(np.arange(len(faces)), splats.face[unseen])
     return Avatar(
-        splats=stored.read_splats(splat_object.data),
+        splats=splats,
         convention=splat_object[tags.CONVENTION],
         neutral=mesh_vertices(neutral),
-        faces=mesh_triangles(neutral),
+        faces=faces,
+        regions=regions,
         antialiased=bool(splat_object[tags.ANTIALIASED]),
         strain_range=stored.read_strain_range(neutral),
         driven_offsets=stored.read_driven_offsets(neutral),

@@ -95,9 +95,9 @@ def frame_block(frames: FaceFrames) -> np.ndarray:
 
 class PosedFrames(NamedTuple):
     """The triangles of all layers as a camera sees them. texels (5, F, 4) float32: three rows of
-    the map to camera space, color and whether frozen, `Relit.face_color`; the last only where there
-    is any. depth_rows (4, F) float32: the third row, less `base` meters, which far away would round
-    differences off."""
+    the map to camera space, color and 1 where frozen plus 2 where unseen, `Relit.face_color`; the
+    last only where there is any. depth_rows (4, F) float32: the third row, less `base` meters,
+    which far away would round differences off."""
 
     texels: np.ndarray
     depth_rows: np.ndarray
@@ -126,7 +126,8 @@ def posed_frames(
         texels[3, rows, : layer.frames.color.shape[1]] = layer.frames.color
         if layer.relit is not None:
             texels[4, rows, : layer.relit.face_color.shape[1]] = layer.relit.face_color
-        texels[3, rows, 3] = 0 if layer.frozen is None else layer.frozen
+        for value, faces in ((1, layer.frozen), (2, layer.unseen)):
+            texels[3, rows, 3] += 0 if faces is None else value * faces
         begin = rows.stop
     return PosedFrames(texels, depth_rows, base)
 
@@ -183,7 +184,11 @@ def table(static: StaticSplats, layers: Sequence[SceneLayer], view: View) -> np.
         # From directions in camera space to those of training: without scale and reflection.
         u, _, v = np.linalg.svd((camera.world_to_camera @ layer.to_world)[:3, :3])
         row[2:5, :3] = (u @ v).T
-        row[2:5, 3] = settings.percentage, settings.show_selection, settings.selected_only
+        row[2:5, 3] = (
+            settings.percentage,
+            2 * settings.selected_only or settings.show_selection,
+            2 * settings.filmed_only or settings.show_unseen,
+        )
     return texels
 
 

@@ -8,11 +8,12 @@ Textures of `packing.py`, each 2048 texels wide and read by texel index:
              percentage, layer
     colors   per splat: spherical harmonics
     frames   three rows of the triangles' maps to camera space (all triangles' first rows, then
-             second, …), then color and whether frozen, then color where the scene lights them
+             second, …), then color and 1 where frozen plus 2 where unseen, then color where the
+             scene lights them
     table    the view: focal lengths and principal point; width, height, number of clip planes; 6
              clip planes; per layer: first color, first splat, colors per splat, degree;
              antialiased, size, opacity threshold, 0; three rows of the matrix to directions,
-             with percentage, show selection, selected only
+             with percentage, how frozen and how unseen splats are shown (1: painted, 2: not)
 Where the scene lights splats, as `light.relight.Relighter` does:
     surface   per splat: recorded sRGB without what depends on the view, roughness; irradiance of
               the capture, occlusion; corners of its triangle; their weights
@@ -41,7 +42,7 @@ from ...light.shading import SHADING_DEFINES, SHADING_FUNCTIONS, SRGB_FUNCTIONS
 from ...raster.shader_constants import printed_constants
 from ...raster.splat_shader import SPLAT_DEFINES, SPLAT_FUNCTIONS
 from ..compat import allow_depth_write
-from ..layers import FROZEN_COLOR_SRGB
+from ..layers import FROZEN_COLOR_SRGB, UNSEEN_COLOR_SRGB
 from . import packing
 from .buffers import TEXTURE_WIDTH
 
@@ -58,6 +59,7 @@ _CONSTANTS |= {"WIDTH": TEXTURE_WIDTH, "BLOCK_SPLATS": BLOCK_SPLATS}
 _CONSTANTS |= {"CLIP_PLANES": packing.CLIP_PLANES}
 _DEFINES = f"""{printed_constants(_CONSTANTS, "glsl")}{SPLAT_DEFINES}
 #define FROZEN_COLOR vec3{FROZEN_COLOR_SRGB}
+#define UNSEEN_COLOR vec3{UNSEEN_COLOR_SRGB}
 #define TEXEL(image, k) texelFetch(image, ivec2((k) % WIDTH, (k) / WIDTH), 0)
 """
 RELIT_DEFINES = f"""
@@ -255,8 +257,9 @@ void main()
   vec4 turn0 = TEXEL(table, row + 2), turn1 = TEXEL(table, row + 3);
   vec4 turn2 = TEXEL(table, row + 4), face_color = TEXEL(frames, 3 * faces + face);
   float opacity = axis0.w;
-  bool frozen = face_color.w > 0.5;
-  if (opacity < display.z || axis1.w >= turn0.w || (frozen && turn2.w > 0.5)) {
+  int kinds = int(face_color.w + 0.5);
+  float frozen = (kinds & 1) != 0 ? turn1.w : 0.0, unseen = (kinds & 2) != 0 ? turn2.w : 0.0;
+  if (opacity < display.z || axis1.w >= turn0.w || max(frozen, unseen) > 1.5) {
     return;
   }
   vec4 r0 = TEXEL(frames, face), r1 = TEXEL(frames, faces + face);
@@ -291,8 +294,8 @@ void main()
   if (!(abs(color.r) + abs(color.g) + abs(color.b) < 1e30)) {
     return;
   }
-  if (frozen && turn1.w > 0.5) {
-    color = FROZEN_COLOR;
+  if (max(frozen, unseen) > 0.5) {
+    color = unseen > 0.5 ? UNSEEN_COLOR : FROZEN_COLOR;
   }
   /* A rectangle along the ellipse's axes, up to where alpha falls below MIN_ALPHA. */
   vec4 ellipse = ellipse_axes(covariance);

@@ -9,7 +9,7 @@ import numpy as np
 from mathutils import Matrix
 
 from ...avatar.embedding import WORLD, FaceFrames, placed, to_world
-from ...avatar.file import Avatar
+from ...avatar.file import UNSEEN_REGION, Avatar
 from ...avatar.splats import Splats, at_degree, joined
 from ...errors import StgaError
 from .. import compat, tags
@@ -168,6 +168,7 @@ def visible_layers(
                 antialiased=stored.antialiased,
                 settings=settings,
                 frozen=frozen,
+                unseen=stored.regions.get(UNSEEN_REGION),
                 relit=relit,
                 holdout=holdout,
             )
