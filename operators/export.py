@@ -16,7 +16,8 @@ from typing import Any
 import bpy
 import numpy as np
 
-from ..stga_addon.avatar.file import read_avatar
+from ..stga_addon.avatar.file import Avatar, read_avatar
+from ..stga_addon.avatar.filmed import filmed_avatar
 from ..stga_addon.avatar.splats import Splats
 from ..stga_addon.capture.camera import Camera, camera_from_gl
 from ..stga_addon.driving.head_map import page_controls
@@ -180,11 +181,12 @@ class ExportAvatar(SplatExport, bpy.types.Operator):
         *((name, format.label, format.description) for name, format in FORMATS.items()),
     )
     motion_only: options.field(Export, "motion_only")
+    filmed_only: options.field(Export, "filmed_only")
 
     def draw(self, context: Any) -> None:
         self.layout.use_property_split = True
-        shown = ("format", "avatar", *(("motion_only",) if FORMATS[self.format].has_rig else ()))
-        for name in shown:
+        rigged = ("motion_only",) if FORMATS[self.format].has_rig else ()
+        for name in ("format", "avatar", "filmed_only", *rigged):
             self.layout.prop(self, name)
         if FORMATS[self.format].source == "range":
             frames = scene_frames(context.scene)
@@ -192,7 +194,8 @@ class ExportAvatar(SplatExport, bpy.types.Operator):
             column.label(text=f"Frames {frames[0]} to {frames[-1]} of the scene", icon="TIME")
             try:
                 source = self._source(context)
-                size = _size(source, source.stat().st_mtime, self.format, len(frames))
+                known = source, source.stat().st_mtime, self.filmed_only
+                size = _size(*known, self.format, len(frames))
                 text = f"About {format_bytes(size)}"
             except (StgaError, OSError) as error:
                 text = str(error)
@@ -208,7 +211,8 @@ class ExportAvatar(SplatExport, bpy.types.Operator):
         format = FORMATS[self.format]
         frames = scene_frames(scene)
         fps = frames_per_second(scene)
-        avatar = read_avatar(self._source(context))
+        source = self._source(context)
+        avatar = _read(source, self.filmed_only)
         check_head(avatar, head)
         motion = None
         playback = Playback(fps=fps)
@@ -349,10 +353,15 @@ def _show_status(text: str | None) -> None:
         workspace.status_text_set(text)
 
 
+def _read(path: Path, filmed_only: bool) -> Avatar:
+    avatar = read_avatar(path)
+    return filmed_avatar(path, avatar) if filmed_only else avatar
+
+
 @lru_cache(maxsize=8)
-def _size(avatar: Path, modified: float, format: str, frames: int) -> int:
+def _size(path: Path, modified: float, filmed_only: bool, format: str, frames: int) -> int:
     """`Format.size` of an avatar file last modified at this time. Raises StgaError."""
-    return FORMATS[format].size(Content(read_avatar(avatar)), frames)
+    return FORMATS[format].size(Content(_read(path, filmed_only)), frames)
 
 
 # What of the scene plays in a web page

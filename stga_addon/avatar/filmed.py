@@ -1,8 +1,12 @@
-"""Which sides of a head were filmed."""
+"""Which sides of a head were filmed, and its avatar without the others."""
+
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 
 from ..capture.mesh_geometry import head_axes, triangle_normals
+from ..errors import StgaError
 from ..flame.quaternions import unit
 from .file import UNSEEN_REGION, Avatar
 
@@ -47,3 +51,18 @@ def filmed_sides(avatar: Avatar) -> str:
     right_deg, left_deg = (SEEN_TO_DEG if end is None else max(0, int(end)) for end in reach)
     reached = f"{right_deg}° on its right to {left_deg}° on its left"
     return f"filmed from {reached}; what is beyond is plausible"
+
+
+def filmed_avatar(path: Path, avatar: Avatar) -> Avatar:
+    """Without the splats on triangles that no camera saw. Raises StgaError naming `path` where the
+    avatar does not know them, or all are."""
+    unseen = avatar.regions.get(UNSEEN_REGION)
+    if unseen is None:
+        problem = "does not say what was filmed, as files of older versions; train it again"
+        raise StgaError(f"{path}: {problem}")
+    kept = ~unseen[avatar.splats.face]
+    if not kept.any():
+        raise StgaError(f"{path}: has no splat on a triangle that was filmed")
+    base = avatar.linear_base
+    base = None if base is None else base[kept]
+    return replace(avatar, splats=avatar.splats.rows(kept), linear_base=base)

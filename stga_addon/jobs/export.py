@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from ..avatar.file import Avatar
+from ..avatar.filmed import filmed_avatar
 from ..capture.camera import Camera
 from ..capture.model import Capture
 from ..driving.head_map import page_controls
@@ -79,6 +80,9 @@ class Export:
     albedo: bool = option(
         "leave out the capture's light: colors are the albedo (docs/light.md)", False
     )
+    filmed_only: bool = option(
+        "leave out the splats that no camera saw, which are plausible only", False
+    )
 
     def check(self) -> None:
         """Raise StgaError for another format's file name, and for what the format leaves out."""
@@ -103,6 +107,8 @@ class Export:
 def export(request: Export, report: Report, say: Say) -> Written:
     """Write the file or the folder. Says how much room several frames take; raises StgaError."""
     avatar, capture = avatar_source.open_avatar(request)
+    if request.filmed_only:
+        avatar = filmed_avatar(avatar_source.avatar_path(request.source), avatar)
     if request.albedo:
         avatar = albedo_avatar(avatar)
     if request.motion is not None:

@@ -15,7 +15,7 @@ from export.web.web_data import read_web_data
 from numpy.testing import assert_allclose, assert_array_equal
 
 from stga_addon.avatar.embedding import to_world
-from stga_addon.avatar.file import Avatar, write_avatar
+from stga_addon.avatar.file import Avatar, read_avatar, write_avatar
 from stga_addon.avatar.lattice import lattice_splats
 from stga_addon.capture.open import open_capture
 from stga_addon.export.formats import export_avatar
@@ -39,7 +39,7 @@ SET_BY_PANEL = {
     "extend": "directory take seconds device adapter",
     "apply_motion": "filter_glob",
     "show_avatar": "hide_head filter_glob",
-    "export_avatar": "format filter_glob check_existing motion_only",
+    "export_avatar": "format filter_glob check_existing motion_only filmed_only",
     "export_cameras": "selected_only filter_glob check_existing",
     "heat_map": "",
     "copy_report": "",
@@ -202,6 +202,15 @@ def test_exports(shown, tmp_path):
     assert_array_equal(read_ply(tmp_path / "one.ply").xyz, many)
     with pytest.raises(RuntimeError, match="not tracked with FLAME"):
         bpy.ops.stga.export_avatar(filepath=str(tmp_path / "pair"), format="gaussian-avatars")
+    one = {"filepath": str(tmp_path / "one.ply"), "format": "ply", "filmed_only": True}
+    with pytest.raises(RuntimeError, match="does not say what was filmed"):
+        bpy.ops.stga.export_avatar(**one)
+    unseen = np.arange(len(avatar.faces)) % 2 == 0
+    path = tmp_path / "avatar.npz"
+    write_avatar(path, replace(read_avatar(path), regions={"unseen": unseen}))
+    bpy.ops.stga.export_avatar(**one)
+    kept = expected.astype(np.float32)[~unseen[avatar.splats.face]]
+    assert_allclose(read_ply(tmp_path / "one.ply").xyz, kept, atol=1e-5)
     bpy.context.scene.frame_start = 1
     bpy.ops.stga.export_avatar(filepath=str(tmp_path / "a.glb"), format="web")
     header, arrays = read_web_data((tmp_path / "a.glb").read_bytes())

@@ -1,7 +1,9 @@
 """Commands of the command line, and their errors: one sentence, exit code 2."""
 
+import gzip
 import json
 import shutil
+import struct
 import subprocess
 import sys
 from dataclasses import replace
@@ -11,6 +13,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import trimesh
 from capture import factory
 from capture.factory import edit, write_avatar_of, write_flame_capture, write_mesh_capture
 from command_line import refused, stga
@@ -19,7 +22,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from PIL import Image
 
 from stga_addon.avatar.embedding import to_world
-from stga_addon.avatar.file import read_avatar
+from stga_addon.avatar.file import read_avatar, write_avatar
 from stga_addon.capture.open import open_capture
 from stga_addon.cli import commands
 from stga_addon.errors import StgaError
@@ -401,6 +404,44 @@ def test_frames_cameras_and_selection_of_a_capture(tmp_path):
     usd = pytest.importorskip("pxr.Usd", reason="the package usd-core is not installed")
     assert stga("export", avatar_file, "--format usd", words, tmp_path / "a.usdc") == 0
     assert usd.Stage.Open(str(tmp_path / "a.usdc")).GetTimeCodesPerSecond() == 60
+
+
+def test_what_no_camera_saw_is_left_out(tmp_path, capsys):
+    """Catches splats of unseen triangles in a file of any format, others lost or exchanged, also of
+    the colors for linear light, and an avatar without the mark that is exported as a whole."""
+    capture = open_capture(write_mesh_capture(tmp_path / "capture"))
+    path = write_avatar_of(capture, tmp_path / "anna.npz", order=2)
+    whole = read_avatar(path)
+    out = tmp_path / "a.ply"
+    message = refused(capsys, "export", path, "--format ply --filmed-only --out", out)
+    assert "anna.npz: does not say what was filmed" in message
+    assert not out.exists()
+    unseen = np.arange(len(whole.faces)) % 3 == 0
+    kept = ~unseen[whole.splats.face]
+    base = np.column_stack([whole.splats.sh[:, 0], whole.splats.opacity])
+    write_avatar(path, replace(whole, regions={"unseen": unseen}, linear_base=base))
+    count = int(kept.sum())
+
+    def written(format, name):
+        file = tmp_path / name
+        assert stga("export", path, "--format", format, "--filmed-only --out", file) == 0
+        return file
+
+    expected = to_world(whole.splats, whole.frames(whole.neutral)).rows(kept)
+    assert_array_equal(np.float32(trimesh.load(written("ply", "a.ply")).vertices), expected.xyz)
+    (cloud,) = trimesh.load(written("gltf", "a.glb")).geometry.values()
+    assert len(cloud.vertices) == count
+    spz = gzip.decompress(written("spz", "a.spz").read_bytes())
+    assert struct.unpack_from("<I", spz, 8) == (count,)
+    for format in ("web", "skinned-gltf"):
+        arrays = read_web_data(written(format, "b.glb").read_bytes())[1]
+        assert len(arrays["xyz"]) == count
+    usd = pytest.importorskip("pxr.Usd", reason="the package usd-core is not installed")
+    words = f"--format usd --filmed-only --capture {capture.root} --out"
+    assert stga("export", path, words, tmp_path / "a.usdc") == 0
+    stage = usd.Stage.Open(str(tmp_path / "a.usdc"))
+    positions = stage.GetPrimAtPath("/Avatar/Splats").GetAttribute("positions")
+    assert len(positions.Get(positions.GetTimeSamples()[0])) == count
 
 
 def test_what_is_left_of_flame_is_said(tmp_path, capsys):

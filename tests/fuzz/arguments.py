@@ -158,7 +158,7 @@ COMMANDS = {
         "@run tracked run/avatar.npz tracked/avatar.npz unfinished",
         [[(1, "--format", f), (1, "--out", f"@exported{SUFFIXES.get(f, '')}")] for f in FORMATS],
         (0.3, "--capture", "@mesh flame"), FLAME, (0.3, "--timestep", "1", *NUMBERS), FPS,
-        (0.2, "--frames", "0:1", "1:0", "7:9", *NUMBERS),
+        (0.2, "--frames", "0:1", "1:0", "7:9", *NUMBERS), (0.1, "--filmed-only"),
     ]),
     "drive": (1, [
         "@take.csv motion.npz flame", (1, "--out", "@new.csv new.npz"), (0.7, "--flame", MODEL),

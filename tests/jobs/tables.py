@@ -80,6 +80,7 @@ REQUESTS = (
         frames=(3, 12),
         fps=30.0,
         motion_only=True,
+        filmed_only=True,
     ),
     TimePresets(HEAD, principal_point="opencv", device="cpu"),
     Analyze(HEAD, effects={"jaw": "off"}, timed=True),
