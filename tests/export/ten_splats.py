@@ -2,7 +2,7 @@
 
     PYTHONPATH=tests:. python -m export.ten_splats
 
-writes the file beside the page and prints the rows of its table.
+writes the file and its splats beside the page.
 """
 
 from dataclasses import replace
@@ -19,6 +19,7 @@ from stga_addon.export.playback import Playback
 from stga_addon.export.skinned_gltf import skinned_glb
 
 FILE = Path(__file__).parents[2] / "docs" / "ten-splats.glb"
+PLACED = FILE.with_suffix(".csv")
 COUNT = 10
 FRAME = 1
 CAMERA = np.array([0.0, 0.0, 1.0])
@@ -70,15 +71,8 @@ def placed(data):
     return np.array(rows)
 
 
-def table(rows):
-    """Rows of the page's table."""
-    columns = (np.s_[:3], np.s_[3:7], np.s_[7:10], np.s_[10:])
-    return "\n".join(
-        "| " + " | ".join(" ".join(f"{value:.4f}" for value in row[at]) for at in columns) + " |"
-        for row in rows
-    )
-
-
 if __name__ == "__main__":
     FILE.write_bytes(ten_splats())
-    print(table(placed(FILE.read_bytes())))
+    names = PLACED.read_text(encoding="utf-8").splitlines()[0]
+    rows = placed(FILE.read_bytes())
+    np.savetxt(PLACED, rows, "%.4f", ",", header=names, comments="")

@@ -328,7 +328,7 @@ def table(runs: dict[str, list[list[Line]]]) -> list[str]:
 def differences(runs: dict[str, list[list[Line]]]) -> list[str]:
     """What each arm gains in the new take beside what it pays in the old one, and how long the
     continuation takes."""
-    found = gains_and_costs(runs) if "extend" in runs else []
+    found = list[str]()
     if {"extend", "anew"} <= set(runs):
         pairs = list(zip(runs["extend"], runs["anew"], strict=True))
         shares = [
@@ -344,32 +344,14 @@ def differences(runs: dict[str, list[list[Line]]]) -> list[str]:
     return found
 
 
-def gains_and_costs(runs: dict[str, list[list[Line]]]) -> list[str]:
-    """Markdown: change of PSNR in dB from the avatar before to the end of each arm, the new take
-    beside the old one."""
-    titles = {"take_2": "new take", "moving_take_2": "where it moves", "take_1": "old take"}
-    titles["moving_take_1"] = titles["moving_take_2"]
-    figures = [name for name in titles if f"psnr_{name}" in runs["extend"][0][-1]]
-    rows = [["over before", *(titles[name] for name in figures)], ["---"] * (1 + len(figures))]
-    for arm, of_seeds in runs.items():
-        # its first line is of the avatar before
-        pairs = list(zip(of_seeds, runs["extend"], strict=True))
-        changes = [
-            [lines[-1][f"psnr_{figure}"] - before[0][f"psnr_{figure}"] for lines, before in pairs]
-            for figure in figures
-        ]
-        rows.append([arm, *(spread(values, signed=True) for values in changes)])
-    return [*("| " + " | ".join(row) + " |" for row in rows), ""]
-
-
-def spread(values: list[float], digits: int = 2, signed: bool = False) -> str:
+def spread(values: list[float], digits: int = 2) -> str:
     """Mean ± standard deviation; empty without values, a dash where one of them is infinite."""
     if not values:
         return ""
     if not np.isfinite(values).all():
         return "–"
     deviation = f"±{np.std(values, ddof=1):.{digits}f}" if len(values) > 1 else ""
-    return f"{np.mean(values):{'+' if signed else ''}.{digits}f}{deviation}"
+    return f"{np.mean(values):.{digits}f}{deviation}"
 
 
 def time_to(lines: list[Line], quality: str, level: float) -> float:
