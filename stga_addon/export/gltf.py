@@ -3,7 +3,6 @@
 import json
 import math
 import struct
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -21,14 +20,56 @@ _JSON_CHUNK = b"JSON"
 _BINARY_CHUNK = b"BIN\0"
 # primitive mode; buffer target ARRAY_BUFFER
 _POINTS = 0
-_VERTICES = 34962
-_COMPONENTS = {
-    "float32": {"componentType": 5126},
-    "uint8": {"componentType": 5121, "normalized": True},
-}
-_TYPES = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
+VERTICES = 34962
+TYPES = {1: "SCALAR", 3: "VEC3", 4: "VEC4", 16: "MAT4"}
 DTYPES = {5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 """Component types of accessors."""
+COMPONENTS = {np.dtype(kind).name: number for number, kind in DTYPES.items()}
+
+
+class Accessors:
+    """Accessors and buffer views of a document, and the binary chunk that they describe."""
+
+    def __init__(self) -> None:
+        self.accessors = list[dict[str, Any]]()
+        self.views = list[dict[str, Any]]()
+        self.blocks = list[bytes]()
+        self._size = 0
+
+    @property
+    def binary(self) -> bytes:
+        """The chunk."""
+        return b"".join(self.blocks)
+
+    def add_view(self, data: bytes, **properties: Any) -> int:
+        """Index of a buffer view that holds the bytes."""
+        view = {"buffer": 0, "byteOffset": self._size, "byteLength": len(data)}
+        self.views.append(view | properties)
+        self.blocks.append(data + bytes(-len(data) % 4))
+        self._size += len(self.blocks[-1])
+        return len(self.views) - 1
+
+    def add(self, array: np.ndarray, target: int | None = None, **properties: Any) -> int:
+        """Index of an accessor of values (N,) or (N, 3, 4 or 16)."""
+        view = self.add_view(little_endian(array), **({"target": target} if target else {}))
+        return self.append({"bufferView": view} | accessor_of(array) | properties)
+
+    def append(self, accessor: dict[str, Any]) -> int:
+        """Index of an accessor."""
+        self.accessors.append(accessor)
+        return len(self.accessors) - 1
+
+
+def accessor_of(array: np.ndarray) -> dict[str, Any]:
+    """Type and number of an accessor's values."""
+    kind = TYPES[array.shape[1] if array.ndim > 1 else 1]
+    return {"componentType": COMPONENTS[array.dtype.name], "type": kind, "count": len(array)}
+
+
+def range_of(array: np.ndarray) -> dict[str, Any]:
+    """Least and largest values of an accessor."""
+    rows = array.reshape(len(array), -1)
+    return {"min": rows.min(axis=0).tolist(), "max": rows.max(axis=0).tolist()}
 
 
 def write_gltf(path: Path, world: Splats) -> None:
@@ -39,11 +80,12 @@ def write_gltf(path: Path, world: Splats) -> None:
     extension shows.
     Source: Khronos, KHR_gaussian_splatting.
     """
-    attributes = _attributes(world)
-    arrays = list(attributes.values())
-    accessors, views = _accessors(arrays)
-    # The first is the position.
-    accessors[0] |= {"min": world.xyz.min(axis=0).tolist(), "max": world.xyz.max(axis=0).tolist()}
+    accessors = Accessors()
+    more = {"POSITION": range_of(world.xyz), "COLOR_0": {"normalized": True}}
+    attributes = {
+        name: accessors.add(array, VERTICES, **more.get(name, {}))
+        for name, array in _attributes(world).items()
+    }
     splatting = {
         "kernel": "ellipse",
         "colorSpace": "srgb_rec709_display",
@@ -51,7 +93,7 @@ def write_gltf(path: Path, world: Splats) -> None:
         "sortingMethod": "cameraDistance",
     }
     primitive = {
-        "attributes": {name: index for index, name in enumerate(attributes)},
+        "attributes": attributes,
         "mode": _POINTS,
         "extensions": {EXTENSION: splatting},
     }
@@ -62,13 +104,12 @@ def write_gltf(path: Path, world: Splats) -> None:
         "scenes": [{"nodes": [0]}],
         "nodes": [{"mesh": 0, "name": "Avatar"}],
         "meshes": [{"primitives": [primitive]}],
-        "accessors": accessors,
-        "bufferViews": views,
-        "buffers": [{"byteLength": sum(array.nbytes for array in arrays)}],
+        "accessors": accessors.accessors,
+        "bufferViews": accessors.views,
+        "buffers": [{"byteLength": len(accessors.binary)}],
     }
-    binary = b"".join(little_endian(array) for array in arrays)
     with replacing(path) as partial:
-        partial.write_bytes(glb_bytes(document, binary))
+        partial.write_bytes(glb_bytes(document, accessors.binary))
 
 
 def _attributes(world: Splats) -> dict[str, np.ndarray]:
@@ -87,22 +128,6 @@ def _attributes(world: Splats) -> dict[str, np.ndarray]:
         name = f"{EXTENSION}:SH_DEGREE_{degree}_COEF_{k - degree**2}"
         attributes[name] = world.sh[:, k]
     return attributes
-
-
-def _accessors(arrays: Sequence[np.ndarray]) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
-    """Accessors of vertex attributes that lie in the buffer one after the other, and their buffer
-    views."""
-    accessors = list[dict[str, Any]]()
-    views = list[dict[str, Any]]()
-    offset = 0
-    for array in arrays:
-        kind = _TYPES[array.shape[1] if array.ndim > 1 else 1]
-        accessor = {"bufferView": len(views), "count": len(array)}
-        accessors.append(accessor | _COMPONENTS[array.dtype.name] | {"type": kind})
-        view = {"buffer": 0, "byteOffset": offset, "byteLength": array.nbytes}
-        views.append(view | {"target": _VERTICES})
-        offset += array.nbytes
-    return accessors, views
 
 
 def glb_bytes(document: dict[str, Any], binary: bytes) -> bytes:

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from ..flame.quaternions import continuous, from_axis_angle
-from .gltf import little_endian
+from .gltf import COMPONENTS, VERTICES, Accessors, accessor_of, little_endian, range_of
 from .rig import Rig
 
 QUANTIZATION = "KHR_mesh_quantization"
@@ -18,56 +18,8 @@ BASE_STEP_M = 2.0**-20
 """Of vertices at rest: so fine that no thin triangle becomes a line."""
 MAX_SHORT = 32767
 MAX_USHORT = 65535
-_TYPES = {1: "SCALAR", 3: "VEC3", 4: "VEC4", 16: "MAT4"}
-_COMPONENTS = {"uint8": 5121, "int16": 5122, "uint16": 5123, "uint32": 5125, "float32": 5126}
-_VERTICES = 34962
 _INDICES = 34963
 _SKIN_COLOR = [0.6, 0.42, 0.33, 1.0]
-
-
-class Accessors:
-    """Accessors and buffer views of a document, and the binary chunk that they describe."""
-
-    def __init__(self) -> None:
-        self.accessors = list[dict[str, Any]]()
-        self.views = list[dict[str, Any]]()
-        self.blocks = list[bytes]()
-        self._size = 0
-
-    @property
-    def binary(self) -> bytes:
-        """The chunk."""
-        return b"".join(self.blocks)
-
-    def add_view(self, data: bytes, **properties: Any) -> int:
-        """Index of a buffer view that holds the bytes."""
-        view = {"buffer": 0, "byteOffset": self._size, "byteLength": len(data)}
-        self.views.append(view | properties)
-        self.blocks.append(data + bytes(-len(data) % 4))
-        self._size += len(self.blocks[-1])
-        return len(self.views) - 1
-
-    def add(self, array: np.ndarray, target: int | None = None, **properties: Any) -> int:
-        """Index of an accessor of values (N,) or (N, 3, 4 or 16), with their range."""
-        view = self.add_view(little_endian(array), **({"target": target} if target else {}))
-        return self.append({"bufferView": view} | accessor_of(array) | properties)
-
-    def append(self, accessor: dict[str, Any]) -> int:
-        """Index of an accessor."""
-        self.accessors.append(accessor)
-        return len(self.accessors) - 1
-
-
-def accessor_of(array: np.ndarray) -> dict[str, Any]:
-    """Type, number and range of an accessor's values."""
-    rows = array.reshape(len(array), -1)
-    return {
-        "componentType": _COMPONENTS[array.dtype.name],
-        "type": _TYPES[rows.shape[1]],
-        "count": len(array),
-        "min": rows.min(axis=0).tolist(),
-        "max": rows.max(axis=0).tolist(),
-    }
 
 
 def skinned_mesh(
@@ -85,7 +37,7 @@ def skinned_mesh(
     base = rig.base / unit
     fine = 2.0 ** np.ceil(np.log2(unit / BASE_STEP_M))
     position = np.asarray(base if exact else np.rint(base * fine) / fine, np.float32)
-    attributes = {"POSITION": accessors.add(position, _VERTICES)}
+    attributes = {"POSITION": accessors.add(position, VERTICES, **range_of(position))}
     attributes |= _skin_attributes(rig.weights, accessors, exact)
     wide = len(rig.base) > MAX_USHORT
     indices = faces.ravel().astype(np.uint32 if wide else np.uint16)
@@ -142,10 +94,10 @@ def _skin_attributes(weights: np.ndarray, accessors: Accessors, exact: bool) -> 
     for number in range(sets):
         four = np.s_[:, 4 * number : 4 * number + 4]
         own = np.ascontiguousarray(joints[four].astype(kind))
-        attributes[f"JOINTS_{number}"] = accessors.add(own, _VERTICES)
+        attributes[f"JOINTS_{number}"] = accessors.add(own, VERTICES)
         normalized = {} if exact else {"normalized": True}
         own = np.ascontiguousarray(shares[four])
-        attributes[f"WEIGHTS_{number}"] = accessors.add(own, _VERTICES, **normalized)
+        attributes[f"WEIGHTS_{number}"] = accessors.add(own, VERTICES, **normalized)
     return attributes
 
 
@@ -168,9 +120,10 @@ def _targets(
     for shape, own, index_at, value_at in zip(
         values, places, index_offsets, value_offsets, strict=False
     ):
-        accessor = accessor_of(shape) | ({} if exact else {"normalized": True})
+        accessor = accessor_of(shape) | range_of(shape)
+        accessor |= {} if exact else {"normalized": True}
         if len(own):
-            kind = _COMPONENTS[own.dtype.name]
+            kind = COMPONENTS[own.dtype.name]
             accessor["sparse"] = {
                 "count": len(own),
                 "indices": {
@@ -205,7 +158,8 @@ def _bind(rig: Rig, unit: float, accessors: Accessors) -> int:
 def _animation(rig: Rig, fps: float, accessors: Accessors) -> dict[str, Any]:
     """The motion: rotations of the joints, translation of the root, weights of the shapes."""
     frames = len(rig.pose)
-    times = accessors.add((np.arange(frames) / fps).astype(np.float32))
+    seconds = (np.arange(frames) / fps).astype(np.float32)
+    times = accessors.add(seconds, **range_of(seconds))
     samplers = list[dict[str, Any]]()
     channels = list[dict[str, Any]]()
 
