@@ -129,6 +129,15 @@ class Avatar:
         return replace(self, splats=splats, linear_base=None)
 
     @property
+    def arrays(self) -> dict[str, np.ndarray]:
+        """Those of a file, by name, but for regions and light."""
+        optional = {"strain_range": self.strain_range, "linear_base": self.linear_base}
+        given = {name: array for name, array in optional.items() if array is not None}
+        own = {name: getattr(self.splats, name) for name in ARRAYS}
+        mesh = {"neutral": self.neutral, "faces": self.faces}
+        return {**own, **mesh, **given, **self.driven_offsets}
+
+    @property
     def follows_strain(self) -> bool:
         """Whether colors or positions depend on the deformation of the mesh."""
         return bool(self.driven_offsets)
@@ -192,14 +201,8 @@ def write_avatar(path: Path, avatar: Avatar) -> None:
     _check(path, avatar)
     header: dict[str, Any] = {"format": FORMAT, "version": VERSION}
     header |= {name: kind(getattr(avatar, name)) for name, kind in _HEADER.items()}
-    arrays = {name: getattr(avatar.splats, name) for name in ARRAYS}
     masks = np.array(list(avatar.regions.values()), bool).reshape(-1, len(avatar.faces))
-    arrays |= {"neutral": avatar.neutral, "faces": avatar.faces, "region_faces": masks}
-    if avatar.strain_range is not None:
-        arrays["strain_range"] = avatar.strain_range
-    if avatar.linear_base is not None:
-        arrays["linear_base"] = avatar.linear_base
-    arrays.update(avatar.driven_offsets)
+    arrays = avatar.arrays | {"region_faces": masks}
     if avatar.light is not None:
         # by vertex in half precision: 30 bytes a vertex
         rest = dict(vars(avatar.light))
@@ -274,13 +277,7 @@ def _read_header(path: Path, arrays: Mapping[str, np.ndarray]) -> dict[str, Any]
 def _check(path: Path, avatar: Avatar) -> None:
     """Raise StgaError where the parts of an avatar do not fit each other."""
     _check_shapes(path, avatar)
-    arrays = {name: getattr(avatar.splats, name) for name in ARRAYS}
-    arrays |= {"neutral": avatar.neutral, **avatar.driven_offsets}
-    if avatar.strain_range is not None:
-        arrays["strain_range"] = avatar.strain_range
-    if avatar.linear_base is not None:
-        arrays["linear_base"] = avatar.linear_base
-    for name, array in arrays.items():
+    for name, array in avatar.arrays.items():
         _check_finite(path, name, array)
     _check_index(path, "faces", avatar.faces, len(avatar.neutral), "vertices")
     _check_index(path, "face", avatar.splats.face, len(avatar.faces), "faces")
@@ -293,24 +290,23 @@ def _check_shapes(path: Path, avatar: Avatar) -> None:
         if getattr(avatar, name) not in known:
             found = shorten(getattr(avatar, name))
             raise StgaError(f"{path}: {name} is {found}, expected one of {', '.join(known)}")
-    _check_shape(path, "neutral", avatar.neutral, "float32", (-1, 3))
-    _check_shape(path, "faces", avatar.faces, "int32", (-1, 3))
     count = len(avatar.splats.xyz) if avatar.splats.xyz.ndim else 0
-    for name, kind in ARRAYS.items():
-        array = getattr(avatar.splats, name)
-        _check_shape(path, name, array, kind.dtype, (count, *kind.shape))
-        if kind.sizes and array.shape[1] not in kind.sizes:
-            found = f"{array.shape[1]} coefficients"
-            raise StgaError(f"{path}: {name} has {found}, expected one of {kind.sizes}")
-    faces = len(avatar.faces)
-    limits = avatar.strain_range
+    faces = len(avatar.faces) if avatar.faces.ndim else 0
+    kinds = {name: (kind.dtype, (count, *kind.shape)) for name, kind in ARRAYS.items()}
+    kinds |= dict.fromkeys(OFFSETS, ("float32", (faces, STRAIN_COMPONENTS, 3)))
+    kinds |= {
+        "neutral": ("float32", (-1, 3)),
+        "faces": ("int32", (-1, 3)),
+        "strain_range": ("float32", (faces, *TRAINED_RANGE.shape)),
+        "linear_base": ("float32", (count, 4)),
+    }
+    for name, array in avatar.arrays.items():
+        _check_shape(path, name, array, *kinds[name])
+    sizes = ARRAYS["sh"].sizes
+    if avatar.splats.sh.shape[1] not in sizes:
+        found = f"{avatar.splats.sh.shape[1]} coefficients"
+        raise StgaError(f"{path}: sh has {found}, expected one of {sizes}")
     color = avatar.background
-    if limits is not None:
-        _check_shape(path, "strain_range", limits, "float32", (faces, *TRAINED_RANGE.shape))
-    if avatar.linear_base is not None:
-        _check_shape(path, "linear_base", avatar.linear_base, "float32", (count, 4))
-    for name, coefficients in avatar.driven_offsets.items():
-        _check_shape(path, name, coefficients, "float32", (faces, STRAIN_COMPONENTS, 3))
     for name, mask in avatar.regions.items():
         _check_shape(path, f"region {name!r}", mask, "bool", (faces,))
     if len(color) != 3 or not all(isinstance(c, (int, float)) and 0 <= c <= 1 for c in color):
