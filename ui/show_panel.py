@@ -3,6 +3,7 @@ another one say so; render properties of the engine STGA Splats."""
 
 from contextlib import suppress
 from functools import partial
+from textwrap import wrap
 from typing import Any
 
 import bpy
@@ -25,7 +26,7 @@ from ..stga_addon.scene.light import MODE_CHANGED, lighting_settings, throws_sha
 from ..stga_addon.scene.render import viewport_display
 from ..stga_addon.scene.render.scene_splats import level_exposure, light_hint
 from ..stga_addon.scene.render.viewport_display import ENGINE
-from .sidebar import SidebarPanel, draw_running, draw_text
+from .sidebar import SidebarPanel, columns, draw_running, draw_text
 
 DISPLAY_INPUTS = (
     splat_nodes.SIZE,
@@ -37,6 +38,7 @@ DISPLAY_INPUTS = (
 )
 UNSEEN_INPUTS = (splat_nodes.SHOW_UNSEEN, splat_nodes.FILMED_ONLY)
 """Of avatars that know what was filmed."""
+POPUP_MARGIN_PX = 60
 _is_told = False
 """Whether the render job in progress has said what it does not show."""
 
@@ -198,8 +200,15 @@ def draw_left_out(layout: Any, context: Any) -> None:
 def _pop_up(hint: str) -> None:
     """Show the sentence in the window that was opened last: that of the image, where it has one."""
     manager = bpy.context.window_manager
-    with bpy.context.temp_override(window=manager.windows[-1]):
-        manager.popup_menu(lambda menu, _: menu.layout.label(text=hint), title="STGA", icon="ERROR")
+    window = manager.windows[-1]
+    lines = wrap(hint, columns(bpy.context, window.width - POPUP_MARGIN_PX))
+
+    def draw(menu: Any, _: Any) -> None:
+        for line in lines:
+            menu.layout.label(text=line)
+
+    with bpy.context.temp_override(window=window):
+        manager.popup_menu(draw, title="STGA", icon="ERROR")
 
 
 class RenderPanel(bpy.types.Panel):

@@ -48,15 +48,17 @@ class ClosedPanel(SidebarPanel):
 def draw_text(layout: Any, context: Any, text: str, icon: str = "NONE") -> None:
     """Draw the text as a label for each line, because Blender truncates; the icon at the first."""
     column = layout.column(align=True)
-    lines = textwrap.wrap(text, _columns(context) - (3 if icon != "NONE" else 0))
+    lines = textwrap.wrap(
+        text, columns(context, context.region.width) - (3 if icon != "NONE" else 0)
+    )
     for row, line in enumerate(lines):
         column.label(text=line, icon=icon if row == 0 or icon == "NONE" else "BLANK1")
 
 
-def _columns(context: Any) -> int:
-    """Number of letters that fit into a label of the panel's region."""
+def columns(context: Any, width_px: int) -> int:
+    """Number of letters that fit into a label of a panel, or menu, so wide."""
     letter_px = LETTER_WIDTH_PX * context.preferences.system.ui_scale
-    return max(20, int(context.region.width / letter_px) - 4)
+    return max(20, int(width_px / letter_px) - 4)
 
 
 def set_options(button: Any, settings: Any, options: type) -> None:
@@ -125,7 +127,7 @@ def draw_end(layout: Any, context: Any, state: RequestState) -> Any:
         row.operator("stga.dismiss", text="", icon="X", emboss=False).request = state.kind
     if now.state.failed:
         draw_text(box, context, now.status.error)
-        width = _columns(context)
+        width = columns(context, context.region.width)
         log = box.column(align=True)
         log.active = False
         for line in now.log_tail:

@@ -1,6 +1,7 @@
 """A newcomer's first hour: messages that can be read, a .blend file that knows its run."""
 
 import shutil
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -132,6 +133,25 @@ def test_what_the_small_edition_begins_with(extension, monkeypatch):
         said = " ".join(draw(extension, "next_step"))
         assert ("no demo" in said, "Open Demo Capture" in said) == (not has_demo, has_demo)
         assert ("first. " in said, "Choose a Python " in said) == (not has_python, not has_python)
+
+
+def test_what_an_image_leaves_out_is_said_in_a_small_window(extension, monkeypatch):
+    """Catches a sentence that the window of a small image cuts off."""
+    said = []
+    menu = SimpleNamespace(layout=SimpleNamespace(label=lambda text: said.append(text)))
+    manager = SimpleNamespace(
+        windows=[SimpleNamespace(width=320)], popup_menu=lambda draw, **_: draw(menu, None)
+    )
+    context = SimpleNamespace(
+        window_manager=manager,
+        temp_override=lambda **_: nullcontext(),
+        preferences=SimpleNamespace(system=SimpleNamespace(ui_scale=1.0)),
+    )
+    monkeypatch.setattr(extension.ui.show_panel, "bpy", SimpleNamespace(context=context))
+    hint = "STGA Splats leaves out meshes; EEVEE with Camera Quads shows all in one image"
+    extension.ui.show_panel._pop_up(hint)
+    assert " ".join(said) == hint
+    assert max(map(len, said)) * 7 < 320
 
 
 def test_exports_propose_the_name_of_the_head(extension, head, tmp_path):

@@ -114,8 +114,11 @@ def test_a_word_for_the_quality_and_more_training(extension, trained, tmp_path):
     assert "Quality: Usable" in texts
     assert not any("PSNR" in text for text in texts)
     assert {"Train", "Train 3 min More"} <= set(texts)
+    (trained / "run.json").write_text("{}")
     settings.show_figures = True
     assert "PSNR 27.00 dB" in draw(extension, "STGA_PT_train")
+    bpy.ops.stga.dismiss(request="training")
+    assert "Train 3 min More" in draw(extension, "STGA_PT_train")
     another = tmp_path / "another"
     settings.run_folder = str(another)
     settings.avatar = ""
