@@ -49,12 +49,13 @@ def buttons():
 
 
 def cut_texts():
-    """ "Panel: text" of each row that is wider than the sidebar -> its width, and the room."""
+    """ "Panel: text" of each row that is wider than the sidebar -> its width, and the room; none
+    where the sidebar is closed."""
     scale = bpy.context.preferences.system.ui_scale
     room = viewport("UI")[2].width / scale - PANEL_MARGIN
     return {
         f"{panel}: {row.text}": [round(row.width), round(room)]
         for panel, layout in drawn().items()
         for row in layout.items
-        if row.width > room
+        if row.width > room > 0
     }

@@ -41,6 +41,8 @@ class Layout:
     def text(self):
         return " ".join(leaf.text for leaf in self.leaves)
 
+    is_icon = False
+
     @property
     def cells(self):
         rows = [item.cells if item.kind == "row" else [item] for item in self.items]
@@ -50,8 +52,10 @@ class Layout:
     def width(self):
         """That the texts need."""
         widths = [item.width for item in self.items] or [0.0]
-        if self.kind == "row":  # whose items, also those of rows in it, are equally wide
-            return len(self.cells) * max(cell.width for cell in self.cells)
+        if self.kind == "row":  # whose items, also those of rows in it, are equally wide, but icons
+            wide = [cell.width for cell in self.cells if not cell.is_icon]
+            icons = [cell.width for cell in self.cells if cell.is_icon]
+            return len(wide) * max(wide, default=0.0) + sum(icons)
         if self.kind == "split":
             return widths[0] / self.options.get("factor", 0.5)
         return max(widths) * max(self.options.get("columns", 1), 1)
@@ -77,6 +81,7 @@ class Leaf:
                 self.text = field.name
                 self.is_number = field.type in ("INT", "FLOAT")
         self.text = options.get("text", self.text)
+        self.is_icon = kind == "operator" and not self.text
 
     @property
     def width(self):

@@ -1,8 +1,8 @@
 """Runs inside a Blender with a window, started by test_newcomer.py: the first two hours.
 
 `blender --python newcomer_script.py -- FOLDER [STEP...]`: reads FOLDER/flame.npz and
-FOLDER/own.npz, a head of FLAME, and FOLDER/demo, a capture; writes FOLDER/result.json with what was
-seen, and pictures.
+FOLDER/own.npz, a head of FLAME, FOLDER/demo, a capture, and FOLDER/anna.mp4, a video of a face;
+writes FOLDER/result.json with what was seen, and pictures.
 """
 
 import shutil
@@ -28,7 +28,11 @@ FOLDER = Path(ARGUMENTS[0])
 FIRST = FOLDER / "first.blend"
 NECK_ANGLE = 0.3
 MOUTH = 0.6
-MORE_MINUTES = 0.2
+MINUTES = 0.1
+MAX_MOUTH = 6.0
+FRONT = Quaternion((1.0, 0.0, 0.0), np.pi / 2)
+DISTANCE_M = 0.7
+"""How the viewport looks at a head."""
 PATIENCE_S = 1500.0
 """With one step, such as a training whose kernels are still to be compiled."""
 PORT = 21112
@@ -48,7 +52,9 @@ for name in ("pressed", "clicks", "messages", "undo", "cut", "texts", "images", 
 
 
 def shot(name):
+    """A picture of the window, and the texts in its panels that do not fit."""
     in_window.picture(FOLDER / f"{name}.png")
+    seen["cut"] |= {f"{name}, {what}": widths for what, widths in drawn_panels.cut_texts().items()}
 
 
 def click(name, action, /, *how, **options):
@@ -74,9 +80,20 @@ def click(name, action, /, *how, **options):
 
 
 def opened(file):
-    """Open it in the window as it is; seconds to wait."""
+    """Open it in the window as it is, with the head in front and the sidebar; what to wait for."""
     bpy.ops.wm.open_mainfile(filepath=str(file), load_ui=False)
-    return 0.3
+    space = viewport()[1].spaces.active
+    with in_viewport():  # without, Blender 5.2 crashes
+        space.show_region_ui = True
+    view = space.region_3d
+    view.view_perspective = "PERSP"
+    view.view_location = Vector()
+    view.view_rotation = FRONT
+    view.view_distance = DISTANCE_M
+    if extension not in bpy.context.preferences.addons:
+        return 0.3
+    open_sidebar = module("stga_addon.scene.avatar_scene").open_sidebar
+    return lambda: open_sidebar("STGA", [viewport()[0].screen])
 
 
 def show_only(root=""):
@@ -105,7 +122,6 @@ def panels_unfolded(state):
             shot(f"{state} {panel.bl_label}")
     show_only()
     yield 0.3
-    seen["cut"] |= {f"{state}, {what}": widths for what, widths in drawn_panels.cut_texts().items()}
     for name, layout in drawn_panels.drawn().items():
         leaves = [leaf for leaf in layout.leaves if leaf.kind != "label"]
         seen["texts"] |= {f"{name}: {leaf.text}": leaf.kind for leaf in leaves}
@@ -232,17 +248,17 @@ def training():
     return monitor.state_of(bpy.context.scene, kinds.TRAINING)
 
 
-def once(what, is_over):
+def once(what, is_over, kind=kinds.TRAINING):
     """What waits for the end of something in a training, and notes the clock in the panel."""
     begin = time.monotonic()
     noted = seen["time left"].setdefault(what, [])
 
     def wait():
-        status = training().snapshot.status
+        status = monitor.state_of(bpy.context.scene, kind).snapshot.status
         figures = dict(status.figures)
-        if not noted or noted[-1][1:3] != [status.message, figures.get("left_s")]:
-            now = round(time.monotonic() - begin, 1)
-            noted.append([now, status.message, figures.get("left_s"), status.progress])
+        told = [status.message, figures.get("left_s"), status.progress, "longer" in figures]
+        if not noted or noted[-1][1:] != told:
+            noted.append([round(time.monotonic() - begin, 1), *told])
         return is_over()
 
     return wait
@@ -250,7 +266,7 @@ def once(what, is_over):
 
 def train():
     begin = time.monotonic()
-    settings = {"directory": chosen().run_folder, "minutes": chosen().minutes}
+    settings = {"directory": chosen().run_folder, "minutes": MINUTES}
     click("Train", bpy.ops.stga.train, **settings)
     yield once("Train", lambda: chosen().splats is not None)
     seen["seconds"]["to the preview"] = round(time.monotonic() - begin, 2)
@@ -505,11 +521,27 @@ def drop():
 def train_more():
     yield opened(FIRST)
     before = training().snapshot.status.figures["iteration"]
-    options = {"directory": chosen().run_folder, "minutes": MORE_MINUTES, "more": True}
+    options = {"directory": chosen().run_folder, "minutes": MINUTES, "more": True}
     click("Train More", bpy.ops.stga.train, **options)
     yield once("Train More", lambda: chosen().result_shown and not training().is_running)
     seen["trained more"] = training().snapshot.status.figures["iteration"] - before
     shot("trained more")
+
+
+def occupied():
+    """Train where a run is, and cancel at once: the next folder is taken, and nothing replaced."""
+    yield opened(FIRST)
+    run = Path(chosen().run_folder)
+    avatar = chosen().avatar
+    click("Train again", bpy.ops.stga.train, directory=str(run), minutes=MINUTES)
+    seen["told"] = bpy.context.window_manager.stga_message
+    seen["next folder"] = Path(chosen().run_folder).name.removeprefix(run.name)
+    yield once("Train again", lambda: training().snapshot.status.figures.get("iteration", 0) > 1)
+    shot("occupied")
+    yield from stop_workers()
+    yield 1.0
+    seen["kept when cancelled"] = [chosen().avatar == avatar, len(shown())]
+    shot("cancelled")
 
 
 def shown():
@@ -526,11 +558,14 @@ def show_again():
     keys = chosen().head.data.shape_keys.key_blocks
     names = ("jawOpen", "identity_000")
     seen["ranges"] = {n: [keys[n].slider_min, keys[n].slider_max] for n in names if n in keys}
+    keys["jawOpen"].value = MAX_MOUTH  # as far as a drag goes
+    seen["dragged"] = keys["jawOpen"].value
+    yield 0.3
+    shot("dragged")
+    parts = (chosen().head, chosen().splats)
+    seen["locked"] = [all((*part.lock_location, *part.lock_rotation)) for part in parts]
     with in_viewport():
-        select_only(chosen().head.parent)
-        bpy.ops.view3d.view_selected()
         bpy.ops.object.select_all(action="DESELECT")
-    yield 0.5
     window, _, region = viewport()
     x = region.x + region.width // 2
     y = window.height - region.y - region.height // 2
@@ -544,6 +579,7 @@ def show_again():
 
 def second_head():
     """Import another head beside the first."""
+    yield opened(FIRST)
     scene = bpy.context.scene
     settings = lambda: [  # noqa: E731
         scene.frame_end,
@@ -562,17 +598,22 @@ def second_head():
     seen["beside"] = gap.length
     seen["names"] = [first.name, second.name]
     shot("second head")
+    folders = [chosen().run_folder]
     with in_viewport():
         select_only(first)
     yield lambda: chosen().head.parent == first
+    folders.append(chosen().run_folder)
+    seen["folders"] = len({*folders})
+    shot("first head again")
 
 
 def left_out():
     """A mesh and a blur that the engine leaves out, and the button that shows all."""
+    yield opened(FIRST)
     scene = bpy.context.scene
     engine = module("stga_addon.scene.render.engine").ENGINE
     with in_viewport():
-        bpy.ops.mesh.primitive_cube_add(size=0.1, location=(0.2, 0, 0))
+        bpy.ops.mesh.primitive_cube_add(size=0.06, location=(0.05, -0.15, 0))
     seen["shows all"] = []
     for scene.camera.data.dof.use_dof in (False, True):
         scene.render.engine = engine
@@ -584,6 +625,74 @@ def left_out():
         options = {option: value for option, value in options.items() if option == "with_engine"}
         click("Show All", getattr(bpy.ops.stga, name.split(".")[1]), **options)
         seen["shows all"].append(what in said and scene.render.engine != engine)
+    cube = bpy.context.view_layer.objects.active
+    scene.camera.data.dof.use_dof = False
+    settings = scene.render
+    settings.resolution_y = IMAGE_PX * settings.resolution_y // settings.resolution_x
+    settings.resolution_x = IMAGE_PX
+    scene.cycles.samples = SAMPLES
+    scene.cycles.use_denoising = False
+    pictures = []
+    for how, cube.hide_render in (("whole", False), ("without", True)):
+        path = FOLDER / f"F12 {how}.png"
+        bpy.ops.render.render()
+        bpy.data.images["Render Result"].save_render(str(path))
+        pictures.append(np.array(bpy.data.images.load(str(path)).pixels))
+    seen["mesh in the picture"] = float(np.abs(pictures[0] - pictures[1]).mean())
+    cube.hide_render = False
+    scene.render.engine = engine
+    bpy.context.preferences.view.render_display_type = "WINDOW"
+    with in_viewport():
+        bpy.ops.render.render("INVOKE_DEFAULT")
+    yield lambda: not bpy.app.is_job_running("RENDER")
+    yield 1.0
+    shot("F12 says what it leaves out")
+    subprocess.run(["xdotool", "key", "Escape"], check=True)
+    yield 0.5
+    subprocess.run(["xdotool", "key", "Escape"], check=True)
+
+
+def motion():
+    """What Apply Motion asks."""
+    yield opened(FIRST)
+    click("Apply Motion", bpy.ops.stga.apply_motion, "INVOKE_DEFAULT", True)
+    yield browser
+    yield 1.0  # for what is asked at its side
+    shot("Apply Motion")
+    window, area = browser()
+    with bpy.context.temp_override(window=window, area=area, region=area.regions[0]):
+        bpy.ops.file.cancel()
+    yield lambda: browser() is None
+    seen["asked by Apply Motion"] = len(module("operators.apply_motion").FIRST_OPTIONS)
+
+
+def without_addon():
+    """Open the file where the add-on is not there."""
+    bpy.ops.preferences.addon_disable(module=extension)
+    yield opened(FIRST)
+    things = [thing for thing in bpy.context.scene.objects if not thing.hide_get()]
+    pictures = []
+    for how in ("without the add-on", "nothing"):
+        in_window.picture(FOLDER / f"{how}.png")
+        pictures.append(np.array(bpy.data.images.load(str(FOLDER / f"{how}.png")).pixels))
+        for thing in things:
+            thing.hide_set(True)
+    seen["left without the add-on"] = float(np.abs(pictures[0] - pictures[1]).mean())
+    bpy.ops.preferences.addon_enable(module=extension)
+    yield opened(FIRST)
+
+
+def quick_look():
+    """A quick look at a video's avatar, until the head is there."""
+    bpy.ops.wm.read_homefile(app_template="")
+    yield 0.3
+    video = str(FOLDER / "anna.mp4")
+    click("Quick Look", bpy.ops.stga.avatar_from_video, filepath=video, quick=True)
+    yield once("Quick Look", lambda: chosen().head is not None, kinds.AVATAR)
+    yield 1.0
+    shot("quick look")
+    seen["quick look"] = chosen().head.parent.name
+    yield from stop_workers()
 
 
 def german():
@@ -597,7 +706,8 @@ def german():
 
 
 STEPS = """fresh open_demo misunderstand train pose live display pressed duplicate delete append
-render drop disable train_more show_again second_head left_out german"""
+render drop disable train_more occupied show_again second_head left_out motion without_addon german
+quick_look"""
 
 
 def steps():

@@ -9,10 +9,12 @@ import os
 import sys
 from pathlib import Path
 
+import kernels
 import numpy as np
 import pytest
 from blender.test_real_blender import blender, complete_zip, install
 from flame.small_head import small_head, write_flame
+from tracking.head_video import write_head_video
 
 from stga_addon.development.demo.capture import unpack_capture
 from stga_addon.development.package import build_zip
@@ -23,6 +25,8 @@ SCRIPT = Path(__file__).with_name("newcomer_script.py")
 MAX_MESSAGE = 90
 MAX_WORDS = 3
 MIN_POSES_PER_SECOND = 30
+VIDEO = (9, 512)
+"""Frames, and their size in pixels."""
 
 
 def test_the_first_two_hours(tmp_path):
@@ -35,12 +39,14 @@ def test_the_first_two_hours(tmp_path):
     try:
         archive = complete_zip(BLENDER, tmp_path / "dist", demo)
     except pytest.skip.Exception:
-        archive = build_zip(tmp_path / "dist", demo=demo)
+        compiled = kernels.bundle().rglob("*.nb[ci]")
+        archive = build_zip(tmp_path / "dist", demo=demo, kernels=sorted(compiled))
         variables["STGA_PYTHON"] = sys.executable
     home = tmp_path / "home"
     home.mkdir()
     write_flame(small_head(0), folder / "flame.npz")
     np.savez(folder / "own.npz", expr=np.zeros((3, small_head(0).n_expression)))
+    write_head_video(folder / "anna.mp4", *VIDEO)
     install(BLENDER, home, archive)
     blender(BLENDER, home, "--python", SCRIPT, "--", folder, background=False, **variables)
     seen = json.loads((folder / "result.json").read_text())
@@ -62,14 +68,22 @@ def test_the_first_two_hours(tmp_path):
         assert poses >= min(MIN_POSES_PER_SECOND, 0.9 * draws)
     assert np.all([np.min(found) > 0 for found in seen["images"].values()])
     for told in seen["time left"].values():
-        left = [left_s for _, _, left_s, _ in told if left_s is not None]
+        left = [left_s for _, _, left_s, *_ in told if left_s is not None]
         assert np.all(np.diff(left) <= 0.1 * np.array(left[:-1])), told
     assert seen["train panel"] == ["Quality", "More"]
     assert seen["trained more"] > 0
+    assert seen["next folder"]
+    assert "into" in seen["told"]
+    assert seen["kept when cancelled"] == [True, 1]
     assert seen["splat objects"] == 1
-    assert seen["ranges"]["jawOpen"] == [0.0, 1.0]
+    assert (seen["ranges"]["jawOpen"], seen["dragged"]) == ([0.0, 1.0], 1.0)
+    assert seen["locked"] == [True, True]
     assert seen["clicked"] == ["EMPTY"]
     assert seen["settings kept"]
     assert seen["beside"] > 0.1
-    assert "capture" not in " ".join(seen["names"]).lower()
+    assert "capture" not in " ".join([*seen["names"], seen["quick look"]]).lower()
+    assert seen["folders"] == 2
     assert seen["shows all"] == [True, True]
+    assert seen["mesh in the picture"] > 1e-3
+    assert seen["asked by Apply Motion"] == 4
+    assert seen["left without the add-on"] > 3e-4
