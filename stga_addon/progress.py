@@ -124,6 +124,12 @@ class Clock:
         return asked_s * max(1.0, (now - then) / fallen) if fallen > 0 else math.inf
 
 
+def after_silence(figures: Mapping[str, float], silent_s: float) -> Mapping[str, float]:
+    """The figures that were told so long ago, of which more is left than they say by now."""
+    patience_s = MIN_PACE_S + (MAX_OVERRUN_RATIO - 1) * figures.get("left_s", math.inf)
+    return {**figures, "longer": 1.0} if silent_s > patience_s else figures
+
+
 class Cancelled(Exception):
     """The work was asked to stop, and has nothing more to give."""
 

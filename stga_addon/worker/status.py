@@ -25,7 +25,7 @@ from typing import Any
 
 from ..errors import StgaError
 from ..files import RENAME_PATIENCE_S, file_size, naming, read_json, write_json, write_npz
-from ..progress import Clock, Progress
+from ..progress import Clock, Progress, after_silence
 from ..schema import from_json, setting
 from .lock import hold_folder, is_locked, lock_owner
 
@@ -117,6 +117,10 @@ def inspect_worker(folder: Path, process: subprocess.Popen[bytes] | None = None)
     else:
         state = WorkerState.STARTING if status is None else WorkerState.WORKING
     status = status or WorkerStatus()
+    if state.is_alive:
+        with suppress(OSError):
+            silent_s = time.time() - (folder / STATUS_FILE).stat().st_mtime
+            status = replace(status, figures=after_silence(status.figures, silent_s))
     if state == WorkerState.LOST:
         error = _why_lost(folder, code)
         status = replace(status, state=WorkerState.LOST, message="", detail="", error=error)

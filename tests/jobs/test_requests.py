@@ -1,9 +1,11 @@
 """Requests: what is written down, what is refused, and what a worker does."""
 
 import math
+import os
 import re
 import subprocess
 import sys
+import time
 from collections.abc import Mapping
 from dataclasses import fields, replace
 from pathlib import Path
@@ -230,6 +232,17 @@ def test_what_has_not_come_true_is_not_said_again():
     series = ((0.0, 20.0), (20.0, 19.9), (90.0, 19.8))
     said = [sentence for _, sentence in as_told(series)]
     assert said == ["About 20 s left", "More than 20 s left", "More than 20 s left"]
+
+
+def test_who_is_silent_takes_longer(tmp_path):
+    """Catches "About 28 s left" for as long as a worker compiles and says nothing."""
+    with status_writer(tmp_path) as writer:
+        writer.report(Progress(stage="Analyzing", figures=lambda: {"left_s": 28.0}))
+        for silent_s, expected in ((5.0, "About"), (20.0, "More than")):
+            told = time.time() - silent_s
+            os.utime(tmp_path / STATUS_FILE, (told, told))
+            sentence = describe_left(inspect_worker(tmp_path).status.figures)
+            assert sentence == f"{expected} 28 s left"
 
 
 def test_what_follows_training_is_told_ahead(tmp_path, monkeypatch):

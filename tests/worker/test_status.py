@@ -92,7 +92,7 @@ def test_worker_is_cancelled(start):
     snapshot = inspect_worker(folder)
     assert snapshot.state == WorkerState.WORKING
     assert (snapshot.status.message, snapshot.status.detail) == ("counting", "on time")
-    assert list(snapshot.status.figures) == ["n"]
+    assert snapshot.status.figures["n"] > 0
     if os.name != "nt":
         nicer = min(os.getpriority(os.PRIO_PROCESS, 0) + 5, 19)
         assert os.getpriority(os.PRIO_PROCESS, process.pid) == nicer
