@@ -137,12 +137,13 @@ def fit_dense(
     chosen = evenly_spread(timesteps, TEXTURE_TIMESTEPS)
     head = DenseHead(fit.head, take)
     total = 2 * len(chosen) + len(timesteps)
+    alone = all(len(own.cameras) == 1 for own in take.landmarks.values())
+    stage = Stage.REFINEMENT if settled else Stage.ONLY_DENSE if alone else Stage.DENSE
 
     def in_parts(
         work: Callable[..., Any], parts: Sequence[tuple], before: int, keep: bool = False
     ) -> list:
         every = [(*excerpt(fit, take, part), *arguments) for part, *arguments in parts]
-        stage = Stage.REFINEMENT if settled else Stage.DENSE
         return crew.map(work, every, (stage, before, total), keep)
 
     weights = head.rest([fit.parameters[t] for t in chosen])

@@ -144,13 +144,13 @@ def find_matte(image: np.ndarray, probability: np.ndarray, head: np.ndarray) -> 
     if not (len(unknown[0]) and inside.any() and outside.any()):
         return matte
     places = np.stack([own + side.start for own, side in zip(unknown, near, strict=True)], axis=1)
-    both = []
+    means = []
     for known, beyond in ((outside, 1), (inside, 0)):
-        whole = np.full(person.shape, beyond, np.uint8)
-        whole[near] = known
-        both.append(_mean_around(cv2, image, whole, size, places))
-    backdrop = both[0]
-    towards = both[1] - backdrop
+        everywhere = np.full(person.shape, beyond, np.uint8)
+        everywhere[near] = known
+        means.append(_mean_around(cv2, image, everywhere, size, places))
+    (backdrop, color) = means
+    towards = color - backdrop
     contrast = (towards**2).sum(axis=1)
     colors = image[near][unknown]
     share = ((colors - backdrop) * towards).sum(axis=1) / np.maximum(contrast, 1e-3)

@@ -33,6 +33,8 @@ class Stage(Enum):
     HEADS = ("Heads", 0.99, 1.0)
     AVATAR = ("Avatar", 1.0, 2.0)
     """Of a known person, whose avatar is posed in the capture."""
+    ONLY_DENSE = ("Dense tracking", 0.12, 0.51)
+    """Where one camera does not see the surface, so that there is nothing to refine."""
     CORRECTION = ("Solve", 0.0, 0.9)
     """Of a capture, around heads that were posed by hand."""
 

@@ -10,7 +10,6 @@ torso is shifted as well; and its cloth bends, where that explains more.
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import pairwise
 
 import numpy as np
 
@@ -193,27 +192,35 @@ class _Follower:
 
     def follow(self, way: Sequence[int], step: Step) -> torso_take.Rows:
         """Poses at the timesteps of a way, which begins with the one whose points are followed."""
-        poses = [self._first]
-        shot = self._take.shot(way[0])
-        for before, timestep in pairwise(way):
-            now = self._take.shot(timestep)
-            pose = poses[-1]
-            starts = [pose, self._by_flow(now, shot, pose)]
-            if self._shifts:  # where it was in the world
-                moved = self._take.pivot(before) - self._take.pivot(timestep)
-                starts.append(TorsoPose(pose.turn, pose.shift + moved))
-            starts = [self._descended(now, start, pose, COARSE_STEPS) for start in starts]
-            misfits = []
-            for start in starts:
-                at = self._posed(timestep, start)
-                share, shown = self.seen.unexplained(now, at, START_LEVEL)
-                use = shown & self.seen.fitted
-                misfits.append(float(share[use].mean()) if use.any() else 1.0)
-            best = starts[int(np.argmin(misfits))]
-            poses.append(self._descended(now, best, pose, FINE_STEPS))
-            shot = now
-            step()
+        first = self._first.points() + self._pivot(way[0])
+        states = torso_take.states_along(self._take, way, first, self._next, step)
+        at = zip(way, states, strict=True)
+        poses = [TorsoPose.of_points(own - self._pivot(timestep)) for timestep, own in at]
         return {name: np.stack([getattr(own, name) for own in poses]) for name in ("turn", "shift")}
+
+    def _next(
+        self, before: torso_take.TorsoShot, now: torso_take.TorsoShot, state: np.ndarray
+    ) -> np.ndarray:
+        """The pose's points (4, 3) at a timestep from those at one before it; in the world, where
+        they move evenly while the head does not, of a torso that is shifted."""
+        pose = TorsoPose.of_points(state - self._pivot(before.timestep))
+        starts = [pose, self._by_flow(now, before, pose)]
+        if self._shifts:  # where it was in the world
+            moved = self._pivot(before.timestep) - self._pivot(now.timestep)
+            starts.append(TorsoPose(pose.turn, pose.shift + moved))
+        starts = [self._descended(now, start, pose, COARSE_STEPS) for start in starts]
+        misfits = []
+        for start in starts:
+            at = self._posed(now.timestep, start)
+            share, shown = self.seen.unexplained(now, at, START_LEVEL)
+            use = shown & self.seen.fitted
+            misfits.append(float(share[use].mean()) if use.any() else 1.0)
+        best = starts[int(np.argmin(misfits))]
+        found = self._descended(now, best, pose, FINE_STEPS)
+        return found.points() + self._pivot(now.timestep)
+
+    def _pivot(self, timestep: int) -> np.ndarray:
+        return self._take.pivot(timestep) if self._shifts else np.zeros(3)
 
     def _descended(
         self, shot: torso_take.TorsoShot, pose: TorsoPose, usual: TorsoPose, plan: Plan

@@ -24,20 +24,20 @@ from .appearance import NOISE_LEVELS, box_of, inside, sampled
 from .fit import posed_mesh
 from .folder import TorsoPoints
 from .posed_points import head_rotation
-from .torso_take import HELD_OUT, BothWays, Motion, Rows, TorsoShot, TorsoTake
+from .torso_take import HELD_OUT, BothWays, Motion, Rows, TorsoShot, TorsoTake, states_along
 
 BLOCK_PX = 12  # Of blocks of pixels; one in HELD_OUT is not fitted, and tells whether to bend
 ROUGHNESS_M = 0.0005
 BEND_SIGMA_M = 0.02
 """Standard deviations of a vertex from the mean of its neighbors, and from the rigid torso."""
 FLOW_SIGMA_PX = 0.5
-FLOW_SHARE = 0.15
+FLOW_SHARE = 0.3
 """Of optical flow, and the share of the pixels that count as independent of each other."""
 FLOW_OUTLIER_PX = 4.0
 CHANGE_OUTLIER_LEVELS = 5 * NOISE_LEVELS
 """Distance, and difference of what flow matches, beyond which flow is wrong."""
 FLOW_MARGIN_PX = 32  # Around the sheet in the images of optical flow
-PIXEL_STEP = 3  # One of so many pixels is fitted
+PIXEL_STEP = 6  # One of so many pixels is fitted
 MIN_GAIN = 0.05  # Share by which the misfit has to fall for the torso to bend
 STEPS = 4  # Gauss–Newton steps for each timestep
 HELD = 1e10  # Precision that holds a vertex
@@ -244,7 +244,7 @@ class _Cloth:
             corners = np.searchsorted(sheet.vertices, model.faces[triangle[rows, columns]])
             weights = barycentric[rows, columns]
             at = np.einsum("pk,pki->pi", weights, mesh[sheet.vertices][corners])
-            visible = self._visible(shot, number, at)
+            visible = self._visible(shot, number, *view.levels[0].camera.project(at))
             shown[rows, columns] = visible
             fitted = (rows // BLOCK_PX + columns // BLOCK_PX) % HELD_OUT != 0
             chosen = corners[visible], weights[visible], fitted[visible]
@@ -254,15 +254,14 @@ class _Cloth:
 
     def follow(self, way: Sequence[int], step: Step) -> Rows:
         """Offsets at the timesteps of a way, which begins with the first one, where they are 0."""
-        bends = [np.zeros_like(self._drape)]
-        for timestep in way[1:]:
-            shot = self._take.shot(timestep)
-            bend = bends[-1]
-            for _ in range(STEPS):
-                bend = self._moved(shot, bend)
-            bends.append(bend)
-            step()
-        return {"bend": np.stack(bends)}
+
+        def bent(_: TorsoShot, now: TorsoShot, bend: np.ndarray) -> np.ndarray:
+            for _step in range(STEPS):
+                bend = self._moved(now, bend)
+            return bend
+
+        first = np.zeros_like(self._drape)
+        return {"bend": states_along(self._take, way, first, bent, step)}
 
     def misfit(self, bends: Mapping[int, np.ndarray], timesteps: Sequence[int]) -> list[float]:
         """Share, 0 to 1, of pixels that were not fitted that is not explained: rigid, and bent."""
@@ -301,23 +300,30 @@ class _Cloth:
         return rigid + drawn @ head_rotation(torso.parameters).T
 
     @staticmethod
-    def _visible(shot: TorsoShot, number: int, at: np.ndarray) -> np.ndarray:
-        """(P,) bool: points that lie in the mask and are not hidden by the head."""
-        view = shot.views[number]
-        share = sampled([shot.masks[number].astype(np.float32)], view.camera.project(at)[0])[0]
-        finest = view.levels[0].camera
-        within = inside(finest, *finest.project(at)) & (share > 127)
-        return shot.shows(number, at) & within
+    def _visible(shot: TorsoShot, number: int, pixels: np.ndarray, depth: np.ndarray) -> np.ndarray:
+        """(P,) bool: points that lie in the mask and are not hidden by the head; pixels (P, 2) of
+        the finest image, which project one of another size alike."""
+        finest = shot.views[number].levels[0].camera
+        size = np.array([finest.width, finest.height])
+        mask = shot.masks[number]
+        head = shot.heads[number]
+        share = sampled([mask], pixels * (mask.shape[::-1] / size))[0]
+        x, y = (
+            np.clip(pixels * (head.shape[::-1] / size), 0, np.array(head.shape[::-1]) - 1)
+            .astype(int)
+            .T
+        )
+        return inside(finest, pixels, depth) & (share > 127) & ~head[y, x]
 
     def _returned(self, shot: TorsoShot, number: int, bend: np.ndarray) -> _Returned:
         reference = self._references[number]
         corners = self._positions(shot.timestep, bend)[reference.corners]
         at = np.einsum("pk,pki->pi", reference.barycentric, corners)
-        source, _ = shot.views[number].levels[0].camera.project(at)
+        source, depth = shot.views[number].levels[0].camera.project(at)
         returned = reference.luma.copy()
         values = sampled([shot.views[number].levels[0].luma.astype(np.float32)], source)[0]
         returned[reference.pixels] = values.astype(np.uint8)
-        return _Returned(returned, at, source, self._visible(shot, number, at))
+        return _Returned(returned, at, source, self._visible(shot, number, source, depth))
 
     def _moved(self, shot: TorsoShot, bend: np.ndarray) -> np.ndarray:
         """The offsets after a Gauss–Newton step."""

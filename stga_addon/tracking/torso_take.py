@@ -15,6 +15,7 @@ from ..capture.model import evenly_spread
 from ..flame.forward import RIGID_SIZE, axis_angle_matrices, world_turns
 from ..flame.model import JOINTS, MIN_TORSO_WEIGHT, torso_faces
 from ..flame.quaternions import from_matrices, to_axis_angle, unit
+from ..worker.helpers import Step
 from . import appearance
 from .appearance import NOISE_LEVELS, PyramidView, inside, sampled, unexplained
 from .fit import HeadFit, posed_mesh
@@ -41,6 +42,10 @@ DEPTH_TIMESTEPS = 8
 NEIGHBORS = 25
 UNSEEN_COST = 0.5
 """Timesteps at which depths are compared; points that count for each other; cost unseen."""
+REACH_M = 0.2
+MAX_UNEVENNESS_M = 0.001
+"""Of the torso from its joint; by which positions may miss the mean of those at the timesteps
+beside: what is followed scatters by as much, and means explain held-out points as well."""
 ALONG_CAMERAS = appearance.CHANNEL_WEIGHTS * [0, 1, 1]
 """Weights of channels between cameras, from which surfaces are not equally bright."""
 
@@ -64,6 +69,14 @@ class TorsoPose:
 
     turn: np.ndarray
     shift: np.ndarray
+
+    def points(self) -> np.ndarray:
+        """(4, 3) meters: where three points around the joint, and the joint, are brought."""
+        return np.concatenate([REACH_M * self.turn.T, np.zeros((1, 3))]) + self.shift
+
+    @classmethod
+    def of_points(cls, points: np.ndarray) -> "TorsoPose":
+        return cls((points[:3] - points[3]).T / REACH_M, points[3])
 
 
 @dataclass(frozen=True)
@@ -188,7 +201,7 @@ def masked(image: np.ndarray, mask: np.ndarray) -> np.ndarray:
     import cv2
 
     found = np.full_like(image, PLAIN_LEVEL)
-    cv2.copyTo(image, cv2.compare(mask, 255, cv2.CMP_EQ), found)
+    cv2.copyTo(image, cv2.inRange(mask, 255, 255), found)
     edge = np.nonzero(cv2.inRange(mask, 1, 254))
     share = mask[edge][:, None].astype(np.float32) / 255
     found[edge] = image[edge] * share + PLAIN_LEVEL * (1 - share) + 0.5
@@ -217,6 +230,54 @@ class BothWays:
             for row, t in enumerate(way):
                 results[number // 2][t] = {name: array[row] for name, array in own.items()}
         return [dict(sorted(own.items())) for own in results]
+
+
+def states_along(
+    take: TorsoTake,
+    way: Sequence[int],
+    first: np.ndarray,
+    solve: Callable[[TorsoShot, TorsoShot, np.ndarray], np.ndarray],
+    step: Step,
+) -> np.ndarray:
+    """(T, N, 3) positions in meters at each timestep of a way, which begins with `first` (N, 3).
+
+    solve: of a timestep and a later one, and the positions at the first, those at the second. Every
+    second one of consecutive timesteps is not solved where the motion is even: it is the mean of
+    its neighbors.
+    """
+    number = {timestep: number for number, timestep in enumerate(sorted(take.parameters))}
+    states = [first]
+    before = first
+    shot = take.shot(way[0])
+    is_even = False
+    for row in range(0, len(way) - 1, 2):
+        start = states[-1]
+        (*middle, end) = way[row + 1 : row + 3]
+        now = take.shot(end)
+        if is_even and middle and abs(number[end] - number[way[row]]) == 2:
+            found = solve(shot, now, start)
+            # by how much smooth motion misses the mean of two states
+            is_even = _distance(2 * start - before, found) / 8 <= MAX_UNEVENNESS_M
+            states += [(start + found) / 2, found] if is_even else []
+        else:
+            is_even = False
+        if not is_even:
+            for timestep in middle:
+                between = take.shot(timestep)
+                states.append(solve(shot, between, start))
+                shot = between
+            states.append(solve(shot, now, states[-1]))
+            is_even = _distance((start + states[-1]) / 2, states[-2]) <= MAX_UNEVENNESS_M
+        before = start
+        shot = now
+        for _ in (*middle, end):
+            step()
+    return np.stack(states)
+
+
+def _distance(start: np.ndarray, end: np.ndarray) -> float:
+    """Of positions (N, 3) from others; but for what is hardly seen, which is anywhere."""
+    return float(np.quantile(np.linalg.norm(end - start, axis=-1), 0.75))
 
 
 def with_root(parameters: np.ndarray, rotation: np.ndarray, arm: np.ndarray) -> np.ndarray:

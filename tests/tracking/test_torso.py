@@ -48,6 +48,7 @@ from stga_addon.tracking.surface import with_offset
 from stga_addon.tracking.torso import _followed, follow_torso
 from stga_addon.tracking.torso_cloth import Bending, draped, found_bending, torso_sheet
 from stga_addon.tracking.torso_take import (
+    MAX_UNEVENNESS_M,
     NECK,
     ROOT,
     BothWays,
@@ -55,6 +56,7 @@ from stga_addon.tracking.torso_take import (
     PosedTorso,
     TorsoPose,
     TorsoTake,
+    states_along,
     with_root,
 )
 from stga_addon.tracking.track import track
@@ -296,6 +298,33 @@ def test_without_masks_the_torso_is_not_told_from_the_wall(head):
     followed = follow(fit, parameters, footage)
     assert followed.motion is None
     assert_unchanged(followed, parameters)
+
+
+@pytest.mark.parametrize("gap", [1, 2])
+def test_what_lies_between_is_solved_where_the_motion_is_uneven(gap):
+    """Catches a torso that lags where it begins to move, jerks or stops between two timesteps that
+    are followed; and a take of which every timestep is followed, or one whose gaps are taken for
+    motion between neighbors."""
+    speed = np.repeat([0.0, 0.03, -0.02, 0.0], (7, 8, 9, 20))
+    true = np.cumsum(speed)[:, None] * [1.0, 0.5]
+    timesteps = range(0, gap * len(true), gap)
+
+    class Take:
+        parameters = dict.fromkeys(range(gap * len(true)))
+        shot = staticmethod(lambda timestep: timestep)
+
+    solved = []
+    steps = []
+
+    def solve(before, now, state):
+        assert_allclose(state, true[before // gap])
+        solved.append(now)
+        return true[now // gap]
+
+    found = states_along(Take, timesteps, true[0], solve, lambda: steps.append(None))
+    assert_allclose(found, true, atol=4 * MAX_UNEVENNESS_M)
+    assert len(steps) == len(true) - 1
+    assert len(solved) < 0.75 * len(steps) if gap == 1 else len(solved) == len(steps)
 
 
 def test_turning_the_root_leaves_the_head_in_its_place(head):
