@@ -19,22 +19,23 @@ class Stage(Enum):
     """
 
     OPENING = ("Opening the footage", 0.0, 0.0)
-    HEAD_MODEL = ("Head model", 0.0, 0.01)
-    LANDMARKS = ("Landmarks", 0.01, 0.06)
-    FOCAL_LENGTH = ("Focal length", 0.06, 0.07)
-    FIT = ("Fit", 0.07, 0.12)
-    DENSE = ("Dense tracking", 0.12, 0.3)
-    SURFACE = ("Surface", 0.3, 0.34)
-    REFINEMENT = ("Refinement", 0.34, 0.51)
-    MATTES = ("Mattes", 0.51, 0.64)
-    TORSO = ("Torso", 0.64, 0.97)
-    CONTACT_SHEET = ("Contact sheet", 0.97, 0.985)
-    IMAGES = ("Images", 0.985, 0.99)
-    HEADS = ("Heads", 0.99, 1.0)
+    HEAD_MODEL = ("Head model", 0.0, 0.02)
+    LANDMARKS = ("Landmarks", 0.02, 0.1)
+    FOCAL_LENGTH = ("Focal length", 0.1, 0.105)
+    FIT = ("Fit", 0.105, 0.19)
+    DENSE = ("Dense tracking", 0.19, 0.29)
+    SURFACE = ("Surface", 0.29, 0.31)
+    REFINEMENT = ("Refinement", 0.31, 0.41)
+    ONLY_DENSE = ("Dense tracking", 0.19, 0.41)
+    """Where one camera does not see the surface, so that there is nothing to refine."""
+    MATTES = ("Mattes", 0.41, 0.48)
+    TORSO = ("Torso", 0.48, 0.7)
+    CLOTH = ("Cloth", 0.7, 0.96)
+    CONTACT_SHEET = ("Contact sheet", 0.96, 0.975)
+    IMAGES = ("Images", 0.975, 0.98)
+    HEADS = ("Heads", 0.98, 1.0)
     AVATAR = ("Avatar", 1.0, 2.0)
     """Of a known person, whose avatar is posed in the capture."""
-    ONLY_DENSE = ("Dense tracking", 0.12, 0.51)
-    """Where one camera does not see the surface, so that there is nothing to refine."""
     CORRECTION = ("Solve", 0.0, 0.9)
     """Of a capture, around heads that were posed by hand."""
 

@@ -22,7 +22,7 @@ from .appearance import NOISE_LEVELS, flow_weights, point_weights, projection_de
 from .fit import HeadFit, posed_mesh
 from .folder import TorsoMotion, TorsoPoints
 from .footage.model import Footage
-from .stages import Crew
+from .stages import Crew, Stage
 from .surface import with_offset
 from .torso_cloth import Bending, found_bending
 from .torso_take import NECK, Motion, PosedTorso, TorsoPose, TorsoTake, axis_angle, head_turn
@@ -106,7 +106,7 @@ def follow_torso(
     seen = torso_take.seen_points(take, middle)
     if sum(map(len, seen.rows.values())) < MIN_POINTS:
         return FollowedTorso(fit, unchanged)
-    walk = torso_take.BothWays(crew, len(some) + 3 * len(unchanged))
+    walk = torso_take.BothWays(crew, Stage.TORSO, len(some) + 2 * len(unchanged))
     motions = _motions(take, seen, some, walk)
     deep = torso_take.at_depth(take, seen, motions)
     found = torso_take.compared(take, deep, motions, some)
@@ -122,6 +122,7 @@ def follow_torso(
     points = TorsoPoints(middle, deep[name].at)
     bending = None
     if bends and name == "shifted":
+        walk = torso_take.BothWays(crew, Stage.CLOTH, len(unchanged))
         bending = found_bending(take, motions[name], points, some, walk)
     return replace(_followed(fit, take, motions[name], bending, decided), points=points)
 

@@ -32,7 +32,7 @@ BEND_SIGMA_M = 0.02
 """Standard deviations of a vertex from the mean of its neighbors, and from the rigid torso."""
 FLOW_SIGMA_PX = 0.5
 FLOW_SHARE = 0.3
-"""Of optical flow, and the share of the pixels that count as independent of each other."""
+"""Of optical flow, and the share of the fitted pixels that are independent of each other."""
 FLOW_OUTLIER_PX = 4.0
 CHANGE_OUTLIER_LEVELS = 5 * NOISE_LEVELS
 """Distance, and difference of what flow matches, beyond which flow is wrong."""

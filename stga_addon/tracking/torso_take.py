@@ -211,8 +211,9 @@ def masked(image: np.ndarray, mask: np.ndarray) -> np.ndarray:
 class BothWays:
     """Work along a take, from one timestep to both ends, by helping processes, each on a way."""
 
-    def __init__(self, crew: Crew, total: int) -> None:
+    def __init__(self, crew: Crew, stage: Stage, total: int) -> None:
         self._crew = crew
+        self._stage = stage
         self._done = 0
         self._total = total
 
@@ -223,7 +224,7 @@ class BothWays:
         later = [first, *sorted(t for t in timesteps if t > first)]
         earlier = [first, *sorted((t for t in timesteps if t < first), reverse=True)]
         every = [(own, way) for own in who for way in (later, earlier)]
-        found = self._crew.map(follow, every, (Stage.TORSO, self._done, self._total), keep=True)
+        found = self._crew.map(follow, every, (self._stage, self._done, self._total), keep=True)
         self._done += len(who) * (len(later) + len(earlier) - 2)
         results: list[dict[int, Rows]] = [{} for _ in who]
         for number, ((_, way), own) in enumerate(zip(every, found, strict=True)):

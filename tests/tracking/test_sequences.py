@@ -2,6 +2,7 @@
 
 import os
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,7 @@ from numpy.testing import assert_allclose
 from refusal import refusal
 
 from stga_addon.render.video import video_writer
+from stga_addon.tracking.footage.model import write_png
 from stga_addon.tracking.footage.open import open_footage
 from stga_addon.tracking.footage.sequences import FrameRange
 
@@ -230,6 +232,23 @@ def test_two_cameras_without_calibration(tmp_path):
     (tmp_path / "loop").symlink_to(tmp_path / "loop")
     with refusal("loop: does not exist"):
         open_footage(tmp_path / "loop")
+
+
+def test_a_kept_frame_is_that_of_the_video_or_named(tmp_path):
+    """Catches a kept frame whose colors are swapped, and one that was cut off and is shown as far
+    as it goes, or cannot be read for a reason that names no file."""
+    write_video(tmp_path / "one.mp4", (60, 90))
+    (camera,) = open_footage(tmp_path / "one.mp4").cameras
+    kept = replace(camera, kept={0: tmp_path / "0.png"})
+    pixels = camera.image(0).copy()
+    pixels[:4, :, 0] = 200
+    write_png(tmp_path / "0.png", pixels[..., ::-1])
+    assert (kept.image(0) == pixels).all()
+    whole = (tmp_path / "0.png").read_bytes()
+    for size in (0, 40, len(whole) // 2):
+        (tmp_path / "0.png").write_bytes(whole[:size])
+        with refusal("0.png"):
+            kept.image(0)
 
 
 def test_distorted_frames_are_undistorted(tmp_path):

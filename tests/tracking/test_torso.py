@@ -43,7 +43,7 @@ from stga_addon.tracking.head_model import HeadModel
 from stga_addon.tracking.landmarks import write_places
 from stga_addon.tracking.opened import TrackingOptions
 from stga_addon.tracking.solve import person
-from stga_addon.tracking.stages import Crew
+from stga_addon.tracking.stages import Crew, Stage
 from stga_addon.tracking.surface import with_offset
 from stga_addon.tracking.torso import _followed, follow_torso
 from stga_addon.tracking.torso_cloth import Bending, draped, found_bending, torso_sheet
@@ -262,7 +262,7 @@ def test_cloth_that_slides_over_the_shoulders_is_followed(fine_head):
     first = 3
     moved = np.arange(TIMESTEPS)[:, None] * [0.002, 0, 0] + LIFT_M
     shown = (cloth + slides[first] + moved[first])[cloth[:, 2] > CHEST_CENTER_M[2] + 0.02]
-    walk = BothWays(Crew(Helpers(1)), TIMESTEPS)
+    walk = BothWays(Crew(Helpers(1)), Stage.CLOTH, TIMESTEPS)
     bending = found_bending(posed, motion, TorsoPoints(first, shown), sorted(parameters), walk)
     meshes = {}
     for timestep, torso in motion.items():
