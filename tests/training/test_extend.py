@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 from capture import factory
 from command_line import stga
-from numpy.testing import assert_array_equal
+from numpy.testing import assert_allclose, assert_array_equal
 from PIL import Image
 
 from stga_addon.avatar.file import read_avatar
+from stga_addon.avatar.splats import SH_C0
 from stga_addon.avatar.strain import TRAINED_RANGE
 from stga_addon.capture.meshes import read_mesh
 from stga_addon.capture.model import require_same_scale
@@ -70,8 +71,8 @@ def prepare_extension(parent, takes, growth=0.0, iterations=1):
     return prepare(request, ignore, lambda line: None)
 
 
-def extend(parent, take, out, stop=None, growth=0.0):
-    prepared = prepare_extension(parent, (take,), growth, iterations=ITERATIONS)
+def extend(parent, take, out, stop=None, growth=0.0, iterations=ITERATIONS):
+    prepared = prepare_extension(parent, (take,), growth, iterations=iterations)
 
     train_run(prepared.capture, out, prepared.run, prepared.selection, report=stop_at(stop))
     return out
@@ -101,6 +102,42 @@ def test_the_run_remembers_its_takes(takes, parent, tmp_path):
     path.write_text(json.dumps(values))
     with pytest.raises(StgaError, match=r"was extended with .*new .* but it now has other images"):
         open_run(out)
+
+
+def painted(root, cameras, color):
+    """A take of a ball of one color, trained from the first of two cameras."""
+    factory.write_mesh_capture(root, (0, 1, 3), cameras)
+    for path in sorted((root / "images").iterdir()):
+        pixels = np.where(factory.silhouette()[..., None], color, 255).astype(np.uint8)
+        Image.fromarray(pixels).save(path)
+    return root
+
+
+def test_a_take_of_the_back_replaces_what_was_plausible(tmp_path):
+    """Catches a region of what no camera saw that stays as it was, and a back that stays what it
+    was thought to be, beside a front that changes for it."""
+    blue = np.array([60, 90, 160])
+    orange = np.array([240, 140, 20])
+    front, back = (
+        painted(tmp_path / name, cameras, color)
+        for name, cameras, color in (("front", (1, 2), blue), ("back", (9, 10), orange))
+    )
+    capture = open_capture(front)
+    settings = quick_settings("global", iterations=60, lattice=1, density_interval=0)
+    train_run(capture, tmp_path / "run", Run(front, None, "vhap", settings))
+    extend(tmp_path / "run", back, tmp_path / "extended", iterations=60)
+    before, after = (read_avatar(tmp_path / name / "avatar.npz") for name in ("run", "extended"))
+    height = capture.neutral[capture.faces].mean(1)[:, 2] / factory.RADIUS
+    assert before.regions["unseen"][height < -0.2].all()
+    assert not after.regions["unseen"][np.abs(height) > 0.2].any()
+
+    def color(avatar, rows):
+        return 255 * (0.5 + SH_C0 * avatar.splats.sh[rows[avatar.splats.face], 0]).mean(0)
+
+    assert_allclose(color(before, height < -0.6), blue, atol=2)
+    share = (color(after, height < -0.6) - blue) / (orange - blue)
+    assert share.min() > 0.2
+    assert_allclose(color(after, height > 0.6), color(before, height > 0.6), atol=3)
 
 
 def test_what_looks_different_is_selected(takes, parent, tmp_path):
