@@ -1,12 +1,15 @@
 """Makes the demo's capture, `head_capture.zip`: a person of the bundled head model, path-traced by
 Cycles.
 
-python -m stga_addon.development.demo.make_capture ict_facekit.npz, which `bundled_head.py`
-describes. Needs Blender's bpy. The pictures show more than the bundled head has: twice as many
+python -m stga_addon.development.demo.make_capture ict_facekit.npz [FOLDER], the file as
+`bundled_head.py` describes it; with FOLDER, instead a capture there by one camera, before which the
+head turns. Needs Blender's bpy. The pictures show more than the bundled head has: twice as many
 vertices, hair, lashes, pores.
 """
 
+import shutil
 import sys
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -16,10 +19,11 @@ import numpy as np
 from tqdm import tqdm
 
 from ...capture.camera import Camera, look_at
-from ...capture.open import CANONICAL_NAME, PARAMETERS
+from ...capture.open import BUNDLED_MODEL, CANONICAL_NAME, PARAMETERS
 from ...capture.transforms import camera_entry
 from ...files import read_npz, replacing, write_json, write_npz
 from ...flame.forward import FlameFrame, flame_forward, neutral_frame
+from ...flame.model import BUNDLED_HEAD
 from ...tracking.folder import SPLIT_FILES, image_name
 from ...tracking.write_capture import moving_arrays
 from .capture import CAPTURE
@@ -29,6 +33,10 @@ from .studio import Studio
 CAMERAS = 9
 HELD_OUT = 4
 """On an arc in front of the head; the middle one is `val`."""
+TURNING_ACTS = 40
+TURN_DEG = 50.0
+NOD_DEG = 12.0
+"""Of the head before one camera, to both sides."""
 WIDTH = 320
 HEIGHT = 400
 FOCAL = 3.7
@@ -102,13 +110,26 @@ TEST_ACTS = (
     ),
     Act({"mouthFunnel": 0.6, "jawOpen": 0.15, "browInnerUp": 0.6, "mouthSmile": 0}, neck=(5, 0)),
 )
+SMALL_WEIGHTS = (
+    {},
+    {"mouthSmile": 0.5},
+    {"browInnerUp": 0.7},
+    {"mouthPucker": 0.3},
+    {"eyeSquint": 0.4},
+)
+"""Expressions while the head turns: the mouth never opens, the lids never close."""
 
 
-def main(source: Path) -> None:
-    """Make the capture of the ICT-FaceKit arrays in `source`, without its head model."""
+def main(source: Path, turning: Path | None = None) -> None:
+    """Make the capture of the ICT-FaceKit arrays in `source`, without its head model; or one of a
+    turning head in the folder `turning`."""
+    if turning is not None:
+        write_capture(turning, source, [camera_at(0, 0)], turning_acts())
+        shutil.copyfile(BUNDLED_HEAD, turning / BUNDLED_MODEL)
+        return
     with TemporaryDirectory() as name:
         folder = Path(name)
-        write_capture(folder, source)
+        write_capture(folder, source, rig())
         with replacing(CAPTURE) as partial, ZipFile(partial, "w", ZIP_DEFLATED) as archive:
             for file in sorted(path for path in folder.rglob("*") if path.is_file()):
                 # Of no date: equal files give an equal zip.
@@ -117,11 +138,21 @@ def main(source: Path) -> None:
                 )
 
 
-def write_capture(out: Path, source: Path) -> None:
-    """Write the capture into the folder `out`."""
+def turning_acts() -> tuple[Act, ...]:
+    """A head that turns to both sides and nods."""
+    acts = []
+    for number, phase in enumerate(np.linspace(0, 2 * np.pi, TURNING_ACTS)):
+        turned = 0.5 * TURN_DEG * np.sin(phase), 0.5 * NOD_DEG * np.sin(3 * phase)
+        acts.append(Act(SMALL_WEIGHTS[number % len(SMALL_WEIGHTS)], turn=turned, neck=turned))
+    return tuple(acts)
+
+
+def write_capture(
+    out: Path, source: Path, cameras: Sequence[Camera], acts: Sequence[Act] = TRAIN_ACTS
+) -> None:
+    """Write the capture into the folder `out`: acts that are trained, then TEST_ACTS."""
     person = make_person(read_npz(source))
-    frames = [frame_of_act(act, person.model.expression_names) for act in (*TRAIN_ACTS, *TEST_ACTS)]
-    cameras = rig()
+    frames = [frame_of_act(act, person.model.expression_names) for act in (*acts, *TEST_ACTS)]
     _write_parameters(out, person, frames)
     studio = Studio(person, SAMPLES)
     with tqdm(total=len(frames) * len(cameras), unit="image") as bar:
@@ -136,7 +167,7 @@ def write_capture(out: Path, source: Path) -> None:
                     }
                     image.save(partial, format="WEBP", **options)
                 bar.update()
-    _write_transforms(out, cameras)
+    _write_transforms(out, cameras, len(acts))
 
 
 def frame_of_act(act: Act, names: tuple[str, ...]) -> FlameFrame:
@@ -166,15 +197,18 @@ def frame_of_act(act: Act, names: tuple[str, ...]) -> FlameFrame:
 
 def rig() -> list[Camera]:
     """Cameras on an arc around the head, alternately from below and above."""
-    cameras = []
-    for number, azimuth in enumerate(np.radians(np.linspace(-ARC_DEG, ARC_DEG, CAMERAS))):
-        elevation = np.radians(ELEVATIONS_DEG[number % len(ELEVATIONS_DEG)])
-        level = np.cos(elevation)
-        ahead = np.array([np.sin(azimuth) * level, np.sin(elevation), np.cos(azimuth) * level])
-        cameras.append(
-            look_at((AIM_M + DISTANCE_M * ahead).tolist(), AIM_M, WIDTH, HEIGHT, FOCAL * WIDTH)
-        )
-    return cameras
+    elevations = [ELEVATIONS_DEG[number % len(ELEVATIONS_DEG)] for number in range(CAMERAS)]
+    around = np.linspace(-ARC_DEG, ARC_DEG, CAMERAS)
+    return [camera_at(*angles) for angles in zip(around, elevations, strict=True)]
+
+
+def camera_at(azimuth_deg: float, elevation_deg: float) -> Camera:
+    """A camera that looks at the head, from so far to the person's left and up."""
+    azimuth, elevation = np.radians([azimuth_deg, elevation_deg])
+    level = np.cos(elevation)
+    ahead = np.array([np.sin(azimuth) * level, np.sin(elevation), np.cos(azimuth) * level])
+    eye = (AIM_M + DISTANCE_M * ahead).tolist()
+    return look_at(eye, AIM_M, WIDTH, HEIGHT, FOCAL * WIDTH)
 
 
 def _name(timestep: int, camera: int) -> str:
@@ -188,13 +222,13 @@ def _write_parameters(out: Path, person: Person, frames: list[FlameFrame]) -> No
         write_npz(out / name, moving_arrays(frame.parameters) | shape, compressed=True)
 
 
-def _write_transforms(out: Path, cameras: list[Camera]) -> None:
+def _write_transforms(out: Path, cameras: Sequence[Camera], trained: int) -> None:
     splits: dict[str, list[dict[str, object]]] = {name: [] for name in SPLIT_FILES}
     train, val, test = splits.values()
-    for timestep in range(len(TRAIN_ACTS) + len(TEST_ACTS)):
+    for timestep in range(trained + len(TEST_ACTS)):
         for number, camera in enumerate(cameras):
             seen = val if number == HELD_OUT else train
-            (seen if timestep < len(TRAIN_ACTS) else test).append(
+            (seen if timestep < trained else test).append(
                 {
                     "timestep_index": timestep,
                     "camera_index": number,
@@ -209,4 +243,4 @@ def _write_transforms(out: Path, cameras: list[Camera]) -> None:
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]))
+    main(*map(Path, sys.argv[1:]))
