@@ -110,7 +110,7 @@ TEST_ACTS = (
     ),
     Act({"mouthFunnel": 0.6, "jawOpen": 0.15, "browInnerUp": 0.6, "mouthSmile": 0}, neck=(5, 0)),
 )
-SMALL_WEIGHTS = (
+SMALL_WEIGHTS: tuple[dict[str, float], ...] = (
     {},
     {"mouthSmile": 0.5},
     {"browInnerUp": 0.7},
