@@ -405,7 +405,7 @@ def check_inputs(track: Track) -> None:
     if (out / INPUTS).exists():
         stored = read_inputs(out)
         for name, value in inputs.items():
-            before = stored.get(name, getattr(Track, name, None))  # an older version noted less
+            before = stored.get(name)
             if before != value:
                 raise StgaError(f"{name}: {out} began with {shorten(before)}; give another --out")
     elif is_written(track.out) or (out / RUN_FOLDER).exists():

@@ -49,7 +49,6 @@ from stga_addon.training.settings import make_settings
 
 DATA = Path(__file__).with_name("data")
 SKINNED = "avatar.glb"
-OLDER_SKINNED = "avatar.stga"
 COUNT = 5
 FACES = np.array([[0, 1, 2], [0, 3, 1], [1, 3, 2], [0, 2, 3]], np.int32)
 NEUTRAL = np.array([[0, 0, 0], [0.25, 0, 0], [0, 0.25, 0], [0, 0, 0.25]], np.float32)

@@ -207,10 +207,10 @@ def test_metrics_with_a_cut_last_line(tmp_path):
         assert metrics_log.read_metrics(tmp_path) == lines
     path.write_bytes(whole[:-5])
     assert metrics_log.read_metrics(tmp_path) == lines[:2]
-    metrics_log.cut_metrics(tmp_path, 20)
+    metrics_log.cut_metrics(tmp_path, 2)
     metrics_log.append_metrics(tmp_path, line(25))
     assert metrics_log.read_metrics(tmp_path) == [*lines[:2], line(25)]
-    metrics_log.cut_metrics(tmp_path, 15)
+    metrics_log.cut_metrics(tmp_path, 1)
     assert metrics_log.read_metrics(tmp_path) == lines[:1]
 
 

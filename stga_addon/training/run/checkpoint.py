@@ -41,8 +41,7 @@ OTHER_RUN = "belongs to another run than run.json; remove it, or train into anot
 class Counts:
     """What a checkpoint holds beside arrays, of the trainer, the session and the evaluator.
 
-    lines      of metrics.jsonl that were written so far; None in earlier checkpoints: those up to
-               the iteration
+    lines      of metrics.jsonl that were written so far
     rounds     in which tracking was refined
     identity   digest of the run's identity
     """
@@ -54,7 +53,7 @@ class Counts:
     elapsed_s: float = setting(minimum=0)
     evaluations: int = setting(minimum=0, maximum=MAX_COUNT)
     losses: tuple[float, ...] = ()
-    lines: int | None = setting(None, 0, MAX_COUNT)
+    lines: int = setting(minimum=0, maximum=MAX_COUNT)
     rounds: int = setting(0, 0, MAX_COUNT)
     identity: str = ""
 

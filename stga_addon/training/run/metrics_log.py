@@ -47,10 +47,10 @@ def append_metrics(folder: Path, line: Mapping[str, Any]) -> None:
         out.write(json.dumps(line) + "\n")
 
 
-def cut_metrics(folder: Path, iteration: int, count: int | None = None) -> None:
-    """Remove the evaluations after `iteration`, which a resumed run makes again, and those beyond
-    the first `count`, which a stopped run has made for itself."""
-    kept = [line for line in read_metrics(folder)[:count] if line["iteration"] <= iteration]
+def cut_metrics(folder: Path, count: int) -> None:
+    """Remove the evaluations beyond the first `count`, which a resumed run makes again, or a
+    stopped run has made for itself."""
+    kept = read_metrics(folder)[:count]
     with replacing(folder / METRICS) as partial:
         partial.write_text("".join(json.dumps(line) + "\n" for line in kept), encoding="utf-8")
 

@@ -679,7 +679,7 @@ def _resume(capture: Capture, folder: Path, run: Run, report: Report) -> _Sessio
     session.elapsed_s = found.elapsed_s
     session.losses.extend(found.losses)
     session.tracking_gain = found.tracking_gain
-    cut_metrics(folder, found.iteration, found.lines)
+    cut_metrics(folder, found.lines)
     evaluator.lines = read_metrics(folder)
     evaluator.count = found.evaluations
     for name, aside in SET_ASIDE.items():

@@ -1,5 +1,4 @@
-"""An independent reader of skinned splats, written from docs/skinned-splats.md, and of the data
-files of version 0.2.0."""
+"""An independent reader of skinned splats, written from docs/skinned-splats.md."""
 
 import gzip
 import json
@@ -14,13 +13,7 @@ WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4, "MAT4": 16}
 
 
 def read_web_data(data):
-    """Header and arrays (floats or int64) of a .glb or an older data file."""
-    if data[:4] != b"glTF":
-        raw = gzip.decompress(data)
-        magic, version, length = struct.unpack_from("<4sII", raw)
-        assert (magic, version) == (b"STGA", 4)
-        header = json.loads(raw[12 : 12 + length])
-        return header, planes(header["arrays"], raw[12 + length :])
+    """Header and arrays (floats or int64) of a .glb."""
     document, binary = document_of(data)
     splats = document["extras"]["stga_splats"]
     assert splats["version"] == 1

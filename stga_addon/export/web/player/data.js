@@ -8,23 +8,24 @@ import { bytesOf, parseGlb, readSkin } from './glb.js';
 
 export class DataError extends Error {}
 
-const VERSION = 4; // of data files of STGA for Blender 0.2
-const SPLATS_VERSION = 1; // of skinned splats in glTF
+const VERSION = 1;
 const MAX_VIEW_SIZE = 1 << 16; // pixels
 
-// Parse skinned splats (Uint8Array): a .glb file, or one of those or an older data file gzipped:
-// { header, arrays }. Throws DataError in one sentence.
+// Parse skinned splats (Uint8Array): a .glb file, or one gzipped: { header, arrays }. Throws
+// DataError in one sentence.
 /** @type {(bytes: Uint8Array<ArrayBuffer>) => Promise<Data>} */
 export async function readData(bytes) {
   const raw = bytes[0] === 0x1f && bytes[1] === 0x8b ? await inflated(bytes) : bytes;
   const view = new DataView(raw.buffer, raw.byteOffset, raw.byteLength);
-  const magic = raw.length < 20 ? 0 : view.getUint32(0, false);
-  if (magic === 0x53544741 && raw !== bytes) return readOlder(raw, view);
-  if (magic !== 0x676c5446) throw new DataError('This is not an avatar data file.');
+  if (raw.length < 20 || view.getUint32(0, false) !== 0x676c5446)
+    throw new DataError('This is not an avatar data file.');
   if (view.getUint32(8, true) > raw.length) throw new DataError('The avatar data is cut off.');
   const { document, binary } = understood('document', () => parseGlb(raw));
   const splats = document.extras.stga_splats;
-  checkVersion(splats.version, SPLATS_VERSION);
+  if (splats.version !== VERSION) {
+    const problem = `has format version ${splats.version}; this player reads ${VERSION}`;
+    throw new DataError(`The avatar ${problem}.`);
+  }
   const packed = understood('byteLength', () => bytesOf(binary, splats));
   const skin = understood('mesh', () => readSkin(document, binary));
   const header = { ...splats, joints: skin.joints, parents: skin.parents };
@@ -49,27 +50,6 @@ async function inflated(bytes) {
     throw new DataError('The avatar data is damaged.');
   });
   return new Uint8Array(buffer);
-}
-
-// A data file of STGA for Blender 0.2.
-/** @type {(raw: Uint8Array<ArrayBuffer>, view: DataView) => Data} */
-function readOlder(raw, view) {
-  checkVersion(view.getUint32(4, true), VERSION);
-  const end = 12 + view.getUint32(8, true);
-  if (end > raw.length) throw new DataError('The avatar data is cut off.');
-  const header = understood('header', () =>
-    JSON.parse(new TextDecoder('utf-8', { fatal: true }).decode(raw.subarray(12, end))),
-  );
-  require(header instanceof Object, 'header');
-  const arrays = readArrays(header, raw.subarray(end));
-  checkData(header, arrays);
-  return { header, arrays };
-}
-
-/** @type {(found: unknown, known: number) => void} */
-function checkVersion(found, known) {
-  if (found !== known)
-    throw new DataError(`The avatar has format version ${found}; this player reads ${known}.`);
 }
 
 // What `read` returns; throws DataError where it throws.
