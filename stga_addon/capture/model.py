@@ -90,6 +90,14 @@ def views_by_timestep(views: Iterable[View]) -> dict[int, list[View]]:
     return found
 
 
+def views_by_camera(views: Iterable[View]) -> dict[int, list[View]]:
+    """The views of each camera, in the order of the views."""
+    found: dict[int, list[View]] = {}
+    for view in views:
+        found.setdefault(view.camera_index, []).append(view)
+    return found
+
+
 def evenly_spread(items: Sequence[Item], limit: int) -> list[Item]:
     """At most `limit` of the items: the first, the last, and those evenly between."""
     if len(items) <= limit:
@@ -100,10 +108,8 @@ def evenly_spread(items: Sequence[Item], limit: int) -> list[Item]:
 def cameras_at_once(views: Iterable[View]) -> int:
     """Most cameras that show one timestep. A phone is one also where it took several takes, from
     other places: they do not show together how far away anything is."""
-    at_once: dict[int, set[int]] = {}
-    for view in views:
-        at_once.setdefault(view.timestep, set()).add(view.camera_index)
-    return max(map(len, at_once.values()), default=0)
+    together = views_by_timestep(views).values()
+    return max((len(views_by_camera(shown)) for shown in together), default=0)
 
 
 def parts_of(timesteps: Sequence[int], limit: int) -> list[list[int]]:
@@ -267,9 +273,8 @@ def _renumbered(take: Capture, start: int, first: Capture, taken: set[int]) -> V
     above all that are `taken`."""
     if start == 0:
         return take.views
-    known = [view for members in first.views.values() for view in members]
-    poses = {view.camera_index: view.camera.world_to_camera for view in known}
-    own = {view.camera_index for members in take.views.values() for view in members}
+    poses = {view.camera_index: view.camera.world_to_camera for view in first.all_views}
+    own = views_by_camera(take.all_views)
     free = 1 + start + max(poses, default=-1)
     if any(free + index in taken for index in own):
         free = 1 + max(taken)

@@ -10,13 +10,11 @@ import numpy as np
 
 from ..avatar.splats import SH_C0, Splats
 from ..capture.color import srgb_to_linear
+from ..capture.meshes import JSON_KIND, MAGIC, VERSION
 from ..files import replacing
 
 EXTENSION = "KHR_gaussian_splatting"
 GENERATOR = "STGA for Blender"
-_MAGIC = b"glTF"
-_VERSION = 2
-_JSON_CHUNK = b"JSON"
 _BINARY_CHUNK = b"BIN\0"
 # primitive mode; buffer target ARRAY_BUFFER
 _POINTS = 0
@@ -138,8 +136,8 @@ def glb_bytes(document: dict[str, Any], binary: bytes) -> bytes:
     size = 12 + 8 + len(text) + 8 + len(binary)
     return b"".join(
         (
-            _MAGIC + struct.pack("<II", _VERSION, size),
-            struct.pack("<I", len(text)) + _JSON_CHUNK + text,
+            MAGIC + struct.pack("<II", VERSION, size),
+            struct.pack("<I", len(text)) + JSON_KIND + text,
             struct.pack("<I", len(binary)) + _BINARY_CHUNK + binary,
         )
     )

@@ -220,7 +220,7 @@ def capture_views(capture: Capture) -> dict[str, Camera]:
 
 def _up(capture: Capture) -> tuple[float, float, float]:
     """The axis of the capture that its cameras hold upright; y without cameras."""
-    cameras = [view.camera for views in capture.views.values() for view in views]
+    cameras = [view.camera for view in capture.all_views]
     if not cameras:
         return (0.0, 1.0, 0.0)
     mean = -np.stack([camera.world_to_camera[1, :3] for camera in cameras]).mean(0)

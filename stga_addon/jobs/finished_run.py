@@ -64,8 +64,7 @@ def relight(request: Relight, report: Report, say: Say) -> Written:
         card = srgb_to_linear(np.array(request.card))
         if not card.min() > 0:
             raise StgaError(f"--gray-card: expected three numbers above 0, got {request.card}")
-        views = [view for split in capture.views.values() for view in split]
-        cameras = list({view.camera_index: view.camera for view in views}.values())
+        cameras = list({view.camera_index: view.camera for view in capture.all_views}.values())
         if not cameras:
             raise StgaError(f"{capture.root}: has no camera that a gray card could face")
         toward = cameras[central_camera(cameras)].position - capture.neutral.mean(0)

@@ -304,7 +304,7 @@ def _subject(request: Render, composer: Composer, say: Say) -> _Subject:
         capture.timesteps,
         lambda: _middle(capture.mesh(capture.timesteps[0])),
         playback_fps(capture, request.fps),
-        [view for views in capture.views.values() for view in views],
+        capture.all_views,
     )
 
 

@@ -8,7 +8,7 @@ from ..avatar.file import AvatarLight
 from ..capture.color import srgb_to_linear
 from ..capture.images import read_view
 from ..capture.mesh_geometry import connected_parts, triangle_normals
-from ..capture.model import Capture, View, ViewExposure, evenly_spread
+from ..capture.model import Capture, View, ViewExposure, evenly_spread, views_by_timestep
 from ..errors import StgaError
 from ..progress import Progress, Report, ignore
 from .harmonics import COUNT, DARK, LAMBERT, basis, least_squares, uniform
@@ -131,9 +131,7 @@ def estimate_light(
     capture: Capture, known: Known = Known(), report: Report = ignore
 ) -> AvatarLight:
     """The light of the capture and how its head receives it. Raises StgaError without views."""
-    by_time: dict[int, list[View]] = {}
-    for view in capture.views.get("train", ()):
-        by_time.setdefault(view.timestep, []).append(view)
+    by_time = views_by_timestep(capture.views.get("train", ()))
     if not by_time:
         raise StgaError(
             f"{capture.root}: has no training views, from which its light could be estimated"

@@ -2,7 +2,6 @@
 
 from collections.abc import Iterable
 from dataclasses import replace
-from itertools import chain
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -110,7 +109,7 @@ def import_cameras(capture: Capture, root: Any, warn: Warn = log_warning) -> lis
     cameras = []
     old = {camera[tags.CAMERA_INDEX]: camera for camera in tags.find(tags.CAMERA, capture.root)}
     by_index: dict[int, dict[int, View]] = {}
-    for view in chain(*capture.views.values()):
+    for view in capture.all_views:
         by_index.setdefault(view.camera_index, {}).setdefault(view.timestep, view)
     for index, by_timestep in sorted(by_index.items()):
         views = [by_timestep[timestep] for timestep in sorted(by_timestep)]

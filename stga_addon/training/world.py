@@ -11,7 +11,7 @@ from ..avatar.embedding import face_frames, to_local, to_world
 from ..avatar.splats import SH_C0, Splats, joined
 from ..capture.camera import Camera
 from ..capture.images import read_view
-from ..capture.model import Capture, View, evenly_spread
+from ..capture.model import Capture, View, evenly_spread, views_by_camera
 from ..flame.quaternions import from_matrices, unit
 from ..progress import Progress, Report, counted, ignore
 from .optimize.image_preparation import Correction, exposure_correction
@@ -83,12 +83,9 @@ class CleanPlate:
 
 def clean_plates(capture: Capture, correct: Correction | None = None) -> list[CleanPlate]:
     """Of each camera with masks, of training views; correct: their exposure. Raises StgaError."""
-    by_camera: dict[int, list[View]] = {}
-    for view in capture.views.get("train", ()):
-        if view.mask is not None:
-            by_camera.setdefault(view.camera_index, []).append(view)
+    masked = [view for view in capture.views.get("train", ()) if view.mask is not None]
     plates = []
-    for _, views in sorted(by_camera.items()):
+    for _, views in sorted(views_by_camera(masked).items()):
         camera = views[0].camera
         stack = []
         scale = min(1.0, (MAX_PLATE_PIXELS / (camera.width * camera.height)) ** 0.5)

@@ -36,7 +36,7 @@ def main() -> None:
     trained = TrainedAvatar(read_avatar(options.run / AVATAR), opened.run.settings)
     capture = opened.capture
     chosen = evenly_spread(capture.timesteps, options.timesteps)
-    views = [view for split in capture.views.values() for view in split]
+    views = capture.all_views
     count = sum(view.timestep in chosen for view in views)
     track_by_avatar(trained, capture, chosen[:1])  # compiles
     size = f"{views[0].camera.width}x{views[0].camera.height}"

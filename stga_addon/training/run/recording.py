@@ -12,7 +12,7 @@ from ...avatar.file import Avatar, read_avatar
 from ...capture.camera import Camera
 from ...capture.images import read_view
 from ...capture.mesh_geometry import Similarity, rasterize
-from ...capture.model import Capture, View, cameras_at_once, evenly_spread
+from ...capture.model import Capture, View, cameras_at_once, evenly_spread, views_by_camera
 from ...capture.open import PARAMETERS, open_capture
 from ...errors import StgaError
 from ...files import read_json, read_npz, write_json, write_npz
@@ -294,10 +294,7 @@ def _colors_by_camera(
 ) -> Iterator[tuple[Sequence[View], list[HeadColors]]]:
     """EXPOSURE_VIEWS of each camera, and their colors on the head; world: the capture's is moved so
     before the avatar is drawn."""
-    by_camera: dict[int, list[View]] = {}
-    for view in capture.all_views:
-        by_camera.setdefault(view.camera_index, []).append(view)
-    for views in by_camera.values():
+    for views in views_by_camera(capture.all_views).values():
         chosen = evenly_spread(sorted(views, key=lambda view: view.timestep), EXPOSURE_VIEWS)
         yield chosen, [_head_colors(avatar, settings, capture, view, world) for view in chosen]
 
