@@ -132,9 +132,9 @@ LIST = "u2[::1]"
 LIMITS = "UniTuple(f4, 4)"
 TABLE = np.zeros((2, 3), np.float32)
 ADAM = numba.types.void(
-    numba.typeof(np.zeros(2, np.int32)),
+    *[numba.typeof(np.zeros(2, np.int32))] * 2,
     numba.typeof(optimizer.AdamTables(*[TABLE] * 5, TABLE[0])),
-    *[numba.types.Array(numba.float32, 1, "C")] * 3,
+    *[numba.typeof(TABLE)] * 2,
     numba.typeof(optimizer.AdamOptions(*np.zeros(5, np.float32))),
 )
 ROW = numba.float32[::1]
@@ -160,7 +160,7 @@ LOOPS = {
         1,
         4,
     ),
-    "Adam": (optimizer._adam_block, ADAM, 2, 1),
+    "Adam": (optimizer.adam_block, ADAM, 2, 1),
     "projection": (splat_block.project_geometry, f"void({STATE}, {STATE}, {LIMITS})", 1, 82),
     "bounds in tiles": (splat_block.project_bounds, f"void({STATE}, f4, f4)", 1, 12),
     "harmonics": (splat_block.compute_harmonics, f"void({STATE}, f4[:, ::1])", 1, 20),

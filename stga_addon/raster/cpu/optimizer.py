@@ -55,6 +55,16 @@ class AdamOptions(NamedTuple):
     ema_share: np.float32
 
 
+class ColorStep(NamedTuple):
+    """How `project.project_backward` steps the harmonics' coefficients, whose gradients are never
+    all in memory: steps (N,) int32 made before, and tables as of `adam_rows`. Without rates it
+    steps nothing."""
+
+    steps: Any
+    tables: AdamTables
+    options: AdamOptions
+
+
 @parallel(lambda rows, *_: len(rows), piece=ROWS_PER_BLOCK)
 def adam_rows(work, rows, steps, parameters, options):
     """One Adam step on the listed rows (M,) of several parameters, with each row's own step count.
@@ -66,50 +76,58 @@ def adam_rows(work, rows, steps, parameters, options):
     its average. All parameters at once: every further parallel loop waits for its slowest thread.
     """
     call_helpers(work)
+    corrections = np.empty((3, ROWS_PER_BLOCK), np.float32)
+    for begin, end in pieces(work):
+        some = rows[begin:end]
+        correct_bias(some, steps, options, corrections)
+        for n in range(len(some)):
+            steps[some[n]] += 1
+        for p in range(len(parameters)):
+            adam_block(some, some, parameters[p], parameters[p].gradient, corrections, options)
+
+
+@part_jit
+def correct_bias(rows, steps, options, corrections):
+    """Write to corrections (3, ≥ M) what each listed row's next step multiplies the moments by, the
+    second one's root, and the share with which the stepped value enters its average."""
     log1 = math.log(options.beta1)
     log2 = math.log(options.beta2)
-    correct1 = np.empty(ROWS_PER_BLOCK, np.float32)
-    correct2 = np.empty(ROWS_PER_BLOCK, np.float32)
-    ema_shares = np.empty(ROWS_PER_BLOCK, np.float32)
     latest = np.int32(-1)
     first = ZERO
     second = ZERO
     share = ZERO
-    for begin, end in pieces(work):
-        for n in range(begin, end):
-            steps[rows[n]] += 1
-            if steps[rows[n]] != latest:  # neighbors are mostly trained equally often
-                latest = steps[rows[n]]
-                count = np.float64(latest)
-                first = np.float32(1.0 / (1.0 - (1.0 - options.ahead) * math.exp(count * log1)))
-                second = np.float32(1.0 / math.sqrt(1.0 - math.exp(count * log2)))
-                share = np.float32(max(np.float64(options.ema_share), 4.0 / (count + 3.0)))
-            correct1[n - begin] = first
-            correct2[n - begin] = second
-            ema_shares[n - begin] = share
-        for p in range(len(parameters)):
-            _adam_block(rows[begin:end], parameters[p], correct1, correct2, ema_shares, options)
+    for n in range(len(rows)):
+        if steps[rows[n]] != latest:  # neighbors are mostly trained equally often
+            latest = steps[rows[n]]
+            count = np.float64(latest + 1)
+            first = np.float32(1.0 / (1.0 - (1.0 - options.ahead) * math.exp(count * log1)))
+            second = np.float32(1.0 / math.sqrt(1.0 - math.exp(count * log2)))
+            share = np.float32(max(np.float64(options.ema_share), 4.0 / (count + 3.0)))
+        corrections[0, n] = first
+        corrections[1, n] = second
+        corrections[2, n] = share
 
 
 @part_jit
-def _adam_block(rows, parameter, correct1, correct2, ema_shares, options):
-    """Adam on a few rows of one parameter; a function of its own so that LLVM sees plain arrays and
-    vectorizes."""
-    values, gradient, first, second, average, rates = parameter
+def adam_block(rows, places, parameter, gradient, corrections, options):
+    """Adam on a few rows of one parameter, whose gradients are at `places` of gradient; a function
+    of its own so that LLVM sees plain arrays and vectorizes."""
+    values, _, first, second, average, rates = parameter
     beta1, beta2, epsilon, ahead, _ = options
     width = len(rates)
     for n in range(len(rows)):
         i = rows[n]
+        at = places[n]
         invalid = ZERO
         for c in range(width):
-            invalid += ZERO if abs(gradient[i, c]) < MAX_GRADIENT else ONE
+            invalid += ZERO if abs(gradient[at, c]) < MAX_GRADIENT else ONE
         if invalid != ZERO:
             continue
-        scale1 = correct1[n]
-        scale2 = correct2[n]
-        share = ema_shares[n]
+        scale1 = corrections[0, n]
+        scale2 = corrections[1, n]
+        share = corrections[2, n]
         for c in range(width):
-            g = gradient[i, c]
+            g = gradient[at, c]
             m = beta1 * first[i, c] + (ONE - beta1) * g
             v = beta2 * second[i, c] + (ONE - beta2) * g * g
             first[i, c] = m

@@ -10,11 +10,27 @@ import numpy as np
 
 from . import inline_jit, part_jit
 from . import splat_block as block
-from .layout import BLUE, GREEN, MEAN_X, MEAN_Y, OPACITY, PRECISION_X, PRECISION_Y, RED, SHEAR, TILE
+from .elementary import prefetch
+from .layout import (
+    BLUE,
+    GREEN,
+    MEAN_X,
+    MEAN_Y,
+    OPACITY,
+    PRECISION_X,
+    PRECISION_Y,
+    PROJECTED,
+    RED,
+    SHEAR,
+    TILE,
+)
+from .optimizer import adam_block, correct_bias
 from .splat_block import BLOCK_SPLATS, HALF, ONE, ZERO
 from .threads import call_helpers, parallel, pieces
 
 COLUMN = np.uint64(BLOCK_SPLATS)
+PAIRS_AHEAD = 64
+"""So many pairs ahead, memory is asked for their gradients."""
 SPLATS_PER_PIECE = 4 * BLOCK_SPLATS
 """That a thread takes over at a time."""
 
@@ -252,16 +268,20 @@ def project_forward(
 
 @part_jit
 def _sum_pairs(rows, lists, pair_gradients, b):
-    """Sum the gradients of each listed splat's pairs to the block: a short loop asks memory for
-    many of them at once."""
+    """Sum the gradients of each listed splat's pairs to the block, while memory is asked for those
+    of the next splats, which lie all over it."""
     first_pair = lists.first_pair
     pairs = lists.pairs
     splat_pairs = lists.splat_pairs
     grads = pair_gradients
+    last_pair = len(splat_pairs) - 1
     for q in range(np.uint64(len(rows))):
         i = np.uint64(rows[q])
         g0 = g1 = g2 = g3 = g4 = g5 = g6 = g7 = g8 = ZERO
         for k in range(first_pair[i], first_pair[i] + pairs[i]):
+            ahead = np.uint64(splat_pairs[np.uint64(min(k + PAIRS_AHEAD, last_pair))])
+            prefetch(grads, ahead * np.uint64(PROJECTED))
+            prefetch(grads, ahead * np.uint64(PROJECTED) + np.uint64(PROJECTED - 1))
             j = np.uint64(splat_pairs[np.uint64(k)])
             g0 = g0 + grads[j, 0]
             g1 = g1 + grads[j, 1]
@@ -299,20 +319,34 @@ def _load_projected(rows, projected, b):
 
 
 @part_jit
-def _color_gradient(b, q, i, coefficients, sh, v_sh):
-    """Write the gradient of splat i's coefficients in use, and the weights of the harmonics to the
-    block at q."""
-    red = b[block.G_RED + q]
-    green = b[block.G_GREEN + q]
-    blue = b[block.G_BLUE + q]
-    for k in range(coefficients):
-        harmonic = b[block.B0 + k * COLUMN + q]
-        v_sh[i, k, 0] = harmonic * red
-        v_sh[i, k, 1] = harmonic * green
-        v_sh[i, k, 2] = harmonic * blue
-        b[block.W0 + k * COLUMN + q] = red * sh[i, k, 0] + green * sh[i, k, 1] + blue * sh[i, k, 2]
-    for k in range(coefficients, np.uint64(block.BASIS_SIZE)):
-        b[block.W0 + k * COLUMN + q] = ZERO
+def _color_gradient(rows, b, coefficients, sh, v_sh):
+    """Write the gradients of the listed splats' coefficients in use to v_sh (≥ M, 3·K), and the
+    weights of the harmonics to the block; sh (N, 3·K)."""
+    three = np.uint64(3)
+    for q in range(np.uint64(len(rows))):
+        i = np.uint64(rows[q])
+        red = b[block.G_RED + q]
+        green = b[block.G_GREEN + q]
+        blue = b[block.G_BLUE + q]
+        for k in range(coefficients):
+            harmonic = b[block.B0 + k * COLUMN + q]
+            c = three * k
+            v_sh[q, c] = harmonic * red
+            v_sh[q, c + np.uint64(1)] = harmonic * green
+            v_sh[q, c + np.uint64(2)] = harmonic * blue
+            b[block.W0 + k * COLUMN + q] = (
+                red * sh[i, c] + green * sh[i, c + np.uint64(1)] + blue * sh[i, c + np.uint64(2)]
+            )
+        for k in range(coefficients, np.uint64(block.BASIS_SIZE)):
+            b[block.W0 + k * COLUMN + q] = ZERO
+
+
+@part_jit
+def _write_color_gradient(rows, v_sh, columns, gradient):
+    for q in range(np.uint64(len(rows))):
+        i = np.uint64(rows[q])
+        for c in range(columns):
+            gradient[i, c] = v_sh[q, c]
 
 
 @part_jit
@@ -353,9 +387,13 @@ def project_backward(
     pair_gradients,
     gradients,
     screen_gradient,
+    color,
 ):
     """Write the gradient of each listed splat to its row of `gradients`; the counterpart of
     `project_forward`.
+
+    color: an `optimizer.ColorStep` of the coefficients in use, of whose gradients only those of the
+    first harmonic are then written.
 
     visible (M,) int32: the splats to differentiate. projected (N, PROJECTED): the columns of the
     projection.
@@ -363,13 +401,16 @@ def project_backward(
     respect to the projected center in units of half the image, for density control.
     """
     call_helpers(work)
-    sh = splats.sh
-    v_sh = gradients.sh
     half_size = HALF * np.float32(frames.size[0]), HALF * np.float32(frames.size[1])
     limits = _tan_limits(frames.intrinsics, frames.size)
     coefficients = np.uint64((degree + 1) * (degree + 1))
     compensated = ONE if antialiased else ZERO
     b = np.zeros(block.BACKWARD_SIZE, np.float32)
+    v_sh = np.zeros((BLOCK_SPLATS, 3 * block.BASIS_SIZE), np.float32)
+    corrections = np.empty((3, BLOCK_SPLATS), np.float32)
+    places = np.arange(BLOCK_SPLATS)
+    is_stepped = len(color.tables.rates) > 0
+    written = np.uint64(3) if is_stepped else np.uint64(3) * coefficients
     for begin, end in pieces(work):
         for first in range(begin, end, BLOCK_SPLATS):
             some = visible[first : min(end, first + BLOCK_SPLATS)]
@@ -378,11 +419,14 @@ def project_backward(
             _load_projected(some, projected, b)
             block.differentiate_geometry(b, frames.intrinsics, limits, half_size, compensated)
             block.compute_harmonics(b, frames.to_world)
-            for q in range(np.uint64(len(some))):
-                i = np.uint64(some[q])
-                if depth_as_color:
+            if depth_as_color:
+                for q in range(np.uint64(len(some))):
                     b[block.V_CAMERA_Z + q] += b[block.G_RED + q]
                     b[block.G_RED + q] = b[block.G_GREEN + q] = b[block.G_BLUE + q] = ZERO
-                _color_gradient(b, q, i, coefficients, sh, v_sh)
+            _color_gradient(some, b, coefficients, color.tables.value, v_sh)
+            _write_color_gradient(some, v_sh, written, color.tables.gradient)
+            if is_stepped:
+                correct_bias(some, color.steps, color.options, corrections)
+                adam_block(some, places, color.tables, v_sh, corrections, color.options)
             block.differentiate_position(b, frames.to_world)
             _store_gradient(some, b, gradients, screen_gradient)

@@ -13,8 +13,13 @@ from ...capture.camera import Camera
 from . import tiles as tiling
 from .blend import blend_backward, blend_forward
 from .layout import PROJECTED, RED, TILE, Blended, CameraFrames, Parameters, Projection, TileLists
+from .optimizer import AdamOptions, AdamTables, ColorStep
 from .project import compose_frames, project_backward, project_forward
 
+LINE_BYTES = 64
+CHUNK_BYTES = 1 << 22
+"""Memory is taken so much at a time at least: from there on NumPy asks for huge pages, but not for
+its zeros. Among small pages, what lies in no order is looked for longer than it is read."""
 BLACK_BACKGROUND = np.zeros(3, np.float32)
 
 
@@ -57,6 +62,7 @@ class BufferPool:
     def __init__(self) -> None:
         self._buffers: dict[str, np.ndarray] = {}
         self._kept: dict[str, tuple[tuple[int, ...], np.ndarray]] = {}
+        self._chunk = np.empty(0, np.uint8)
 
     def get(self, name: str, shape: tuple[int, ...], dtype: Any = np.float32) -> np.ndarray:
         """An array to be written; the same memory whenever the same name is asked for again."""
@@ -64,10 +70,19 @@ class BufferPool:
         buffer = self._buffers.get(name)
         if buffer is None or len(buffer) < size:
             # An eighth to spare, so that a slowly growing count does not allocate every time.
-            # Zeros, not what memory held: where a local iteration does not render, nothing may be
-            # infinite or NaN.
-            buffer = self._buffers[name] = np.zeros(size + size // 8, dtype)
+            buffer = self._buffers[name] = self._zeros(size + size // 8, np.dtype(dtype))
         return buffer[:size].reshape(shape)
+
+    def _zeros(self, size: int, dtype: np.dtype) -> np.ndarray:
+        """New memory; not what it held: where a local iteration does not render, nothing may be
+        infinite or NaN."""
+        used = -(-size * dtype.itemsize // LINE_BYTES) * LINE_BYTES
+        if used > len(self._chunk):
+            self._chunk = np.empty(max(used, CHUNK_BYTES), np.uint8)
+        part = self._chunk[:used]
+        part.fill(0)
+        self._chunk = self._chunk[used:]
+        return part[: size * dtype.itemsize].view(dtype)
 
     def room(self, name: str) -> int:
         """How many values the name's array has had room for."""
@@ -80,14 +95,17 @@ class BufferPool:
         return self._kept[name][1]
 
 
-def frames_in_camera(frames: FaceFrames, camera: Camera) -> CameraFrames:
+def frames_in_camera(
+    frames: FaceFrames, camera: Camera, buffers: BufferPool | None = None
+) -> CameraFrames:
     """Compose face frames with a camera in float64, so that distance from the origin costs no
-    precision."""
+    precision. buffers: as of `render_forward`."""
+    buffers = buffers or BufferPool()
     rotation = np.float64(camera.world_to_camera[:3, :3])
     translation = np.float64(camera.world_to_camera[:3, 3])
     parts = (frames.origin, frames.rotation, frames.scale, rotation, translation)
-    origin = np.empty((len(frames.origin), 3), np.float32)
-    matrix = np.empty((len(frames.origin), 3, 3), np.float32)
+    origin = buffers.get("origin", (len(frames.origin), 3))
+    matrix = buffers.get("matrix", (len(frames.origin), 3, 3))
     compose_frames(*(np.ascontiguousarray(part, np.float64) for part in parts), origin, matrix)
     return CameraFrames(
         origin=origin,
@@ -139,7 +157,8 @@ def render_forward(
         project(buffers.kept("everything", (len(splats.xyz),), np.arange), everywhere)
         tile_blocks = buffers.kept("whole_tiles", (tiles_x * tiles_y,), tiling.whole_tiles)
     else:
-        focused, others = tiling.split_splats(focus)
+        room = (buffers.get(name, focus.shape, np.int64) for name in ("focused", "others"))
+        focused, others = tiling.split_splats(focus, *room)
         project(focused, everywhere)
         touched, covered, tile_blocks = tiling.find_needed_blocks(
             projection, focused, np.float32(reach), tiles_x, tiles_y
@@ -162,12 +181,14 @@ def render_backward(
     gradients: Parameters,
     v_transmittance: np.ndarray | None = None,
     buffers: BufferPool | None = None,
+    color: ColorStep | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Gradient of a scalar with respect to the splats, from its gradient with respect to the image.
 
     v_image (3, H, W); v_transmittance (H, W), zero if None. Overwrites those rows of `gradients`
     that belong to a visible splat, one in focus if the output has a focus, and leaves all others
-    and coefficients above the degree in use unchanged. Returns the rows written (M,) int32, and
+    and coefficients above the degree in use unchanged. color: steps the coefficients instead, and
+    only the first harmonic's gradient is written. Returns the rows written (M,) int32, and
     screen_gradient (N,): for those rows, the length of the gradient with respect to the projected
     center in units of half the image.
     """
@@ -209,8 +230,16 @@ def render_backward(
         pair_gradients,
         gradients,
         screen_gradient,
+        color or _no_step(splats.sh, gradients.sh),
     )
     return rows, screen_gradient
+
+
+def _no_step(sh: np.ndarray, v_sh: np.ndarray) -> ColorStep:
+    """Of coefficients whose gradients are written."""
+    arrays = [array.reshape(len(array), -1) for array in (sh, *[v_sh] * 4)]
+    tables = AdamTables._make([*arrays, np.empty(0, np.float32)])
+    return ColorStep(np.empty(0, np.int32), tables, AdamOptions(*[np.float32(0)] * 5))
 
 
 def blend_weights(output: RenderOutput, buffers: BufferPool) -> np.ndarray:

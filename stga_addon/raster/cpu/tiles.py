@@ -388,10 +388,8 @@ def _sum_boxes(count):
 
 
 @jit
-def split_splats(focus):
-    """The splats (M,) int64 that are in focus (N,) bool, and the others."""
-    inside = np.empty(len(focus), np.int64)
-    outside = np.empty(len(focus), np.int64)
+def split_splats(focus, inside, outside):
+    """The splats (M,) that are in focus (N,) bool, and the others, in room for N int64 each."""
     found = 0
     for i in range(np.uint64(len(focus))):
         inside[found] = outside[i - np.uint64(found)] = i
@@ -466,22 +464,48 @@ def find_needed_blocks(projection, splats, reach, tiles_x, tiles_y):
     return reached[:-1, :-1] > 0, covered, tile_blocks
 
 
-def box_groups(tiles: np.ndarray, most_rows: int) -> np.ndarray:
+@jit
+def box_groups(tiles, most_rows):
     """Boxes (B, 4) int64 x0, y0, x1, y1 around each connected group of marked tiles (rows, columns)
-    bool, the largest first; a group of more than `most_rows` rows is cut into bands of about as
-    many rows each."""
-    from scipy import ndimage  # which rendering does not need
-
-    numbers, _ = ndimage.label(tiles, np.ones((3, 3)))
-    boxes = []
-    for number, (rows, _) in enumerate(ndimage.find_objects(numbers), 1):
-        first = rows.start
-        count = rows.stop - rows.start
-        bands = -(-count // most_rows)
-        for band in range(bands):
-            y0 = first + count * band // bands
-            y1 = first + count * (band + 1) // bands
-            columns = np.flatnonzero((numbers[y0:y1] == number).any(0))
-            boxes.append((columns[0], y0, columns[-1] + 1, y1))
-    boxes.sort(key=lambda box: (box[0] - box[2]) * (box[3] - box[1]))
-    return np.array(boxes, np.int64).reshape(-1, 4)
+    bool; a group of more than `most_rows` rows is cut into bands of about as many rows each."""
+    rows, columns = tiles.shape
+    group = np.zeros((rows, columns), np.int64)
+    waiting = np.empty((rows * columns, 2), np.int64)
+    boxes = np.empty((rows * columns, 4), np.int64)
+    count = 0
+    for y in range(rows):
+        for x in range(columns):
+            if not tiles[y, x] or group[y, x] != 0:
+                continue
+            number = count + 1
+            group[y, x] = number
+            waiting[0, 0] = y
+            waiting[0, 1] = x
+            left = 1
+            past = y + 1
+            while left > 0:
+                left -= 1
+                row = waiting[left, 0]
+                column = waiting[left, 1]
+                past = max(past, row + 1)
+                for v in range(max(0, row - 1), min(rows, row + 2)):
+                    for u in range(max(0, column - 1), min(columns, column + 2)):
+                        if tiles[v, u] and group[v, u] == 0:
+                            group[v, u] = number
+                            waiting[left, 0] = v
+                            waiting[left, 1] = u
+                            left += 1
+            bands = (past - y + most_rows - 1) // most_rows
+            for band in range(bands):
+                box = boxes[count]
+                box[0] = columns
+                box[2] = 0
+                box[1] = y + (past - y) * band // bands
+                box[3] = y + (past - y) * (band + 1) // bands
+                for v in range(box[1], box[3]):
+                    for u in range(columns):
+                        if group[v, u] == number:
+                            box[0] = min(box[0], u)
+                            box[2] = max(box[2], u + 1)
+                count += 1
+    return boxes[:count]

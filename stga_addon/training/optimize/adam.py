@@ -10,6 +10,7 @@ from ...capture.camera import Camera
 from ...raster.cpu.optimizer import (
     AdamOptions,
     AdamTables,
+    ColorStep,
     adam_rows,
     offset_gradient,
     sum_by_triangle,
@@ -32,26 +33,34 @@ def adam_options(settings: TrainingSettings, camera: Camera) -> AdamOptions:
     )
 
 
+def color_step(
+    state: TrainState,
+    rates: Mapping[str, float],
+    options: AdamOptions = PLAIN,
+    sh_degree: int = MAX_SH_DEGREE,
+) -> ColorStep:
+    """How `render_backward` steps `sh`: at the rate "sh", its view-dependent part at "sh_rest";
+    coefficients of higher degrees than the one in use are left alone."""
+    tables = state.tables["sh"]
+    tables.rates[:3] = rates["sh"]
+    tables.rates[3:] = rates["sh_rest"]
+    in_use = tables._replace(rates=tables.rates[: 3 * (sh_degree + 1) ** 2])
+    return ColorStep(state.steps, in_use, options)
+
+
 def step(
     state: TrainState,
     rows: np.ndarray,
     rates: Mapping[str, float],
     options: AdamOptions = PLAIN,
-    sh_degree: int = MAX_SH_DEGREE,
 ) -> None:
-    """Step the listed rows (M,) int32 of every parameter along its gradient.
-
-    rates      learning rate by parameter name; "sh_rest" is that of the view-dependent part of `sh`
-    sh_degree  in use: coefficients of higher ones have no gradient, and memory is left alone
+    """Step the listed rows (M,) int32 of every parameter but `sh` along its gradient, at its rate.
 
     Steps are counted per row, because rows are trained unequally often (STGA, selective training).
     """
-    tables = dict(state.tables)
+    tables = {name: table for name, table in state.tables.items() if name != "sh"}
     for name, table in tables.items():
         table.rates[:] = rates[name]
-    sh_rates = tables["sh"].rates
-    sh_rates[3:] = rates["sh_rest"]
-    tables["sh"] = tables["sh"]._replace(rates=sh_rates[: 3 * (sh_degree + 1) ** 2])
     adam_rows(rows, state.steps, tuple(tables.values()), options)
 
 

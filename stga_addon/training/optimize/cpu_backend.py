@@ -11,6 +11,7 @@ from ...capture.model import View
 from ...raster.cpu import optimizer, rasterize
 from ...raster.cpu.image_loss import LOSS_REACH_PX, change_background
 from ...raster.cpu.layout import CameraFrames, Parameters
+from ...raster.cpu.optimizer import ColorStep
 from ...raster.cpu.threads import threads
 from ..settings import TrainingSettings
 from . import adam
@@ -50,8 +51,9 @@ class CpuBackend:
             target = over.view()
             target.setflags(write=False)  # like the loader's: Numba compiles for one type only
         frames = self._moved_frames(batch.view.timestep)
-        rows, screen, loss = self._backward(frames, batch.view, target, batch.options, focus)
         options = adam.adam_options(settings, batch.view.camera)
+        color = adam.color_step(state, batch.rates, options, batch.options.sh_degree)
+        rows, screen, loss = self._backward(frames, batch.view, target, batch.options, focus, color)
         signals = self._frames.signals(batch.view.timestep)
         # before the limits' gradients are added
         adam.step_offsets(state, rows, signals, batch.rates, options)
@@ -74,7 +76,7 @@ class CpuBackend:
             xyz = state.parameters.xyz
             weight = settings.distance_weight
             optimizer.distance_limit(rows, xyz, face, unbound, limit, weight, gradients.xyz)
-        adam.step(state, rows, batch.rates, options, batch.options.sh_degree)
+        adam.step(state, rows, batch.rates, options)
         if batch.accumulate:
             optimizer.add_screen_gradients(
                 rows, screen, state.screen_gradient, state.gradient_count
@@ -83,11 +85,12 @@ class CpuBackend:
 
     def render(self, view: View, options: RenderOptions) -> np.ndarray:
         frames = self._moved_frames(view.timestep, averaged=True)
-        seen = rasterize.frames_in_camera(frames, view.camera)
+        seen = rasterize.frames_in_camera(frames, view.camera, self._buffers)
         return self._forward(self.state.average, seen, options).image.copy()
 
     def blend_weights(self, view: View) -> np.ndarray:
-        seen = rasterize.frames_in_camera(self._moved_frames(view.timestep), view.camera)
+        frames = self._moved_frames(view.timestep)
+        seen = rasterize.frames_in_camera(frames, view.camera, self._buffers)
         rendering = self._forward(self.state.parameters, seen, WITHOUT_COLOR)
         return rasterize.blend_weights(rendering, self._buffers)
 
@@ -114,13 +117,15 @@ class CpuBackend:
         target: np.ndarray,
         options: RenderOptions,
         focus: np.ndarray | None,
+        color: ColorStep | None = None,
     ) -> tuple[np.ndarray, np.ndarray, float | None]:
-        """Fill the trained rows' gradients; returns these rows, screen gradients (N,) and loss."""
+        """Fill the trained rows' gradients, those of `sh` only where they are not stepped by
+        `color`; returns these rows, screen gradients (N,) and loss."""
         weight = self._settings.ssim_weight
         height = view.camera.height
         width = view.camera.width
         state = self.state
-        seen = rasterize.frames_in_camera(frames, view.camera)
+        seen = rasterize.frames_in_camera(frames, view.camera, self._buffers)
         rendering = self._forward(state.parameters, seen, options, focus)
         if focus is None:
             key = height, width, threads()
@@ -137,6 +142,7 @@ class CpuBackend:
             v_image,
             state.gradients,
             buffers=self._buffers,
+            color=color,
         )
         loss = (1 - weight) * l1 + weight * (1 - ssim)
         return rows, screen, loss if focus is None else None

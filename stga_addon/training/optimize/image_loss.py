@@ -11,7 +11,8 @@ from ...raster.cpu.threads import PROCESSORS, threads
 from ...raster.cpu.tiles import box_groups
 
 BAND_TILES = 4
-"""Most rows of tiles in a rectangle of a local iteration; each computes 20 rows of pixels more."""
+"""A rectangle of a local iteration is not cut into fewer rows of tiles; each computes 20 rows of
+pixels more."""
 
 
 @cache
@@ -36,8 +37,11 @@ def whole_image(height: int, width: int, bands: int | None = None) -> np.ndarray
 
 def tile_rectangles(tiles: np.ndarray, height: int, width: int) -> np.ndarray:
     """Rectangles (R, 4) of pixels around each connected group of marked tiles (rows, columns) bool,
-    the largest first; those of more than BAND_TILES rows are cut, for the threads."""
-    return np.minimum(box_groups(tiles, BAND_TILES) * TILE, [width, height, width, height])
+    the largest first; those of more rows than a thread's share, or BAND_TILES, are cut."""
+    share = -(-int(tiles.any(1).sum()) // min(threads(), PROCESSORS))
+    boxes = box_groups(tiles, max(BAND_TILES, share))
+    largest_first = np.argsort((boxes[:, 0] - boxes[:, 2]) * (boxes[:, 3] - boxes[:, 1]))
+    return np.minimum(boxes[largest_first] * TILE, [width, height, width, height])
 
 
 def image_gradient(

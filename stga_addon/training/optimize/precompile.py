@@ -17,7 +17,7 @@ from ...raster.cpu.threads import Team
 from ...render.device import adapter_name
 from ...worker.launch import is_preparing
 from . import adam
-from .image_loss import image_gradient, whole_image
+from .image_loss import image_gradient, tile_rectangles, whole_image
 from .state import TrainState, new_state, with_offsets
 
 HELPER_TIMEOUT_S = 120.0
@@ -91,7 +91,8 @@ def _step() -> None:
     optimizer.scale_limit(rows, log_scale, face, unbound, limits, 1.0, gradients.log_scale)
     optimizer.opacity_weight(rows, opacity, state.unseen_share, 1.0, gradients.opacity)
     optimizer.distance_limit(rows, xyz, face, unbound, limits[0], 1.0, gradients.xyz)
-    image_gradient(image, target, whole_image(16, 16), 0.2, np.empty_like(image))
+    for rectangles in (whole_image(16, 16), tile_rectangles(np.ones((1, 1), bool), 16, 16)):
+        image_gradient(image, target, rectangles, 0.2, np.empty_like(image))
     rates = dict.fromkeys((*Parameters._fields, "sh_rest", "strain_color"), 1e-3)
     adam.step(state, rows, rates)
     screen = state.screen_gradient
