@@ -13,7 +13,7 @@ from ...capture.mesh_geometry import connected_parts, rasterize, silhouette, tri
 from ...capture.model import Capture, View, evenly_spread, views_by_timestep
 from ...flame.quaternions import unit
 from .initial_splats import FEW_CAMERAS, SAMPLED_HEIGHT_PIXELS, mirrored, voxel_size
-from .likeness import BROWS_LEVEL, head_coordinates, kinds_of
+from .likeness import head_coordinates, kinds_of
 
 FACING_TIMESTEPS = 300
 FACING_MESHES = 48
@@ -164,11 +164,10 @@ class Surface:
     def is_flat(self) -> np.ndarray:
         """(F,) bool: hidden triangles and, where few cameras do not tell how thick it is, skin and
         clothes, above which no outline shows anything to stand."""
-        at = head_coordinates(self.capture)
-        if at is None or not self.has_few_cameras:
+        if head_coordinates(self.capture) is None or not self.has_few_cameras:
             return self.hidden
         voxel = voxel_size(np.asarray(self.capture.neutral))
-        bare = self.outside & ~self._scalp & (at.level < BROWS_LEVEL)
+        bare = self.outside & ~self._scalp
         stands = self._is_measured & (self._measured_height > STANDING_VOXELS * voxel)
         if stands.any():
             center = np.asarray(self.capture.neutral, np.float64)[self.capture.faces].mean(1)
