@@ -144,10 +144,12 @@ CLOTH = np.array([30, 60, 160], np.uint8)
 EYES = np.array([200, 180, 170], np.uint8)
 
 
-def test_hair_goes_round_the_head(from_one_side, tmp_path):
-    """Catches a back of the head in the color of skin, a neck with hair or in the color of clothes,
-    clothes that end where the camera does, a closed mouth that is skin inside, teeth that are too
-    white, and lips with a dark rim."""
+@pytest.mark.parametrize("angles", [(-45, -20, 0, 20, 45), (0,)])
+def test_hair_goes_round_the_head(angles, from_one_side, tmp_path):
+    """Also that of a head that does not turn, of which a fringe alone is shown. Catches a back of
+    the head in the color of skin, a neck with hair or in the color of clothes, clothes that end
+    where the camera does, a closed mouth that is skin inside, teeth that are too white, and lips
+    with a dark rim."""
     model = flame_model(None)
     neutral = model.v_template
     centers = neutral[model.faces].mean(1)
@@ -166,7 +168,7 @@ def test_hair_goes_round_the_head(from_one_side, tmp_path):
     for eye in ("left_eyeball", "right_eyeball"):
         color[faces_within(model.faces, model.masks[eye])] = EYES
     views = []
-    for number, angle in enumerate(np.radians((-45, -20, 0, 20, 45))):
+    for number, angle in enumerate(np.radians(angles)):
         eye = [np.sin(angle), 0, np.cos(angle)]
         camera = look_at(eye, [0, -0.02, 0], 160, 200, 480)
         triangle, _ = rasterize(neutral, model.faces, camera)
@@ -188,6 +190,8 @@ def test_hair_goes_round_the_head(from_one_side, tmp_path):
         assert rows.sum() > 8, part
         off = np.abs(255 * sides.color[rows] - expected).max(1)
         assert (off < 25).mean() > 0.9, (part, np.median(255 * sides.color[rows], 0))
+    if len(angles) == 1:
+        return
     teeth = faces_within(model.faces, model.masks["teeth"])
     assert sides.triangles[teeth].all()
     part = connected_parts(len(neutral), model.faces)[model.faces[:, 0]]

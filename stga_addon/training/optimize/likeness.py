@@ -17,6 +17,7 @@ NECK_ANGLE_DEG = 60.0
 begins behind the third."""
 EYES_TO_MIDDLE = 1.35
 BROWS_OVER_EYES = 0.15
+BROWS_LEVEL = 0.45
 JAW_LEVEL = -0.5
 CHIN_LEVEL = -2.0
 """Places on a head, in distances of its eyes from its mouth: how far its middle lies behind the

@@ -10,6 +10,7 @@ from ...capture.mesh_geometry import connected_parts
 from ...capture.model import Capture, View, evenly_spread, views_by_timestep
 from .initial_splats import mean_colors, mirror_images
 from .likeness import (
+    BROWS_LEVEL,
     hairy_triangles,
     head_coordinates,
     inside_colors,
@@ -26,8 +27,10 @@ mouth is highest."""
 MIN_TEETH_SHARE = 0.08
 """Of the teeth's triangles, half of which are behind others, that views show at least."""
 SOURCE_COSINE = 0.5
-"""Of the angle between a triangle and a camera: below it, others do not take its color, which a
-matte's edge may be in."""
+FRINGE_COSINE = 0.2
+"""Of the angle between a triangle and a camera: below the first, others do not take its color,
+which a matte's edge may be in; below the second, nor does the scalp, of which a head that does not
+turn shows a fringe alone."""
 MIN_SHOWN_SHARE = 0.1
 """Of the pixels that usually show as much of the surface: a folded eyelid has less."""
 SOURCE_TRIANGLES = 100
@@ -75,7 +78,10 @@ def unseen_sides(surface: Surface) -> UnseenSides:
     kinds = {} if at is None else kinds_of(at, is_outside)
     for kind, members in kinds.items():
         own = np.flatnonzero(members & is_source)
-        if kind == "scalp":
+        if kind == "scalp" and at is not None:
+            if not len(own):
+                is_above = is_outside & (at.level > BROWS_LEVEL)
+                own = np.flatnonzero(is_above & (pixels > 0) & (cosine > FRINGE_COSINE))
             own = hairy_triangles(own, centers, color, capture.regions)
         rows = np.flatnonzero(members & unseen)
         if at is not None and len(own) and len(rows):
