@@ -144,9 +144,11 @@ CLOTH = np.array([30, 60, 160], np.uint8)
 EYES = np.array([200, 180, 170], np.uint8)
 
 
-@pytest.mark.parametrize("angles", [(-45, -20, 0, 20, 45), (0,)])
-def test_hair_goes_round_the_head(angles, from_one_side, tmp_path):
-    """Also that of a head that does not turn, of which a fringe alone is shown. Catches a back of
+@pytest.mark.parametrize(
+    ("angles", "height", "fringe"), [((-45, -20, 0, 20, 45), 0.0, 0.75), ((0,), -0.5, 0.5)]
+)
+def test_hair_goes_round_the_head(angles, height, fringe, from_one_side, tmp_path):
+    """Also that of a head that does not turn, of which a fringe is shown from below. Catches a back of
     the head in the color of skin, a neck with hair or in the color of clothes, clothes that end
     where the camera does, a closed mouth that is skin inside, teeth that are too white, and lips
     with a dark rim."""
@@ -162,14 +164,14 @@ def test_hair_goes_round_the_head(angles, from_one_side, tmp_path):
         regions=key_regions(model),
     )
     level = (centers[:, 1] - 0.04) / 0.07  # over the eyes, in their distance from the mouth
-    hairline = np.interp(centers[:, 2], (-0.02, 0.06), (-1.1, 0.75))
+    hairline = np.interp(centers[:, 2], (-0.02, 0.06), (-1.1, fringe))
     color = np.where((level > hairline)[:, None], HAIR, SKIN)
     color[level < -2.2] = CLOTH
     for eye in ("left_eyeball", "right_eyeball"):
         color[faces_within(model.faces, model.masks[eye])] = EYES
     views = []
     for number, angle in enumerate(np.radians(angles)):
-        eye = [np.sin(angle), 0, np.cos(angle)]
+        eye = [np.sin(angle), height, np.cos(angle)]
         camera = look_at(eye, [0, -0.02, 0], 160, 200, 480)
         triangle, _ = rasterize(neutral, model.faces, camera)
         picture = np.full((200, 160, 3), 255, np.uint8)

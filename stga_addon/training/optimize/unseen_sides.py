@@ -29,8 +29,10 @@ MIN_TEETH_SHARE = 0.08
 SOURCE_COSINE = 0.5
 FRINGE_COSINE = 0.2
 """Of the angle between a triangle and a camera: below the first, others do not take its color,
-which a matte's edge may be in; below the second, nor does the scalp, of which a head that does not
-turn shows a fringe alone."""
+which a matte's edge may be in; below the second, nor does the scalp take that of a fringe, where it
+is not shown itself."""
+FRINGE_SHARE = 0.2
+"""Of what is shown above the brows, the highest, where hair is if there is any."""
 MIN_SHOWN_SHARE = 0.1
 """Of the pixels that usually show as much of the surface: a folded eyelid has less."""
 SOURCE_TRIANGLES = 100
@@ -82,6 +84,7 @@ def unseen_sides(surface: Surface) -> UnseenSides:
             if not len(own):
                 is_above = is_outside & (at.level > BROWS_LEVEL)
                 own = np.flatnonzero(is_above & (pixels > 0) & (cosine > FRINGE_COSINE))
+                own = own[np.argsort(at.level[own])][int(len(own) * (1 - FRINGE_SHARE)) :]
             own = hairy_triangles(own, centers, color, capture.regions)
         rows = np.flatnonzero(members & unseen)
         if at is not None and len(own) and len(rows):
