@@ -148,10 +148,10 @@ EYES = np.array([200, 180, 170], np.uint8)
     ("angles", "height", "fringe"), [((-45, -20, 0, 20, 45), 0.0, 0.75), ((0,), -0.5, 0.5)]
 )
 def test_hair_goes_round_the_head(angles, height, fringe, from_one_side, tmp_path):
-    """Also that of a head that does not turn, of which a fringe is shown, from below. Catches a back
-    of the head in the color of skin, a neck with hair or in the color of clothes, clothes that end
-    where the camera does, a closed mouth that is skin inside, teeth that are too white, and lips
-    with a dark rim."""
+    """Also that of a head that does not turn, of which a fringe is shown, from below. Catches a
+    back of the head in the color of skin, a neck with hair or in the color of clothes, clothes that
+    end where the camera does, a closed mouth that is skin inside, teeth that are too white, and
+    lips with a dark rim."""
     model = flame_model(None)
     neutral = model.v_template
     centers = neutral[model.faces].mean(1)
