@@ -368,6 +368,23 @@ def _mode(path: Path) -> int:
         raise StgaError(f"{path}: cannot be read ({error.strerror or error})") from error
 
 
+def usable_path(text: str) -> Path:
+    """Raises StgaError for a name that no file can have: empty, too long or with a NUL."""
+    try:
+        os.lstat(text)
+        too_long = False
+    except OSError as error:
+        too_long = error.errno == errno.ENAMETOOLONG
+    except ValueError as error:  # a NUL, or a character that file names cannot encode
+        raise StgaError(f"'{text}' is not a usable path ({error})") from error
+    # The system looks at names in turn and stops at the first that is missing.
+    if too_long or any(len(os.fsencode(part)) > MAX_NAME_BYTES for part in Path(text).parts):
+        raise StgaError(f"'{text}' is not a usable path (too long)")
+    if not text:
+        raise StgaError("the path is empty")
+    return Path(text)
+
+
 def file_size(path: Path) -> int:
     """Size in bytes. Raises StgaError for no regular file: a pipe or a device need never end."""
     try:

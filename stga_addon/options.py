@@ -1,9 +1,7 @@
 """Fields of dataclasses as options: of the command line; of Blender in `operators/options.py`."""
 
 import dataclasses
-import errno
 import math
-import os
 import re
 from argparse import ArgumentTypeError, Namespace
 from collections.abc import Callable, Collection, Iterator, Mapping
@@ -12,7 +10,7 @@ from types import NoneType
 from typing import Any, get_args, get_origin
 
 from .errors import StgaError, shorten
-from .files import MAX_NAME_BYTES
+from .files import usable_path
 from .schema import alternatives, expectation, setting, type_hints
 
 MAX_DIGITS = 18  # Of a whole number on the command line, which fits 64 bits
@@ -182,23 +180,6 @@ def _parser(kind: Any, limits: Mapping[str, Any]) -> Callable[[str], Any]:
         return value
 
     return parse
-
-
-def usable_path(text: str) -> Path:
-    """Raises StgaError for a name that no file can have: empty, too long or with a NUL."""
-    try:
-        os.lstat(text)
-        too_long = False
-    except OSError as error:
-        too_long = error.errno == errno.ENAMETOOLONG
-    except ValueError as error:  # a NUL, or a character that file names cannot encode
-        raise StgaError(f"'{text}' is not a usable path ({error})") from error
-    # The system looks at names in turn and stops at the first that is missing.
-    if too_long or any(len(os.fsencode(part)) > MAX_NAME_BYTES for part in Path(text).parts):
-        raise StgaError(f"'{text}' is not a usable path (too long)")
-    if not text:
-        raise StgaError("the path is empty")
-    return Path(text)
 
 
 def _whole_number(text: str) -> Any:

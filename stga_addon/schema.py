@@ -13,6 +13,7 @@ from typing import Any, Union, get_args, get_origin, get_type_hints
 import numpy as np
 
 from .errors import StgaError, shorten
+from .files import usable_path
 
 MAX_COUNT = (1 << 31) - 1  # Largest whole number that kernels can count to
 KIND = "kind"  # Key that names the dataclass where a field may hold one of several
@@ -221,7 +222,10 @@ def _parsed(hint: Any, value: Any, where: str, arrays: Mapping[str, np.ndarray])
         paths = {name: _joined(where, name) for name in hints}
         return chosen(**{n: _parsed(hints[n], value[n], paths[n], arrays) for n in hints})
     if isinstance(value, str) and Path in kinds and str not in kinds:
-        return Path(value)
+        try:
+            return usable_path(value)
+        except StgaError as error:
+            raise StgaError(f"setting {where}: {error}") from error
     if isinstance(value, list):
         items = next((get_args(kind) for kind in kinds if get_origin(kind) is tuple), (Any,))
         return tuple(

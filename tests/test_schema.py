@@ -162,6 +162,9 @@ OTHER_FORMS = [
     ),
     ({"last": {"side": 0, "points": None}}, f"d: setting last.side: {SIDE}, got 0"),
     ({"more": 1}, "d: fields are missing or unknown (more)"),
+    ({"path": "a\0b"}, "d: setting path: 'a\\x00b' is not a usable path"),
+    ({"path": "a\ud800"}, "d: setting path: 'a\\ud800' is not a usable path"),
+    ({"path": 300 * "a"}, "d: setting path: 'aaa"),
 ]
 
 

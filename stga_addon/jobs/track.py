@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..errors import StgaError, shorten
-from ..files import read_json, write_json
+from ..files import read_json, usable_path, write_json
 from ..format import format_duration
-from ..options import option, usable_path
+from ..options import option
 from ..progress import Cancelled, Progress, Report, Say, TimeLeft, Written
 from ..report import CURVE
 from ..tracking.folder import KEPT_FOLDER, LOCK_FILE, REPORT_FILE, SHEET_FILE, is_flame, is_written
