@@ -54,7 +54,8 @@ for name in ("pressed", "clicks", "messages", "undo", "cut", "texts", "images", 
 def shot(name):
     """A picture of the window, and the texts in its panels that do not fit."""
     in_window.picture(FOLDER / f"{name}.png")
-    seen["cut"] |= {f"{name}, {what}": widths for what, widths in drawn_panels.cut_texts().items()}
+    cut = drawn_panels.cut_texts() if hasattr(bpy.types.Scene, "stga") else {}
+    seen["cut"] |= {f"{name}, {what}": widths for what, widths in cut.items()}
 
 
 def click(name, action, /, *how, **options):
