@@ -3,6 +3,7 @@
 import os
 import shlex
 
+import bpy  # noqa: F401  which brings the module gpu
 import pytest
 
 BLENDER = shlex.split(os.environ.get("STGA_BLENDER", ""))
