@@ -308,11 +308,8 @@ class _Cloth:
         mask = shot.masks[number]
         head = shot.heads[number]
         share = sampled([mask], pixels * (mask.shape[::-1] / size))[0]
-        x, y = (
-            np.clip(pixels * (head.shape[::-1] / size), 0, np.array(head.shape[::-1]) - 1)
-            .astype(int)
-            .T
-        )
+        (height, width) = head.shape
+        x, y = np.clip(pixels * ([width, height] / size), 0, [width - 1, height - 1]).astype(int).T
         return inside(finest, pixels, depth) & (share > 127) & ~head[y, x]
 
     def _returned(self, shot: TorsoShot, number: int, bend: np.ndarray) -> _Returned:
