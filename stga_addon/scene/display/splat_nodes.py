@@ -354,7 +354,7 @@ def build_next_node_group(options: TreeOptions) -> bool:
     # What `_build` uses, each after those that it uses itself.
     groups = [PLACED[convention], _RELIT, *MODES.values(), *SH_BANDS[:degree]]
     if convention is not None:
-        groups += [FRAMES[convention], _FROZEN_SPLATS]
+        groups += [FRAMES[convention], _FROZEN_SPLATS, _MARKED, _PAINT]
         groups += [DEFORMED] if offsets else []
         groups += [SIGNALS[name] for name in options.signals]
         groups += [driven(name, convention) for name in offsets]
@@ -436,15 +436,11 @@ def _build(nodes: Nodes, options: TreeOptions) -> None:
             added = nodes.sample(mesh, nodes.attribute(FACE_COLOR), face, "FLOAT_VECTOR")
         color = _color(nodes, inputs, added, options.degree)
         splats = nodes.store(splats, _FROZEN, nodes.group(_FROZEN_SPLATS, head), "BOOLEAN")
-        for attribute, show, only, paint in (
-            (_FROZEN, SHOW_SELECTION, SELECTED_ONLY, FROZEN_COLOR),
-            (stored.UNSEEN, SHOW_UNSEEN, FILMED_ONLY, UNSEEN_COLOR),
-        ):
-            rows = nodes.attribute(attribute, "BOOLEAN")
-            is_shown = nodes.logic("AND", rows, inputs[show])
-            color = nodes.switch("RGBA", is_shown, color, paint)
-            painted = nodes.logic("OR", is_shown, painted)
-            visible = nodes.logic("NIMPLY", visible, nodes.logic("AND", rows, inputs[only]))
+        painted = nodes.group(_MARKED, inputs[SHOW_SELECTION], inputs[SHOW_UNSEEN])
+        paint = nodes.group(_PAINT, inputs[SHOW_UNSEEN])
+        color = nodes.switch("RGBA", painted, color, paint)
+        hidden = nodes.group(_MARKED, inputs[SELECTED_ONLY], inputs[FILMED_ONLY])
+        visible = nodes.logic("NIMPLY", visible, hidden)
     splats = nodes.store(splats, stored.DISPLAY_COLOR, nodes.group(_RELIT, color), "FLOAT_COLOR")
     native = None
     if compat.NATIVE_SPLATS:
@@ -500,6 +496,23 @@ def _frozen_splats(nodes: Nodes, mesh: Any) -> bpy.types.NodeSocket:
 
 
 _FROZEN_SPLATS = NodeGroup("STGA Frozen Splats", {"Mesh": "Geometry"}, "Bool", _frozen_splats)
+
+
+def _marked(nodes: Nodes, frozen: Any, unseen: Any) -> bpy.types.NodeSocket:
+    """Field: splats of those kinds that are asked for."""
+    kinds = (_FROZEN, frozen), (stored.UNSEEN, unseen)
+    found = [nodes.logic("AND", nodes.attribute(name, "BOOLEAN"), asked) for name, asked in kinds]
+    return nodes.logic("OR", *found)
+
+
+def _paint(nodes: Nodes, shows_unseen: Any) -> bpy.types.NodeSocket:
+    """Field: the color of a marked splat; unseen ones have theirs where it is shown."""
+    unseen = nodes.logic("AND", nodes.attribute(stored.UNSEEN, "BOOLEAN"), shows_unseen)
+    return nodes.switch("RGBA", unseen, FROZEN_COLOR, UNSEEN_COLOR)
+
+
+_MARKED = NodeGroup("STGA Marked Splats", {"Frozen": "Bool", "Unseen": "Bool"}, "Bool", _marked)
+_PAINT = NodeGroup("STGA Paint", {"Shows Unseen": "Bool"}, "Color", _paint)
 
 
 def _relit_color(nodes: Nodes, color: Any) -> bpy.types.NodeSocket:
