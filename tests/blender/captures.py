@@ -1,13 +1,14 @@
 """Captures and FLAME sequences made by hand, so that the scene is tested, not readers."""
 
+from dataclasses import replace
+
 import bpy
 import numpy as np
+from flame.conftest import model_of, random_arrays, random_frame
 from flame.small_head import small_head, write_flame
 from numpy.random import default_rng
 
 from stga_addon.capture.model import Capture
-from stga_addon.flame.forward import FlameFrame
-from stga_addon.flame.model import FlameModel
 from stga_addon.flame.sequence import FlameSequence, expression_mesh, neutral_mesh, sequence_mesh
 from stga_addon.scene.arrays import evaluated_vertices
 
@@ -53,38 +54,17 @@ def mesh_capture(
 
 def flame_model(vertices=80, components=40, identity=10, seed=0):
     """A random model whose joints depend on more terms than one driver holds."""
-    rng = default_rng(seed)
-    weights = rng.random((vertices, 5)) ** 4
-    regressor = rng.random((5, vertices)) * (rng.random((5, vertices)) < 0.3)
-    regressor[:, 0] += 0.1
-    return FlameModel(
-        v_template=rng.normal(0, 0.08, (vertices, 3)),
-        shapedirs=rng.normal(0, 0.003, (vertices, 3, components)),
-        n_identity=identity,
-        posedirs=rng.normal(0, 0.004, (vertices, 3, 36)),
-        j_regressor=regressor / regressor.sum(1, keepdims=True),
-        parents=np.array([-1, 0, 1, 1, 1]),
-        weights=weights / weights.sum(1, keepdims=True),
-        faces=strip(vertices),
-    )
+    return model_of(random_arrays(seed, vertices, components) | {"f": strip(vertices)}, identity)
 
 
 def flame_sequence(model, timesteps=(4, 5, 9), seed=0, dynamic=False):
     """Large random poses, so that a transposed rotation or a wrong pivot is centimeters off."""
     rng = default_rng(seed)
     size = len(model.v_template)
-    frames = {
-        timestep: FlameFrame(
-            expr=rng.normal(size=model.n_expression),
-            rotation=rng.normal(0, 0.7, 3),
-            neck_pose=rng.normal(0, 0.4, 3),
-            jaw_pose=rng.normal(0, 0.4, 3),
-            translation=rng.normal(0, 0.2, 3),
-            eyes_pose=rng.normal(0, 0.4, 6),
-            dynamic_offset=rng.normal(0, 0.01, (size, 3)) if dynamic else None,
-        )
-        for timestep in timesteps
-    }
+    frames = {t: random_frame(seed + t, model.n_expression) for t in timesteps}
+    if dynamic:
+        for t, frame in frames.items():
+            frames[t] = replace(frame, dynamic_offset=rng.normal(0, 0.01, (size, 3)))
     shape = rng.normal(size=model.n_identity)
     offset = rng.normal(0, 0.002, (size, 3))
     return FlameSequence(model, shape, offset, tuple(timesteps), frames.__getitem__)

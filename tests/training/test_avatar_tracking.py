@@ -12,6 +12,7 @@ import torch
 from command_line import refused, stga
 from numpy.testing import assert_allclose, assert_array_equal, assert_equal
 from PIL import Image
+from raster.reference import rotation_matrix
 from refusal import refusal
 from scipy.spatial.transform import Rotation
 
@@ -362,23 +363,8 @@ def test_the_gradient_from_splats_to_parameters(lost):
 
     def loss():
         origin, turn, scale = (torch.from_numpy(getattr(frames(), name)[face]) for name in NAMES)
-        w, x, y, z = (rotation / rotation.norm(dim=1, keepdim=True)).unbind(1)
-        own = torch.stack(
-            [
-                1 - 2 * (y * y + z * z),
-                2 * (x * y - w * z),
-                2 * (x * z + w * y),
-                2 * (x * y + w * z),
-                1 - 2 * (x * x + z * z),
-                2 * (y * z - w * x),
-                2 * (x * z - w * y),
-                2 * (y * z + w * x),
-                1 - 2 * (x * x + y * y),
-            ],
-            1,
-        ).reshape(-1, 3, 3)
         place = scale[:, None] * (turn @ xyz[..., None])[..., 0] + origin
-        axes = scale[:, None, None] * turn @ own * log_scale.exp()[:, None]
+        axes = scale[:, None, None] * turn @ rotation_matrix(rotation) * log_scale.exp()[:, None]
         return (toward * place).sum() + 0.1 * (along * (axes @ axes.mT)).sum()
 
     leaves = [tensor.requires_grad_() for tensor in (xyz, rotation, log_scale)]

@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 from avatar.conftest import splats_of
+from numpy.testing import assert_array_equal
 
 from stga_addon.training.optimize.cpu_backend import CpuBackend
 from stga_addon.training.optimize.state import arrays_of, new_state
@@ -83,3 +84,13 @@ def bits(state):
     return {
         name: array.copy().reshape(len(state), -1).view(np.uint8) for name, array in arrays.items()
     }
+
+
+def assert_only_selected_changed(before, after, selected):
+    """Rows (`bits`) that are not selected stay bit by bit; most of the others are trained."""
+    for name in before:
+        assert_array_equal(after[name][~selected], before[name][~selected], err_msg=name)
+    for name in ("parameters/xyz", "parameters/sh", "first/opacity", "second/rotation", "steps"):
+        changed = (after[name] != before[name]).any(axis=1)
+        # those on the far side of the ball may be invisible
+        assert changed[selected].mean() > 0.3, name
