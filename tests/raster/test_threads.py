@@ -11,9 +11,11 @@ import pytest
 from numpy.testing import assert_array_equal, assert_equal
 
 pytest.importorskip("numba")
+from numba import types
+from numba.extending import intrinsic
 
 from stga_addon.raster.cpu import jit
-from stga_addon.raster.cpu.elementary import fetch_add
+from stga_addon.raster.cpu.elementary import fetch_add, latest, yield_processor
 from stga_addon.raster.cpu.threads import (
     call_helpers,
     end_stages,
@@ -53,6 +55,34 @@ def test_every_unit_is_done_once(count, piece):
         for _ in range(10):
             call(done)
         assert (done == 10).all()
+
+
+@intrinsic
+def is_counted(typing, array):
+    def generate(context, builder, signature, arguments):
+        owner = context.make_array(signature.args[0])(context, builder, arguments[0]).meminfo
+        return builder.icmp_unsigned("!=", owner, owner.type(None))
+
+    return types.boolean(array), generate
+
+
+@parallel(lambda *_: 2)
+def look_at_counts(work, begun, counted):
+    call_helpers(work)
+    for n, _ in pieces(work):
+        fetch_add(begun, 0, 1)
+        while latest(begun, 0) < 2:  # so that the helper does one of the two
+            yield_processor()
+        counted[n] = is_counted(counted)
+
+
+def test_helpers_count_no_references():
+    """Catches cores that take the counts of the same arrays' references from each other, a dozen
+    times for every block of rows."""
+    set_threads(2)
+    counted = np.zeros(2, bool)
+    look_at_counts(np.zeros(1, np.int64), counted)
+    assert sorted(counted) == [False, True]
 
 
 @parallel(lambda numbers, *_: len(numbers))

@@ -14,6 +14,7 @@ import ctypes
 import os
 from collections.abc import Callable
 from functools import wraps
+from itertools import pairwise
 from threading import Lock, Thread
 from typing import Any
 
@@ -183,6 +184,13 @@ def _keep_call(typing: Any, words: Any) -> Any:
         kernel = builder.function
         values = list(kernel.args[2:])  # after where it returns a value and an error
         values[2] = values[5] = ir.IntType(64)(SEEN)  # length and shape of the first array
+        # An array begins with two pointers, the first to its count of references. The caller holds
+        # the arrays: helpers count none, or the processor's cores would take it from each other.
+        for n, (value, following) in enumerate(pairwise(values)):
+            if isinstance(value.type, ir.PointerType) and isinstance(
+                following.type, ir.PointerType
+            ):
+                values[n] = value.type(None)
         record = ir.LiteralStructType([value.type for value in values])
         assert context.get_abi_sizeof(record) <= 8 * CALL_WORDS
         kind = context.call_conv.get_function_type(types.none, (types.voidptr,))
