@@ -194,7 +194,6 @@ def render_backward(
     """
     n = len(splats.xyz)
     buffers = buffers or BufferPool()
-    tiles_x, _ = tile_grid(*frames.size)
     lists = output.lists
     columns = output.projection.columns
     tiles, rows, wanted = _in_focus(output, n, buffers)
@@ -207,7 +206,7 @@ def render_backward(
         )
     blend_backward(
         tiles,
-        tiles_x,
+        tile_grid(*frames.size)[0],
         lists,
         output.blended,
         wanted,
