@@ -197,8 +197,7 @@ def test_hair_goes_round_the_head(angles, height, fringe, from_one_side, tmp_pat
     teeth = faces_within(model.faces, model.masks["teeth"])
     assert sides.triangles[teeth].all()
     part = connected_parts(len(neutral), model.faces)[model.faces[:, 0]]
-    mouth = centers[key_regions(model)["mouth"]].mean(0)
-    off = np.linalg.norm(centers - mouth, axis=1)
+    off = np.linalg.norm(centers - centers[key_regions(model)["mouth"]].mean(0), axis=1)
     front = teeth & (off < 0.02) & (centers[:, 2] > np.quantile(centers[teeth, 2], 0.8))
     assert_allclose(np.median(sides.color[front], 0), 0.85 * EYES / 255, rtol=0.1)
     inside = sides.triangles & ~Surface(bare).outside & ~teeth & (off < 0.06)
