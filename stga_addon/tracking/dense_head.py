@@ -203,8 +203,8 @@ class DenseHead:
     ) -> tuple[np.ndarray, np.ndarray]:
         """Gauss–Newton terms of a level's points by their positions: H (M, 3, 3) and b (M, 3)."""
         at = self.positions(values, level)
-        matrix = np.zeros((len(at), 3, 3), np.float32)
-        right = np.zeros((len(at), 3), np.float32)
+        matrix = np.zeros((len(at), 3, 3))
+        right = np.zeros((len(at), 3))
         basis = self.light_basis(values, level)
         rows = self.rows[level]
         for view, seen in zip(views, visible, strict=True):
