@@ -189,12 +189,14 @@ def inside_colors(
 
 def _white_of_eyes(capture: Capture, color: np.ndarray, shown: np.ndarray) -> np.ndarray:
     masks = {} if capture.flame is None else capture.flame.model.masks
-    eyes = [masks[name] for name in EYEBALLS if name in masks]
-    rows = [np.flatnonzero(faces_within(capture.faces, eye) & shown) for eye in eyes]
-    bright = sorted(np.concatenate([*rows, []]).astype(int), key=lambda row: color[row].sum())
-    if not bright:
+    eyes = np.zeros(len(shown), bool)
+    for name in set(EYEBALLS) & set(masks):
+        eyes |= faces_within(capture.faces, masks[name])
+    bright = color[eyes & shown]
+    if not len(bright):
         return WHITE
-    return np.asarray(color[bright[int(WHITE_QUANTILE * len(bright)) :]].mean(0))
+    bright = bright[np.argsort(bright.sum(1))]
+    return np.asarray(bright[int(WHITE_QUANTILE * len(bright)) :].mean(0))
 
 
 def skin_of(capture: Capture) -> np.ndarray:

@@ -31,9 +31,9 @@ HIDDEN_FLATNESS = 0.25
 """Of the layer on hidden triangles: order of the lattice where none is chosen, logit, and how much
 thinner it is than the lattice's splats."""
 LID_DEPTH_SHARE = 0.5
-LID_EDGE_SHARE = 0.6
+BESIDE_LID_SHARE = 0.6
 """Of the depth of the layer under lids, below which a splat belongs to it; of its scale, at lids'
-edges, where it would stand out beside the eye."""
+edges and in the mouth, where it would stand out beside the eye and the lips."""
 BORDER_INSET = 0.6
 """Of the distance from the middle of a triangle, and of the scale, at the mesh's edge."""
 HEAD_RADIUS_VOXELS = 22.5
@@ -105,12 +105,13 @@ class SurfacePrior:
         share = self._doubt(columns["second/sh"][:, 0], face)
         least = SHOWN_COSINE if self._surface.has_few_cameras else UNSEEN_COSINE
         share[sides.shown[face] & (self._surface.facing[face] > least)] = 0
-        rows = np.flatnonzero((share > MIN_PULL) & ~sides.triangles[face])
+        is_pinned = sides.triangles[face] | self._is_under_lid(columns)
+        rows = np.flatnonzero((share > MIN_PULL) & ~is_pinned)
         plausible = ((sides.color[face] - 0.5) / SH_C0).astype(np.float32)
         sh = columns["parameters/sh"][rows]
         sh[:, 0] += share[rows, None] * (plausible[rows] - sh[:, 0])
         backend.assign(bound[rows], {"parameters/sh": sh})
-        rows = np.flatnonzero(sides.triangles[face])
+        rows = np.flatnonzero(is_pinned)
         sh = np.zeros_like(columns["parameters/sh"][rows])
         sh[:, 0] = plausible[rows]
         moments = dict.fromkeys(("first/sh", "second/sh"), 0.0)
@@ -155,14 +156,16 @@ class SurfacePrior:
         """Splats of the mouth's unseen inside, and those under lids, stay as `layer_on` has them:
         views of closed mouths and open eyes would make them any size."""
         face = columns["face"]
+        is_inside = (self.sides.triangles & ~self._surface.outside)[face]
+        rows = np.flatnonzero(is_inside | self._is_under_lid(columns))
+        backend.assign(bound[rows], parameters_and_average(layer_on(self._frames, face[rows])))
+
+    def _is_under_lid(self, columns: Mapping[str, np.ndarray]) -> np.ndarray:
+        """(N,) bool: splats of the layer under lids."""
+        face = columns["face"]
         height = columns["parameters/xyz"][:, NORMAL_AXIS[self._frames.convention]]
         is_under = height < LID_DEPTH_SHARE * self._frames.layer_height[face]
-        is_inside = (self.sides.triangles & ~self._surface.outside)[face]
-        rows = np.flatnonzero(is_inside | (self._surface.lids[face] & is_under))
-        values = layer_on(self._frames, face[rows])
-        sh = np.zeros_like(columns["parameters/sh"][rows])
-        sh[:, 0] = (self.sides.color[face[rows]] - 0.5) / SH_C0
-        backend.assign(bound[rows], parameters_and_average({**values, "sh": sh}))
+        return np.asarray(self._surface.lids[face] & is_under)
 
 
 def parameters_and_average(values: Mapping[str, np.ndarray]) -> dict[str, np.ndarray | float]:
@@ -223,12 +226,12 @@ def hidden_splats(frames: FrameStore, settings: TrainingSettings) -> Splats:
 
 def layer_on(frames: FrameStore, face: np.ndarray) -> dict[str, np.ndarray]:
     """xyz, rotation, log_scale and opacity of one splat under the middle of each of these triangles
-    (N,), so large that a closed lid has no gaps."""
+    (N,) of lids, so large that closed they have no gaps, and of the mouth's inside."""
     axis = NORMAL_AXIS[frames.convention]
     lids = frames.surface.lids
     inner = np.ones(len(frames.capture.neutral), bool)
     inner[frames.capture.faces[~lids]] = False
-    share = np.where(inner[frames.capture.faces[face]].all(1), 1.0, LID_EDGE_SHARE)
+    share = np.where(inner[frames.capture.faces[face]].all(1), 1.0, BESIDE_LID_SHARE)
     xyz = np.zeros((len(face), 3), np.float32)
     xyz[:, axis] = frames.layer_height[face]
     log_scale = np.log(SCALE * share * frames.units[face])[:, None].repeat(3, axis=1)

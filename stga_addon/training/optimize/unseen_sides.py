@@ -11,6 +11,7 @@ from ...capture.model import Capture, View, evenly_spread, views_by_timestep
 from .initial_splats import mean_colors, mirror_images
 from .likeness import (
     BROWS_LEVEL,
+    HeadCoordinates,
     hairy_triangles,
     head_coordinates,
     inside_colors,
@@ -77,24 +78,28 @@ def unseen_sides(surface: Surface) -> UnseenSides:
         _, near = cKDTree(centers[own]).query(centers[rows], min(SOURCE_TRIANGLES, len(own)))
         found[rows] = np.median(color[own[near.reshape(len(rows), -1)]], axis=1)
     at = head_coordinates(capture)
-    kinds = {} if at is None else kinds_of(at, is_outside)
-    for kind, members in kinds.items():
-        own = np.flatnonzero(members & is_source)
-        if kind == "scalp" and at is not None:
-            if not len(own):
-                is_above = is_outside & (at.level > BROWS_LEVEL)
-                own = np.flatnonzero(is_above & (pixels > 0) & (cosine > FRINGE_COSINE))
-                own = own[np.argsort(at.level[own])][int(len(own) * (1 - FRINGE_SHARE)) :]
-            own = hairy_triangles(own, centers, color, capture.regions)
-        rows = np.flatnonzero(members & unseen)
-        if at is not None and len(own) and len(rows):
-            found[rows] = color[sources_around_head(at, own, rows)]
+    if at is not None:
+        for kind, members in kinds_of(at, is_outside).items():
+            own = np.flatnonzero(members & is_source)
+            if kind == "scalp":
+                if not len(own):
+                    own = _fringe(at, is_outside & (pixels > 0) & (cosine > FRINGE_COSINE))
+                own = hairy_triangles(own, centers, color, capture.regions)
+            rows = np.flatnonzero(members & unseen)
+            if len(own) and len(rows):
+                found[rows] = color[sources_around_head(at, own, rows)]
     hidden, partner = mirror_images(capture, unseen, is_source)
     found[hidden] = color[partner]
     inside = _unseen_inside(capture, pixels > 0, is_outside)
     within = inside | (~is_outside & ~shown)
     found[within] = inside_colors(capture, color, shown, within)
     return UnseenSides((is_outside & (cosine < UNSEEN_COSINE)) | inside, shown, found)
+
+
+def _fringe(at: HeadCoordinates, shown: np.ndarray) -> np.ndarray:
+    """The highest of the triangles (F,) bool that are shown above the brows."""
+    above = np.flatnonzero(shown & (at.level > BROWS_LEVEL))
+    return above[np.argsort(at.level[above])][int(len(above) * (1 - FRINGE_SHARE)) :]
 
 
 def _color_views(capture: Capture) -> list[View]:
