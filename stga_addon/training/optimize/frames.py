@@ -8,12 +8,13 @@ from functools import cached_property
 import numpy as np
 
 from ...avatar.embedding import MIN_DIVISOR, FaceFrames, face_areas, face_frames
+from ...avatar.lattice import SCALE
 from ...avatar.offsets import SIGNALS, moved_frames
 from ...avatar.strain import strain_basis, trained_range
 from ...capture.model import Capture
 from ..settings import TrainingSettings
 from .initial_splats import voxel_size
-from .surface import UNSEEN_COSINE, Surface
+from .surface import Surface
 
 CACHE_BYTES = 256e6
 BYTES_PER_TRIANGLE = 170
@@ -31,6 +32,8 @@ LAYER_VOXELS = 0.5
 SKIN_DEPTH = 0.1
 """Share of the height of hair at which its outer layer lies, less its own thickness; depth of that
 on skin, in the triangles' units, so that it does not stand out of the surface."""
+HEAD_RADIUS_VOXELS = 22.5
+"""By which hair's outer layer is wider than the scalp."""
 
 
 @dataclass
@@ -82,10 +85,11 @@ class FrameStore:
         """Largest scale (2, F) float32 of bound and of unbound splats, in local units."""
         unbound = settings.unbound_scale_limit * self.voxel / self.unit_lengths
         limits = np.stack([settings.scale_limit * self.units, unbound])
-        beyond = max(self.surface.grazing_cosine, UNSEEN_COSINE + 1e-9)
-        cosines = UNSEEN_COSINE, beyond
-        limits *= np.interp(self.surface.facing, cosines, (UNSEEN_LIMIT_SHARE, 1))
+        limits *= 1 - (1 - UNSEEN_LIMIT_SHARE) * self.surface.turned_away
         limits[0, self.surface.border] *= BORDER_LIMIT_SHARE  # a torso's unbound splats follow it
+        layer = SCALE * self.units * self.hair_widening  # smaller, it has gaps: the inside shows
+        is_hair = self.surface.hidden & (self.surface.hair_height > 0)
+        limits[0, is_hair] = np.maximum(limits[0, is_hair], layer[is_hair])
         return np.asarray(limits, np.float32)
 
     def stray_limits(self, settings: TrainingSettings) -> np.ndarray:
@@ -102,6 +106,11 @@ class FrameStore:
         inner = LAYER_HEIGHT_SHARE * self.surface.hair_height - LAYER_VOXELS * self.voxel
         skin = -SKIN_DEPTH * self.units
         return np.asarray(np.where(inner > 0, inner / self.unit_lengths, skin), np.float32)
+
+    @cached_property
+    def hair_widening(self) -> np.ndarray:
+        """(F,) how much wider hair's outer layer is than the scalp; 1 elsewhere."""
+        return np.asarray(1 + self.surface.hair_height / (HEAD_RADIUS_VOXELS * self.voxel))
 
     def of(self, timestep: int) -> FaceFrames:
         entry = self._latest(timestep)

@@ -112,6 +112,13 @@ def kinds_of(at: HeadCoordinates, is_outside: np.ndarray) -> dict[str, np.ndarra
     return {"scalp": scalp, "body": body}
 
 
+def nearest(known: np.ndarray, places: np.ndarray, count: int) -> np.ndarray:
+    """Rows (N, count) of the known places (M, 3) that are nearest to each of these (N, 3), the
+    nearest first; M where there are fewer."""
+    _, rows = cKDTree(known).query(places, np.arange(min(count, len(known))) + 1)
+    return np.asarray(rows)
+
+
 def hairy_triangles(
     sources: np.ndarray, centers: np.ndarray, color: np.ndarray, regions: Mapping[str, np.ndarray]
 ) -> np.ndarray:
@@ -119,8 +126,8 @@ def hairy_triangles(
     if not len(sources):
         return sources
     skin = np.median(color[regions["nose"]] if "nose" in regions else color, axis=0)
-    near = cKDTree(centers[sources]).query(centers[sources], min(SMOOTHED, len(sources)))[1]
-    contrast = np.linalg.norm(color[sources] - skin, axis=1)[near.reshape(len(sources), -1)]
+    near = nearest(centers[sources], centers[sources], SMOOTHED)
+    contrast = np.linalg.norm(color[sources] - skin, axis=1)[near]
     contrast = np.quantile(contrast, 0.1, axis=1)
     return np.asarray(sources[contrast > MIN_HAIR_CONTRAST * np.quantile(contrast, 0.9)])
 
@@ -164,8 +171,8 @@ def inside_colors(
     known = np.flatnonzero(shown & skin)
     if not len(known) or not inside.any():
         return np.asarray(color[inside])
-    near = cKDTree(centers[known]).query(centers[inside], min(SMOOTHED, len(known)))[1]
-    found = np.median(color[known[near.reshape(int(inside.sum()), -1)]], axis=1)
+    near = nearest(centers[known], centers[inside], SMOOTHED)
+    found = np.median(color[known[near]], axis=1)
     at = head_coordinates(capture)
     if at is None:
         return np.asarray(found)

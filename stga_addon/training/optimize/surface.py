@@ -13,7 +13,7 @@ from ...capture.mesh_geometry import connected_parts, rasterize, silhouette, tri
 from ...capture.model import Capture, View, evenly_spread, views_by_timestep
 from ...flame.quaternions import unit
 from .initial_splats import FEW_CAMERAS, SAMPLED_HEIGHT_PIXELS, mirrored, voxel_size
-from .likeness import head_coordinates, kinds_of
+from .likeness import head_coordinates, kinds_of, nearest
 
 FACING_TIMESTEPS = 300
 FACING_MESHES = 48
@@ -102,6 +102,13 @@ class Surface:
         return GRAZING_COSINE if self.has_few_cameras else UNSEEN_COSINE
 
     @cached_property
+    def turned_away(self) -> np.ndarray:
+        """(F,) share in 0…1 of what views do not tell of a triangle's shape, by how it faces them:
+        1 where it faces away, 0 where it does not graze."""
+        beyond = max(self.grazing_cosine, UNSEEN_COSINE + 1e-9)
+        return np.asarray(np.interp(self.facing, (UNSEEN_COSINE, beyond), (1, 0)))
+
+    @cached_property
     def hidden(self) -> np.ndarray:
         """(F,) bool: triangles of the outside that face away from all cameras."""
         limit = HIDDEN_COSINE if self.has_few_cameras else UNSEEN_COSINE
@@ -154,9 +161,8 @@ class Surface:
         if not len(measured):
             return height
         center = np.asarray(self.capture.neutral, np.float64)[self.capture.faces].mean(1)
-        sources = cKDTree(np.concatenate([center[measured], mirrored(center)[measured]]))
-        near = sources.query(center[scalp], min(AROUND, 2 * len(measured)))[1]
-        near = measured[near.reshape(len(scalp), -1) % len(measured)]
+        sources = np.concatenate([center[measured], mirrored(center)[measured]])
+        near = measured[nearest(sources, center[scalp], AROUND) % len(measured)]
         height[scalp] = np.median(self._measured_height[near], axis=1)
         return height
 

@@ -36,8 +36,6 @@ BESIDE_LID_SHARE = 0.6
 edges and in the mouth, where it would stand out beside the eye and the lips."""
 BORDER_INSET = 0.6
 """Of the distance from the middle of a triangle, and of the scale, at the mesh's edge."""
-HEAD_RADIUS_VOXELS = 22.5
-"""By which hair's outer layer is wider than the scalp."""
 FLAT_VOXELS = 0.25
 FLAT_TOLERANCE = 1.02
 """Largest standard deviation of splats on skin and clothes along the normal; how much more is worth
@@ -122,8 +120,8 @@ class SurfacePrior:
     ) -> None:
         face = columns["face"]
         share = self._doubt(columns["second/opacity"][:, None], face)
-        is_told_little = self._surface.facing < self._surface.grazing_cosine
-        rows = np.flatnonzero((share > MIN_PULL) & is_told_little[face])
+        share *= self._surface.turned_away[face]
+        rows = np.flatnonzero(share > MIN_PULL)
         share = share[rows]
         opacity = columns["parameters/opacity"][rows]
         opacity += share * (HIDDEN_OPACITY - opacity)
@@ -217,8 +215,7 @@ def hidden_splats(frames: FrameStore, settings: TrainingSettings) -> Splats:
     inset = np.where(surface.border, BORDER_INSET, 1.0)[face]
     xyz = layer.xyz * inset[:, None]
     xyz[:, axis] += frames.layer_height[face]
-    lifted = inset * (1 + surface.hair_height[face] / (HEAD_RADIUS_VOXELS * frames.voxel))
-    log_scale = layer.log_scale + np.log(lifted)[:, None]
+    log_scale = layer.log_scale + np.log(inset * frames.hair_widening[face])[:, None]
     log_scale[:, axis] += np.log(HIDDEN_FLATNESS)
     layer = replace(layer, xyz=xyz.astype(np.float32), log_scale=log_scale.astype(np.float32))
     return joined([layer, under])

@@ -3,7 +3,6 @@
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from ...avatar.embedding import MIN_DIVISOR, face_areas
 from ...capture.mesh_geometry import connected_parts
@@ -11,11 +10,13 @@ from ...capture.model import Capture, View, evenly_spread, views_by_timestep
 from .initial_splats import mean_colors, mirror_images
 from .likeness import (
     BROWS_LEVEL,
+    SMOOTHED,
     HeadCoordinates,
     hairy_triangles,
     head_coordinates,
     inside_colors,
     kinds_of,
+    nearest,
     sources_around_head,
     teeth_of,
 )
@@ -52,8 +53,8 @@ class UnseenSides:
 
 def unseen_sides(surface: Surface) -> UnseenSides:
     """Triangles that no camera looks at look as their mirror images that are shown; those of scalp,
-    neck and shoulders else as a shown one of their height, back and forth around the head; any
-    other as the nearest connected ones. All that views show look as there."""
+    neck and shoulders else as shown ones of their height, back and forth around the head, smoothed
+    over those around; any other as the nearest connected ones. What views show looks as there."""
     capture = surface.capture
     cosine = surface.facing
     views = _color_views(capture)
@@ -75,8 +76,8 @@ def unseen_sides(surface: Surface) -> UnseenSides:
     for number in np.unique(part[hidden]):
         rows = np.flatnonzero(hidden & (part == number))
         own = sources[part[sources] == number] if (part[sources] == number).any() else sources
-        _, near = cKDTree(centers[own]).query(centers[rows], min(SOURCE_TRIANGLES, len(own)))
-        found[rows] = np.median(color[own[near.reshape(len(rows), -1)]], axis=1)
+        near = nearest(centers[own], centers[rows], SOURCE_TRIANGLES)
+        found[rows] = np.median(color[own[near]], axis=1)
     at = head_coordinates(capture)
     if at is not None:
         for kind, members in kinds_of(at, is_outside).items():
@@ -87,7 +88,9 @@ def unseen_sides(surface: Surface) -> UnseenSides:
                 own = hairy_triangles(own, centers, color, capture.regions)
             rows = np.flatnonzero(members & unseen)
             if len(own) and len(rows):
-                found[rows] = color[sources_around_head(at, own, rows)]
+                copied = color[sources_around_head(at, own, rows)]
+                around = nearest(centers[rows], centers[rows], SMOOTHED)
+                found[rows] = np.median(copied[around], axis=1)
     hidden, partner = mirror_images(capture, unseen, is_source)
     found[hidden] = color[partner]
     inside = _unseen_inside(capture, pixels > 0, is_outside)
