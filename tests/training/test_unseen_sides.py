@@ -139,17 +139,24 @@ def test_a_glance_counts(from_one_side):
 
 
 HAIR = np.array([40, 25, 15], np.uint8)
+GRAY = np.array([170, 160, 145], np.uint8)
 SKIN = np.array([220, 170, 150], np.uint8)
 CLOTH = np.array([30, 60, 160], np.uint8)
 EYES = np.array([200, 180, 170], np.uint8)
+TURNS_DEG = (-45, -20, 0, 20, 45)
 
 
 @pytest.mark.parametrize(
-    ("angles", "height", "fringe"), [((-45, -20, 0, 20, 45), 0.0, 0.75), ((0,), -0.5, 0.5)]
+    ("angles", "height", "fringe", "hair", "shade"),
+    [
+        (TURNS_DEG, 0.0, 0.75, HAIR, 1.0),
+        (TURNS_DEG, 0.0, 0.75, GRAY, 0.6),
+        ((0,), -0.5, 0.5, HAIR, 1.0),
+    ],
 )
-def test_hair_goes_round_the_head(angles, height, fringe, from_one_side, tmp_path):
-    """Also that of a head that does not turn, of which a fringe is shown, from below. Catches a
-    back of the head in the color of skin, a neck with hair or in the color of clothes, clothes that
+def test_hair_goes_round_the_head(angles, height, fringe, hair, shade, from_one_side, tmp_path):
+    """Also gray hair, hardly brighter than skin in the shade, and that of a head that does not
+    turn, of which a fringe is shown, from below. Catches a back of the head in the color of skin, a neck with hair or in the color of clothes, clothes that
     end where the camera does, a closed mouth that is skin inside, teeth that are too white, and
     lips with a dark rim."""
     model = flame_model(None)
@@ -164,8 +171,9 @@ def test_hair_goes_round_the_head(angles, height, fringe, from_one_side, tmp_pat
         regions=key_regions(model),
     )
     level = (centers[:, 1] - 0.04) / 0.07  # over the eyes, in their distance from the mouth
-    hairline = np.interp(centers[:, 2], (-0.02, 0.06), (-1.1, fringe))
-    color = np.where((level > hairline)[:, None], HAIR, SKIN)
+    hairline = np.interp(centers[:, 2], (-0.06, 0.02), (-1.1, fringe))
+    shaded = np.where(centers[:, 2:] < 0.02, shade * SKIN, SKIN)
+    color = np.where((level > hairline)[:, None], hair, shaded)
     color[level < -2.2] = CLOTH
     for eye in ("left_eyeball", "right_eyeball"):
         color[faces_within(model.faces, model.masks[eye])] = EYES
@@ -183,9 +191,9 @@ def test_hair_goes_round_the_head(angles, height, fringe, from_one_side, tmp_pat
     sides = sides_of(replace(bare, views={"train": tuple(views)}))
     back = sides.triangles & (centers[:, 2] < -0.03) & (np.abs(centers[:, 0]) < 0.05)
     for part, expected in {
-        (0.2, 1.0): HAIR,
-        (-0.9, -0.2): HAIR,
-        (-1.9, -1.4): SKIN,
+        (0.2, 1.0): hair,
+        (-0.9, -0.2): hair,
+        (-1.9, -1.4): shade * SKIN,
         (-3.0, -2.5): CLOTH,
     }.items():
         rows = back & (level > part[0]) & (level < part[1])

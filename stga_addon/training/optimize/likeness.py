@@ -1,6 +1,5 @@
 """Which seen triangles of a head unseen ones look like: hair has hair, a neck a neck."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -40,10 +39,12 @@ MIN_STRETCH_RAD = 0.05
 MIN_NARROWING = 0.2
 """Quantiles of the heights and of the angles from straight ahead at which a kind is seen, between
 which it serves as a source: its back looks as what is seen farthest back."""
-MIN_HAIR_CONTRAST = 0.6
+MIN_HAIR_CONTRAST = 0.9
+LEAST_SHADE = 0.02
 SMOOTHED = 24
-"""A scalp's triangle has hair if its color is that far from the skin's, as a share of the scalp's
-most different ones, and so are most of that many around it."""
+"""A scalp's triangle has hair if its color is that far from the skin's, in standard deviations of
+its shades, as a share of the scalp's most different ones, and so are most of that many around it;
+least standard deviation of a shade, of 1."""
 
 EYEBALLS = ("left_eyeball", "right_eyeball")
 LINING_REACH = 1.1
@@ -120,15 +121,18 @@ def nearest(known: np.ndarray, places: np.ndarray, count: int) -> np.ndarray:
 
 
 def hairy_triangles(
-    sources: np.ndarray, centers: np.ndarray, color: np.ndarray, regions: Mapping[str, np.ndarray]
+    sources: np.ndarray, centers: np.ndarray, color: np.ndarray, skin: np.ndarray
 ) -> np.ndarray:
-    """Those of a scalp's triangles whose color is not the skin's; all of a bald one."""
-    if not len(sources):
+    """Those of a scalp's triangles whose color differs from skin in another way than skin's own
+    shades (K, 3) do; all where no skin is known."""
+    if not len(sources) or not len(skin):
         return sources
-    skin = np.median(color[regions["nose"]] if "nose" in regions else color, axis=0)
+    usual = np.median(skin, axis=0)
+    shades = (skin - usual).T @ (skin - usual) / len(skin) + LEAST_SHADE**2 * np.eye(3)
+    away = color[sources] - usual
+    contrast = np.sqrt((away * np.linalg.solve(shades, away.T).T).sum(1))
     near = nearest(centers[sources], centers[sources], SMOOTHED)
-    contrast = np.linalg.norm(color[sources] - skin, axis=1)[near]
-    contrast = np.quantile(contrast, 0.1, axis=1)
+    contrast = np.quantile(contrast[near], 0.1, axis=1)
     return np.asarray(sources[contrast > MIN_HAIR_CONTRAST * np.quantile(contrast, 0.9)])
 
 

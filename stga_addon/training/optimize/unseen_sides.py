@@ -80,12 +80,14 @@ def unseen_sides(surface: Surface) -> UnseenSides:
         found[rows] = np.median(color[own[near]], axis=1)
     at = head_coordinates(capture)
     if at is not None:
-        for kind, members in kinds_of(at, is_outside).items():
+        kinds = kinds_of(at, is_outside)
+        is_face = is_source & ~kinds["scalp"] & ~kinds["body"] & (at.level < BROWS_LEVEL)
+        for kind, members in kinds.items():
             own = np.flatnonzero(members & is_source)
             if kind == "scalp":
                 if not len(own):
                     own = _fringe(at, is_outside & (pixels > 0) & (cosine > FRINGE_COSINE))
-                own = hairy_triangles(own, centers, color, capture.regions)
+                own = hairy_triangles(own, centers, color, color[is_face])
             rows = np.flatnonzero(members & unseen)
             if len(own) and len(rows):
                 copied = color[sources_around_head(at, own, rows)]
