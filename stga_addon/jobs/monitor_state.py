@@ -323,6 +323,8 @@ def _status_read(state: RequestState, event: StatusRead) -> Outcome:
         error=error,
         stopped=False,
     )
+    if event.snapshot.state == WorkerState.NONE and event.files.avatar is not None:
+        return _forgotten(state)  # dismissed since the file was saved
     drawn = [(each.folder, each.files.metrics, each.files.picture) for each in (before, state)]
     if drawn[0] != drawn[1] and state.kind in (*TRAINS, Kind.TRACKING):
         effects.append(ReadCurve(state.run))

@@ -228,6 +228,16 @@ def test_moved_run_folder():
     assert (state.subject, state.place) == (RUN, moved)
 
 
+@pytest.mark.parametrize("kind", [Kind.TRAINING, Kind.AVATAR])
+def test_dismissed_since_the_file_was_saved(kind):
+    """Catches "run not found" over a run that is there, and one that is not, forgotten."""
+    stored = RequestState(kind, RUN, JOB, result_shown=True)
+    read = made(WorkerState.NONE, avatar=1)
+    state, effects = after(read, state=stored)
+    assert (state, Store(None, False) in effects) == (RequestState(kind), True)
+    assert after(made(WorkerState.NONE), state=stored)[0].subject == RUN
+
+
 def test_unexpected_error_stops_until_the_next_start_or_check():
     """Catches a timer that ends silently, repeats a traceback, or never recovers."""
     state, effects = after(
