@@ -2,7 +2,9 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
+from time import monotonic
 
 from ..capture.open import open_capture
 from ..format import format_duration
@@ -11,8 +13,10 @@ from ..progress import Progress, Report, Say
 from ..render.device import choose_device
 from ..selection import SelectionOptions, select_capture
 from ..training.effect_catalog import EffectDecision
-from ..training.settings import TrainingSettings, make_settings
+from ..training.settings import PRESETS, TrainingSettings, make_settings
 from .train import Selected, Train
+
+LAP_PLANS = 3.0  # Times that planning takes, which timing a preset takes at most
 
 
 @dataclass(frozen=True)
@@ -68,6 +72,7 @@ def analyze(request: Analyze, report: Report, say: Say) -> Analyzed:
     StgaError."""
     from ..training.effects.plan import plan_effects
 
+    begin = monotonic()
     report(Progress(stage="Analyzing the capture"))
     capture = open_capture(request.capture, request.flame, request.principal_point)
     if not capture.views.get("train"):
@@ -80,8 +85,15 @@ def analyze(request: Analyze, report: Report, say: Say) -> Analyzed:
         # imports Numba, which deciding effects does without
         from ..training.preset_timing import time_presets
 
-        report(Progress(0.5, "Timing the presets"))
-        seconds = {timing.preset: timing.seconds for timing in time_presets(capture, device=device)}
+        timings = time_presets(capture, device=device)
+        lap_s = LAP_PLANS * (monotonic() - begin)
+        for left in range(len(PRESETS), 0, -1):
+            told = partial(dict, left_s=left * lap_s)
+            report(Progress(1 - left / (len(PRESETS) + 1), "Timing the presets", figures=told))
+            begin = monotonic()
+            timing = next(timings)
+            lap_s = monotonic() - begin
+            seconds[timing.preset] = timing.seconds
     return Analyzed(plan, seconds)
 
 
@@ -92,8 +104,9 @@ def time_each_preset(request: TimePresets, report: Report, say: Say) -> Analyzed
     capture = open_capture(request.capture, request.flame, request.principal_point)
     device, why = choose_device(request.device)
     say(why)
-    timings = time_presets(capture, device=device)
-    for timing in timings:
+    timings = []
+    for timing in time_presets(capture, device=device):
+        timings.append(timing)
         say(
             f"{timing.preset:<9} {timing.iterations:6d} iterations  about "
             f"{format_duration(timing.seconds):<10}  {timing.purpose}"

@@ -44,7 +44,7 @@ class PresetTiming:
 
 def time_presets(
     capture: Capture, seconds: float = CALIBRATION_S, device: str = "cpu"
-) -> list[PresetTiming]:
+) -> Iterator[PresetTiming]:
     """Measure each preset, with the effects that suit the capture, for `seconds` on a device of
     `choose_device`.
 
@@ -52,13 +52,11 @@ def time_presets(
     """
     if not capture.views.get("train"):
         raise StgaError(f"{capture.root}: has no training views, so there is nothing to train on")
-    timings = []
     for name, preset in PRESETS.items():
         settings, _ = plan_effects(capture, make_settings(preset=name, effects={}), device)
         iterations = preset.iterations_for(len(capture.views["train"]))
         pace = seconds_per_iteration(capture, settings, iterations, seconds, device)
-        timings.append(PresetTiming(name, preset.purpose, iterations, iterations * pace))
-    return timings
+        yield PresetTiming(name, preset.purpose, iterations, iterations * pace)
 
 
 def seconds_per_iteration(

@@ -24,8 +24,10 @@ from stga_addon.capture.open import open_capture
 from stga_addon.errors import StgaError
 from stga_addon.files import read_npz
 from stga_addon.format import describe_left
+from stga_addon.jobs import analyze as analysis
 from stga_addon.jobs import perform as jobs
 from stga_addon.jobs import train
+from stga_addon.jobs.analyze import Analyze
 from stga_addon.jobs.export import Export
 from stga_addon.jobs.perform import perform_in_folder, write_request
 from stga_addon.jobs.render import Render
@@ -33,9 +35,11 @@ from stga_addon.jobs.table import JOBS, Result
 from stga_addon.jobs.track import SolveAgain, Track
 from stga_addon.jobs.train import Resume, Train
 from stga_addon.progress import Clock, Progress, TimeLeft, Written
+from stga_addon.training import preset_timing
 from stga_addon.training.effect_catalog import RELIGHT, WORLD, EffectDecision
+from stga_addon.training.effects import plan
 from stga_addon.training.run.folder import Run, write_run
-from stga_addon.training.settings import make_settings
+from stga_addon.training.settings import PRESETS, make_settings
 from stga_addon.worker.launch import start_worker
 from stga_addon.worker.status import (
     CANCEL_FILE,
@@ -243,6 +247,27 @@ def test_who_is_silent_takes_longer(tmp_path):
             os.utime(tmp_path / STATUS_FILE, (told, told))
             sentence = describe_left(inspect_worker(tmp_path).status.figures)
             assert sentence == f"{expected} 28 s left"
+
+
+def test_an_analysis_says_how_long_it_takes(monkeypatch):
+    """Catches minutes of "Timing the presets" without a time."""
+    now = [0.0]
+
+    def take(seconds, what):
+        now[0] += seconds
+        return what
+
+    timings = (take(20.0, SimpleNamespace(preset=name, seconds=1.0)) for name in PRESETS)
+    capture = SimpleNamespace(views={"train": [0]})
+    monkeypatch.setattr(analysis, "monotonic", lambda: now[0])
+    monkeypatch.setattr(analysis, "open_capture", lambda *_: take(2.0, capture))
+    monkeypatch.setattr(plan, "plan_effects", lambda *_: take(8.0, (None, ())))
+    monkeypatch.setattr(preset_timing, "time_presets", lambda *_, **__: timings)
+    told = []
+    analysis.analyze(Analyze(Path("capture"), timed=True), told.append, print)
+    left = [progress.figures().get("left_s", 0.0) for progress in told]
+    assert left == [0.0, 90.0, 40.0, 20.0]
+    assert [progress.share for progress in told] == [0.0, 0.25, 0.5, 0.75]
 
 
 def test_what_follows_training_is_told_ahead(tmp_path, monkeypatch):
