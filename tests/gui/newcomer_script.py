@@ -46,6 +46,8 @@ OUTSIDE = ("wm.path_open", "wm.save_mainfile")
 STARTED = time.monotonic()
 monitor = module("operators.monitor")
 kinds = module("stga_addon.jobs.table").Kind
+panels = module("ui.panel").CLASSES
+CLOSED = {panel: panel.bl_options for panel in panels if getattr(panel, "bl_options", ())}
 seen["time left"] = {}
 for name in ("pressed", "clicks", "messages", "undo", "cut", "texts", "images", "seconds"):
     seen[name] = {}
@@ -98,14 +100,13 @@ def opened(file):
 
 
 def show_only(root=""):
-    """Let the sidebar show one panel with those below it, or all of them, none folded."""
-    panels = module("ui.panel").CLASSES
+    """Let the sidebar show one panel with those below it, none folded, or all of them."""
     for panel in reversed(panels):
         if panel.is_registered:
             bpy.utils.unregister_class(panel)
     for panel in panels:
-        if "DEFAULT_CLOSED" in getattr(panel, "bl_options", ()):
-            panel.bl_options = panel.bl_options - {"DEFAULT_CLOSED"}
+        if panel in CLOSED:
+            panel.bl_options = frozenset() if root else CLOSED[panel]
         family = panel.bl_idname, getattr(panel, "bl_parent_id", ""), ""
         if root in family or not issubclass(panel, bpy.types.Panel):
             bpy.utils.register_class(panel)
@@ -116,7 +117,7 @@ def panels_unfolded(state):
     open_sidebar = module("stga_addon.scene.avatar_scene").open_sidebar
     show_only()
     yield lambda: open_sidebar("STGA", [viewport()[0].screen])
-    for panel in module("ui.panel").CLASSES:
+    for panel in panels:
         if hasattr(panel, "bl_category") and not hasattr(panel, "bl_parent_id"):
             show_only(panel.bl_idname)
             yield 0.3
@@ -230,6 +231,8 @@ def fresh():
     """Every panel and every button in a file without a head."""
     yield from panels_unfolded("fresh")
     yield from press("fresh")
+    bpy.ops.wm.read_homefile(app_template="")  # the panels in their order
+    yield 0.3
 
 
 def open_demo():
@@ -374,7 +377,7 @@ def display():
         shading.type = "SOLID"
         click(f"Display {mode}", bpy.ops.stga.choose_display, display=mode)
         seen["shading"][mode] = shading.type
-        yield 0.2
+        yield 2.0 if shading.type == "MATERIAL" else 0.2  # whose shaders are compiled at first
         shot(f"display {mode}")
     shading.type = "SOLID"
     for mode in ("scene", "mix", "recorded"):
@@ -519,13 +522,19 @@ def drop():
 # The second hour
 
 
+def iterations():
+    """Of the run in the panel's folder."""
+    metrics = module("stga_addon.training.run.metrics_log")
+    return metrics.read_metrics(Path(chosen().run_folder))[-1]["iteration"]
+
+
 def train_more():
     yield opened(FIRST)
-    before = training().snapshot.status.figures["iteration"]
+    before = iterations()
     options = {"directory": chosen().run_folder, "minutes": MINUTES, "more": True}
     click("Train More", bpy.ops.stga.train, **options)
     yield once("Train More", lambda: chosen().result_shown and not training().is_running)
-    seen["trained more"] = training().snapshot.status.figures["iteration"] - before
+    seen["trained more"] = iterations() - before
     shot("trained more")
 
 
