@@ -98,13 +98,14 @@ class Clock:
 
     def told(self, progress: Progress) -> dict[str, float]:
         """The finite figures of some progress; `left_s`, by the share where the work does not say,
-        is the least so far, and `longer` 1 where that is, or the work knows it to be, too
+        else as before, is the least so far, and `longer` 1 where that is, or the work knows it to be, too
         little."""
         self.share = max(self.share, min(progress.share, MAX_TOLD_SHARE))
         figures = {"left_s": self._by_share.after(progress.share), **progress.figures()}
         figures = {name: value for name, value in figures.items() if math.isfinite(value)}
-        if "left_s" in figures:
-            expected_s = self._expected_s(figures["left_s"])
+        asked_s = figures.get("left_s", self._left_s)
+        if math.isfinite(asked_s):
+            expected_s = self._expected_s(asked_s)
             self._left_s = min(self._left_s, expected_s)
             figures["left_s"] = self._left_s
             if expected_s > MAX_OVERRUN_RATIO * self._left_s + 1:
