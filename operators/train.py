@@ -205,7 +205,7 @@ class Train(TrainingOperator, TrainOptions, bpy.types.Operator):
         if Path(bpy.path.abspath(settings.run_folder)).resolve() == occupied:
             given = settings.run_folder.rstrip("/\\")
             settings.run_folder = given.removesuffix(occupied.name) + free.name
-        self.warn(f"{occupied.name} holds a run; training into {free.name} beside it")
+        self.warn(f"'{occupied.name}' is taken: training into '{free.name}' beside it")
         return free
 
 

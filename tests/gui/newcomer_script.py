@@ -245,6 +245,7 @@ def misunderstand():
     """Train into a folder that a file never saved does not have."""
     click("Train without a folder", bpy.ops.stga.train, directory="//run")
     seen["error in the panel"] = bpy.context.window_manager.stga_message
+    yield 0.5  # while the panel unfolds
     shot("error")
 
 
@@ -274,9 +275,11 @@ def train():
     click("Train", bpy.ops.stga.train, **settings)
     yield once("Train", lambda: chosen().splats is not None)
     seen["seconds"]["to the preview"] = round(time.monotonic() - begin, 2)
+    yield 0.5
     shot("preview")
     yield once("Train", lambda: chosen().result_shown)
     seen["seconds"]["to the avatar"] = round(time.monotonic() - begin, 2)
+    yield 0.5
     shot("trained")
     train_panel = drawn_panels.drawn()["3 Train"].text
     seen["train panel"] = [part for part in ("Quality", "More") if part in train_panel]
