@@ -98,8 +98,8 @@ class Clock:
 
     def told(self, progress: Progress) -> dict[str, float]:
         """The finite figures of some progress; `left_s`, by the share where the work does not say,
-        else as before, is the least so far, and `longer` 1 where that is, or the work knows it to be, too
-        little."""
+        else as before, is the least so far, and `longer` 1 where that is, or the work knows it to
+        be, too little."""
         self.share = max(self.share, min(progress.share, MAX_TOLD_SHARE))
         figures = {"left_s": self._by_share.after(progress.share), **progress.figures()}
         figures = {name: value for name, value in figures.items() if math.isfinite(value)}

@@ -88,8 +88,8 @@ def analyze(request: Analyze, report: Report, say: Say) -> Analyzed:
         timings = time_presets(capture, device=device)
         lap_s = LAP_PLANS * (monotonic() - begin)
         for left in range(len(PRESETS), 0, -1):
-            told = partial(dict, left_s=left * lap_s)
-            report(Progress(1 - left / (len(PRESETS) + 1), "Timing the presets", figures=told))
+            left_s = partial(dict[str, float], left_s=left * lap_s)
+            report(Progress(1 - left / (len(PRESETS) + 1), "Timing the presets", figures=left_s))
             begin = monotonic()
             timing = next(timings)
             lap_s = monotonic() - begin
