@@ -11,6 +11,7 @@ from bpy.app.handlers import persistent
 
 from ..stga_addon.scene import tags
 from ..stga_addon.scene.compat import APPENDED
+from ..stga_addon.scene.display.node_builder import Nodes, kept_material
 from ..stga_addon.scene.display.splat_object import (
     hide_covered,
     hide_in_layers,
@@ -58,12 +59,17 @@ def _add_notes() -> None:
             text.body = NOTE
             text.size = NOTE_SIZE_M
             text.align_x = "CENTER"
+            text.materials.append(kept_material("STGA note", _unlit, "DITHERED"))
             note = bpy.data.objects.new(text.name, text)
             note[tags.KIND] = tags.NOTE
             note.hide_render = True
             note.rotation_euler = (radians(90), 0, 0)
             note.location = avatar.matrix_world.translation
             scene.collection.objects.link(note)
+
+
+def _unlit(nodes: Nodes) -> Any:
+    return nodes.out("ShaderNodeEmission")
 
 
 def _remove_notes() -> None:
