@@ -478,6 +478,7 @@ def render():
     scene = bpy.context.scene
     settings = bpy.context.scene.render
     click("Preview for EEVEE/Cycles", bpy.ops.stga.preview_images)
+    yield 2.0
     shot("preview of images")
     bpy.context.preferences.view.render_display_type = "NONE"
     settings.resolution_y = IMAGE_PX * settings.resolution_y // settings.resolution_x
@@ -660,9 +661,8 @@ def left_out():
     yield lambda: not bpy.app.is_job_running("RENDER")
     yield 1.0
     shot("F12 says what it leaves out")
-    subprocess.run(["xdotool", "key", "Escape"], check=True)
-    yield 0.5
-    subprocess.run(["xdotool", "key", "Escape"], check=True)
+    with bpy.context.temp_override(window=bpy.context.window_manager.windows[-1]):
+        bpy.ops.wm.window_close()
 
 
 def motion():
@@ -683,13 +683,13 @@ def without_addon():
     """Open the file where the add-on is not there."""
     bpy.ops.preferences.addon_disable(module=extension)
     yield opened(FIRST)
-    things = [thing for thing in bpy.context.scene.objects if not thing.hide_get()]
+    notes = [thing for thing in bpy.context.scene.objects if thing.type == "FONT"]
     pictures = []
     for how in ("without the add-on", "nothing"):
         in_window.picture(FOLDER / f"{how}.png")
         pictures.append(np.array(bpy.data.images.load(str(FOLDER / f"{how}.png")).pixels))
-        for thing in things:
-            thing.hide_set(True)
+        for note in notes:
+            note.hide_set(True)
     seen["left without the add-on"] = float(np.abs(pictures[0] - pictures[1]).mean())
     bpy.ops.preferences.addon_enable(module=extension)
     yield opened(FIRST)
