@@ -47,7 +47,6 @@ STARTED = time.monotonic()
 monitor = module("operators.monitor")
 kinds = module("stga_addon.jobs.table").Kind
 panels = module("ui.panel").CLASSES
-CLOSED = {panel: panel.bl_options for panel in panels if getattr(panel, "bl_options", ())}
 seen["time left"] = {}
 for name in ("pressed", "clicks", "messages", "undo", "cut", "texts", "images", "seconds"):
     seen[name] = {}
@@ -100,13 +99,14 @@ def opened(file):
 
 
 def show_only(root=""):
-    """Let the sidebar show one panel with those below it, none folded, or all of them."""
+    """Let the sidebar show one panel with those below it, or all of them, none folded: Blender
+    remembers for good how it first shows one."""
     for panel in reversed(panels):
         if panel.is_registered:
             bpy.utils.unregister_class(panel)
     for panel in panels:
-        if panel in CLOSED:
-            panel.bl_options = frozenset() if root else CLOSED[panel]
+        if "DEFAULT_CLOSED" in getattr(panel, "bl_options", ()):
+            panel.bl_options = panel.bl_options - {"DEFAULT_CLOSED"}
         family = panel.bl_idname, getattr(panel, "bl_parent_id", ""), ""
         if root in family or not issubclass(panel, bpy.types.Panel):
             bpy.utils.register_class(panel)
