@@ -213,6 +213,7 @@ def press(state):
             changed = [name for name in before if before[name] != after.get(name)]
             if changed or len(after) != len(before):
                 seen["undo"][label] = [[name, before[name], after.get(name)] for name in changed]
+        viewport()[1].spaces.active.shading.type = "SOLID"  # undo leaves it, and others take long
         yield 0.2
 
 
