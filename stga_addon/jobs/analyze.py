@@ -16,6 +16,7 @@ from ..training.effect_catalog import EffectDecision
 from ..training.settings import PRESETS, TrainingSettings, make_settings
 from .train import Selected, Train
 
+TIMED_S = 60.0  # That an analysis which times the presets takes on two cores
 LAP_PLANS = 3.0  # Times that planning takes, which timing a preset takes at most
 
 
@@ -73,7 +74,8 @@ def analyze(request: Analyze, report: Report, say: Say) -> Analyzed:
     from ..training.effects.plan import plan_effects
 
     begin = monotonic()
-    report(Progress(stage="Analyzing the capture"))
+    left_s = partial(dict[str, float], left_s=TIMED_S)
+    report(Progress(stage="Analyzing the capture", figures=left_s if request.timed else dict))
     capture = open_capture(request.capture, request.flame, request.principal_point)
     if not capture.views.get("train"):
         return Analyzed((), {})

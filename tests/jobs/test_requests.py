@@ -272,8 +272,8 @@ def test_an_analysis_says_how_long_it_takes(monkeypatch):
     monkeypatch.setattr(preset_timing, "time_presets", lambda *_, **__: timings)
     told = []
     analysis.analyze(Analyze(Path("capture"), timed=True), told.append, print)
-    left = [progress.figures().get("left_s", 0.0) for progress in told]
-    assert left == [0.0, 90.0, 40.0, 20.0]
+    left = [progress.figures()["left_s"] for progress in told]
+    assert left == [60.0, 90.0, 40.0, 20.0]
     assert [progress.share for progress in told] == [0.0, 0.25, 0.5, 0.75]
 
 
