@@ -534,6 +534,8 @@ def iterations():
 
 
 def train_more():
+    bpy.ops.wm.read_homefile(app_template="")  # the panels in their order
+    yield 0.3
     yield opened(FIRST)
     before = iterations()
     options = {"directory": chosen().run_folder, "minutes": MINUTES, "more": True}
@@ -684,6 +686,7 @@ def without_addon():
     """Open the file where the add-on is not there."""
     bpy.ops.preferences.addon_disable(module=extension)
     yield opened(FIRST)
+    yield 2.0  # for EEVEE's samples, of which the first shows thin strokes only in part
     notes = [thing for thing in bpy.context.scene.objects if thing.type == "FONT"]
     pictures = []
     for how in ("without the add-on", "nothing"):

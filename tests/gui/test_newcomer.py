@@ -6,6 +6,7 @@ STGA_GUI_FOLDER: where the pictures of the steps are left.
 
 import json
 import os
+import re
 import sys
 from pathlib import Path
 
@@ -25,6 +26,7 @@ SCRIPT = Path(__file__).with_name("newcomer_script.py")
 MAX_MESSAGE = 90
 MAX_WORDS = 3
 MIN_POSES_PER_SECOND = 30
+DRIVEN_S = 5.0
 VIDEO = (9, 512)
 """Frames, and their size in pixels."""
 
@@ -55,6 +57,7 @@ def test_the_first_two_hours(tmp_path):
     assert max(map(len, seen["messages"].values())) <= MAX_MESSAGE, seen["messages"]
     assert seen["error in the panel"].endswith("which has not been saved yet")
     texts = [text.rstrip("…").partition(": ")[2].partition(" (STGA)")[0] for text in seen["texts"]]
+    texts = [re.sub(r"\d+ (s|min) ", "", text) for text in texts]
     assert [text for text in texts if len(text.split()) > MAX_WORDS] == []
     assert (seen["cut"], seen["undo"], seen["kept"]) == ({}, {}, [])
     assert not any(name.endswith(".blend") for name in seen["proposed"].values())
@@ -65,7 +68,8 @@ def test_the_first_two_hours(tmp_path):
     assert {*seen["shading"].values()} == {"MATERIAL", "SOLID"}
     for moved, left, poses, draws in seen["driven"].values():
         assert moved > 1e-3 > 1e-5 > left
-        assert poses >= min(MIN_POSES_PER_SECOND, 0.9 * draws)
+        # less a redraw that no pose asked for, which few redraws on a busy machine would show
+        assert poses >= min(MIN_POSES_PER_SECOND, 0.9 * (draws - 1 / DRIVEN_S))
     assert np.all([np.min(found) > 0 for found in seen["images"].values()])
     for told in seen["time left"].values():
         left = [left_s for _, _, left_s, *_ in told if left_s is not None]
@@ -86,4 +90,4 @@ def test_the_first_two_hours(tmp_path):
     assert seen["shows all"] == [True, True]
     assert seen["mesh in the picture"] > 1e-3
     assert seen["asked by Apply Motion"] == 4
-    assert seen["left without the add-on"] > 1e-3
+    assert seen["left without the add-on"] > 5e-4
