@@ -10,8 +10,10 @@ from .backend import Backend
 from .change import Turn
 
 MIN_WEIGHT_PX = 0.5
-"""A splat that fills less in every view serves the rays of a few pixels, and hangs in the air for
-all other cameras."""
+MIN_WEIGHT_SHARE = 0.4
+"""A splat that fills less in every view, also as a share of the median of unbound ones, which fill
+much after a short training, serves the rays of a few pixels, and hangs in the air for all other
+cameras."""
 TURNS = (0.6, 0.8)
 """Shares of the budget at which splats are weighed; what is trained afterwards fills in."""
 MAX_WEIGHED_VIEWS = 40
@@ -44,6 +46,7 @@ class DustPruning:
         count = min(MAX_WEIGHED_VIEWS, max(1, round(WEIGHED_SHARE * iterations)))
         views = evenly_spread(self.capture.views["train"], count)
         weight = np.max([backend.blend_weights(view) for view in views], axis=0)
-        dust = weighed & (weight < MIN_WEIGHT_PX)
+        usual = np.median(weight[columns["unbound"]])
+        dust = weighed & (weight < max(MIN_WEIGHT_PX, MIN_WEIGHT_SHARE * usual))
         if dust.any():
             backend.keep(~dust)
