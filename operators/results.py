@@ -207,6 +207,7 @@ def store_avatar(scene: Any, state: RequestState, path: Path) -> None:
     if head not in (None, settings.head) or (named.is_file() and _is_immature(state)):
         return
     settings.avatar = str(path)
+    keep_run_folder(settings)  # which was empty when the head of a video arrived
     with suppress(StgaError):  # the request was removed
         parent = getattr(read_request(state.folder_path), "parent", None)
         if parent == Path(bpy.path.abspath(settings.run_folder)).resolve():

@@ -86,6 +86,18 @@ def test_the_file_knows_its_run(extension, head, tmp_path):
     assert settings.run_folder == str(tmp_path / "moved/run")
 
 
+def test_a_run_made_after_its_head(extension, head, tmp_path):
+    """Catches no Train More after Avatar from Video, whose head is there before its run."""
+    settings = bpy.context.scene.stga
+    settings.run_folder = str(tmp_path / "run")
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run/run.json").write_text("{}")
+    results = extension.operators.results
+    making = extension.operators.monitor.RequestState(results.Kind.AVATAR, tmp_path, tmp_path)
+    results.store_avatar(bpy.context.scene, making, tmp_path / "run/avatar.npz")
+    assert settings.holds_run
+
+
 def test_a_file_made_without_the_panel(extension, head, tmp_path):
     """Catches demo.blend with an empty panel, and a chosen head replaced at loading."""
     (tmp_path / "run").mkdir()
