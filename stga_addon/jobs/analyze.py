@@ -16,8 +16,7 @@ from ..training.effect_catalog import EffectDecision
 from ..training.settings import PRESETS, TrainingSettings, make_settings
 from .train import Selected, Train
 
-TIMED_S = 90.0  # That an analysis which times the presets takes on two cores
-SHARES = (0.06, 0.31, 0.69)  # Of it that are over when each of the presets is begun
+SHARES = (0.1, 0.35, 0.65)  # Of an analysis that are over when each preset begins to be timed
 
 
 @dataclass(frozen=True)
@@ -74,8 +73,7 @@ def analyze(request: Analyze, report: Report, say: Say) -> Analyzed:
     from ..training.effects.plan import plan_effects
 
     begin = monotonic()
-    left_s = partial(dict[str, float], left_s=TIMED_S)
-    report(Progress(stage="Analyzing the capture", figures=left_s if request.timed else dict))
+    report(Progress(stage="Analyzing the capture"))
     capture = open_capture(request.capture, request.flame, request.principal_point)
     if not capture.views.get("train"):
         return Analyzed((), {})
