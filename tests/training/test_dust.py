@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from numpy.testing import assert_array_equal
 
 from stga_addon.avatar.splats import SH_C0
 from stga_addon.raster.cpu.layout import Parameters
@@ -77,6 +78,21 @@ def test_what_fills_no_view_is_dust(toy):
         assert kept[~state.unbound].all()
         assert kept[~near].all() == (region is not None)
         assert kept[state.unbound & ~tiny].mean() > 0.3  # others are hidden in all views
+
+
+@pytest.mark.parametrize("usual", [1.0, 10.0])
+def test_after_a_short_training(usual, toy):
+    """Catches dust that has not faded yet, beside which hair fills more, and hair that has faded."""
+    state = Trainer(toy, quick_settings("global", lattice=0), {}).state
+    state.unbound[:] = True
+    state.gradient_count[:] = np.arange(len(state))
+    weight = np.full(len(state), usual, np.float32)
+    weight[::5] = 0.6
+    backend = Rows(state)
+    backend.blend_weights = lambda view: weight
+    DustPruning(toy).apply(backend, Turn(200, TURNS[0], len(state)))
+    kept = np.isin(np.arange(len(weight)), backend.state.gradient_count)
+    assert_array_equal(kept, (weight > 0.6) | (usual < 5))
 
 
 def test_a_turn_comes_once(toy):
