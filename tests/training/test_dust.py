@@ -82,7 +82,7 @@ def test_what_fills_no_view_is_dust(toy):
 
 @pytest.mark.parametrize("usual", [1.0, 10.0])
 def test_after_a_short_training(usual, toy):
-    """Catches dust that has not faded yet, beside which hair fills more, and hair that has faded."""
+    """Catches dust that has not faded yet, beside fuller hair, and hair that has faded."""
     state = Trainer(toy, quick_settings("global", lattice=0), {}).state
     state.unbound[:] = True
     state.gradient_count[:] = np.arange(len(state))
