@@ -108,7 +108,7 @@ def test_a_turn_comes_once(toy):
         trainer._post_step(share)
     assert sum(turn.passes(0.6) for turn in turns) == 1
     steps = [n / 50 for n in range(50)]
-    for stop in range(1, 49):
+    for stop in (1, 12, 29, 30, 31, 48):
         turns.clear()
         for part in (steps[:stop], steps[stop:]):
             resumed = Trainer(toy, quick_settings("global", lattice=0), {})
