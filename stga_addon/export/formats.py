@@ -249,7 +249,8 @@ def check_suffix(path: Path, format: str) -> None:
 
 def check_free_space(path: Path, size: int) -> None:
     """Raise StgaError where the disk that `path` is on has less than `size` bytes free."""
-    folder = next(parent for parent in path.absolute().parents if parent.exists())
+    place = path.absolute()
+    folder = next(each for each in (place, *place.parents) if each.is_dir())
     free = shutil.disk_usage(folder).free
     if size > free:
         needed = format_bytes(size)

@@ -173,12 +173,13 @@ def test_a_page_is_called_like_its_run(trained, tmp_path):
     assert read_web_data(out.read_bytes())[0]["title"] == "anna.v2"
 
 
-@pytest.mark.parametrize("format", ["ply-sequence", "web"])
-def test_export_to_a_full_disk(trained, tmp_path, capsys, monkeypatch, format):
-    """Catches a range that fills the disk."""
+@pytest.mark.parametrize(
+    ("format", "name"), [("ply-sequence", "o"), ("ply-sequence", "/"), ("web", "o.html")]
+)
+def test_export_to_a_full_disk(trained, tmp_path, capsys, monkeypatch, format, name):
+    """Catches a range that fills the disk, and a folder that has none above it."""
     monkeypatch.setattr("shutil.disk_usage", lambda folder: SimpleNamespace(free=1000))
-    out = tmp_path / ("o.html" if format == "web" else "o")
-    message = refused(capsys, "export", trained, "--format", format, "--out", out)
+    message = refused(capsys, "export", trained, "--format", format, "--out", tmp_path / name)
     assert "1.0 kB are free there" in message
     assert list(tmp_path.iterdir()) == []
 
