@@ -97,7 +97,7 @@ def bare_python(folder):
     return folder / "bin/python"
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_track_and_train_at_once(archive, demo, tmp_path):
     """Catches a missing wheel, a worker that needs more, and files that uninstalling leaves."""
     python = bare_python(tmp_path / "bare")
