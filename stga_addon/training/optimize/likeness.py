@@ -43,8 +43,8 @@ MIN_HAIR_CONTRAST = 0.9
 LEAST_SHADE = 0.02
 SMOOTHED = 24
 """A scalp's triangle has hair if its color is that far from the skin's, in standard deviations of
-its shades, as a share of the scalp's most different ones, and so are most of that many around it;
-least standard deviation of a shade, of 1."""
+its shades, as a share of the scalp's most different ones; the least standard deviation of a shade,
+in colors of 0…1; triangles around one over which what is found is smoothed."""
 
 EYEBALLS = ("left_eyeball", "right_eyeball")
 LINING_REACH = 1.1
@@ -113,7 +113,7 @@ def kinds_of(at: HeadCoordinates, is_outside: np.ndarray) -> dict[str, np.ndarra
     return {"scalp": scalp, "body": body}
 
 
-def nearest(known: np.ndarray, places: np.ndarray, count: int) -> np.ndarray:
+def nearest_rows(known: np.ndarray, places: np.ndarray, count: int) -> np.ndarray:
     """Rows (N, count) of the known places (M, 3) that are nearest to each of these (N, 3), the
     nearest first; M where there are fewer."""
     _, rows = cKDTree(known).query(places, np.arange(min(count, len(known))) + 1)
@@ -131,7 +131,7 @@ def hairy_triangles(
     shades = (skin - usual).T @ (skin - usual) / len(skin) + LEAST_SHADE**2 * np.eye(3)
     away = color[sources] - usual
     contrast = np.sqrt((away * np.linalg.solve(shades, away.T).T).sum(1))
-    near = nearest(centers[sources], centers[sources], SMOOTHED)
+    near = nearest_rows(centers[sources], centers[sources], SMOOTHED)
     contrast = np.quantile(contrast[near], 0.1, axis=1)
     return np.asarray(sources[contrast > MIN_HAIR_CONTRAST * np.quantile(contrast, 0.9)])
 
@@ -175,7 +175,7 @@ def inside_colors(
     known = np.flatnonzero(shown & skin)
     if not len(known) or not inside.any():
         return np.asarray(color[inside])
-    near = nearest(centers[known], centers[inside], SMOOTHED)
+    near = nearest_rows(centers[known], centers[inside], SMOOTHED)
     found = np.median(color[known[near]], axis=1)
     at = head_coordinates(capture)
     if at is None:

@@ -13,7 +13,7 @@ from ...capture.mesh_geometry import connected_parts, rasterize, silhouette, tri
 from ...capture.model import Capture, View, evenly_spread, views_by_timestep
 from ...flame.quaternions import unit
 from .initial_splats import FEW_CAMERAS, SAMPLED_HEIGHT_PIXELS, mirrored, voxel_size
-from .likeness import head_coordinates, kinds_of, nearest
+from .likeness import head_coordinates, kinds_of, nearest_rows
 
 FACING_TIMESTEPS = 300
 FACING_MESHES = 48
@@ -162,7 +162,7 @@ class Surface:
             return height
         center = np.asarray(self.capture.neutral, np.float64)[self.capture.faces].mean(1)
         sources = np.concatenate([center[measured], mirrored(center)[measured]])
-        near = measured[nearest(sources, center[scalp], AROUND) % len(measured)]
+        near = measured[nearest_rows(sources, center[scalp], AROUND) % len(measured)]
         height[scalp] = np.median(self._measured_height[near], axis=1)
         return height
 

@@ -16,7 +16,7 @@ from .likeness import (
     head_coordinates,
     inside_colors,
     kinds_of,
-    nearest,
+    nearest_rows,
     sources_around_head,
     teeth_of,
 )
@@ -76,7 +76,7 @@ def unseen_sides(surface: Surface) -> UnseenSides:
     for number in np.unique(part[hidden]):
         rows = np.flatnonzero(hidden & (part == number))
         own = sources[part[sources] == number] if (part[sources] == number).any() else sources
-        near = nearest(centers[own], centers[rows], SOURCE_TRIANGLES)
+        near = nearest_rows(centers[own], centers[rows], SOURCE_TRIANGLES)
         found[rows] = np.median(color[own[near]], axis=1)
     at = head_coordinates(capture)
     if at is not None:
@@ -91,7 +91,7 @@ def unseen_sides(surface: Surface) -> UnseenSides:
             rows = np.flatnonzero(members & unseen)
             if len(own) and len(rows):
                 copied = color[sources_around_head(at, own, rows)]
-                around = nearest(centers[rows], centers[rows], SMOOTHED)
+                around = nearest_rows(centers[rows], centers[rows], SMOOTHED)
                 found[rows] = np.median(copied[around], axis=1)
     hidden, partner = mirror_images(capture, unseen, is_source)
     found[hidden] = color[partner]
