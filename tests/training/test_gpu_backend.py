@@ -267,6 +267,39 @@ def test_states_are_the_same_bits_on_both(toy):
     assert not gpu.state.driven_offsets
 
 
+def test_rows_change_as_the_cpus(toy):
+    """Catches rows mixed up, columns of other fields, moments and ages left behind, gradients of
+    offsets summed over the splats of before, and changes that take all splats to the host."""
+    settings = settings_of()
+    cpu, gpu = pair(toy, settings)
+    gpu.step(batch_of(toy, settings))
+    cpu.state = gpu.state
+    rng = default_rng(2)
+    count = len(cpu)
+    third = np.arange(count) % 3 == 1
+    color = rng.normal(size=(third.sum(), 3)).astype(np.float32)
+    scale = rng.normal(size=(7, 3)).astype(np.float32)
+    order = rng.integers(0, count, 2 * count)  # more than there were, some several times
+    few = np.arange(3, 10)
+    for backend in (cpu, gpu):
+        backend.assign(third, {"average/sh": 0.25, "parameters/color": color})
+        backend.keep(order)
+        backend.assign(few, {"first/log_scale": scale, "second/opacity": 3.0, "steps": 5})
+        backend.keep(np.arange(2 * count) % 5 != 1)
+    waits = gpu.device.waits
+    names = ["parameters/color", "second/sh", "steps", "face", "screen_gradient"]
+    found = gpu.columns(names)
+    assert gpu.device.waits == waits + 1
+    assert_equal(found, cpu.columns(names))
+    assert_equal(every_bit(gpu.state), every_bit(cpu.state))
+    batch = batch_of(toy, settings, 3)
+    assert_allclose(gpu.blend_weights(batch.view), cpu.blend_weights(batch.view), atol=1e-2)
+    assert gpu.blend_weights(batch.view).max() > 1
+    for backend in (cpu, gpu):
+        backend.step(batch)
+    assert_near(gpu.state, cpu.state)
+
+
 def assert_near(got, want):
     """All values and moments, as shares of the largest of their name."""
     for name, expected in following(want).items():

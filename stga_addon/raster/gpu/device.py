@@ -217,10 +217,14 @@ class Device:
 
 class Recording:
     """Work for the device in the order in which it is recorded; each dispatch sees what those
-    before it wrote."""
+    before it wrote.
+
+    dispatches  recorded so far
+    """
 
     def __init__(self, device: Device) -> None:
         self.device = device
+        self.dispatches = 0
         self._encoder = device.gpu.create_command_encoder()
         self._pass: Any = None
 
@@ -246,7 +250,7 @@ class Recording:
             compute.dispatch_workgroups_indirect(*groups)
         else:
             compute.dispatch_workgroups(*groups)
-        self.device.dispatches += 1
+        self.dispatches += 1
 
     def copy(self, source: Any, target: Any, words: int, to: int = 0) -> None:
         """Copy the first words of a buffer to another, from its word `to` on."""
@@ -268,6 +272,7 @@ class Recording:
                 self._end_pass()
                 self.device.gpu.queue.submit([self._encoder.finish()])
                 self.device.submits += 1
+                self.device.dispatches += self.dispatches
 
     def _end_pass(self) -> None:
         if self._pass is not None:

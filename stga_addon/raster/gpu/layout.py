@@ -76,6 +76,15 @@ UNIFORMS = {
             ("padding", "u4", 2),
         ]
     ),
+    "Part": np.dtype(
+        [
+            *((name, "u4") for name in ("stride", "first", "width", "rows")),  # of a table
+            ("at", "u4"),  # word at which the packed columns begin
+            ("listed", "u4"),  # 1: of listed rows, 0: of the first ones
+            ("alike", "u4"),  # 1: one value for all
+            ("padding", "u4"),
+        ]
+    ),
     "Step": np.dtype(
         [
             (
@@ -93,7 +102,8 @@ UNIFORMS = {
         ]
     ),
 }
-"""Structs of the kernels: of an image (camera, sizes, options), a mesh, a target and a step."""
+"""Structs of the kernels: of an image (camera, sizes, options), a mesh, a target, some columns of a
+table, and a step."""
 
 _OWN = (
     "WORKGROUP HIDDEN WANTED MAX_GROUPS SORT_BLOCK SORT_GROUPS PAIR_GROUPS PAIRS NEEDED OVERFLOWED"

@@ -3,6 +3,7 @@
 
 var<storage> depth_key: array<u32>; // (N,) bits of a splat's depth; HIDDEN where it is not visible
 var<storage> selected: array<u32>; // (F,) bytes, four to a word
+var<storage> blend_weights: array<f32>; // (N,)
 
 const MAX_COEFFICIENTS: u32 = 16u;
 
@@ -293,6 +294,20 @@ fn backward(thread: Thread) {
   }
   v_position += write_color(at, s.position, v_color);
   write_vec3(at + XYZ, frame.row_x * v_position.x + frame.row_y * v_position.y + frame.row_z * v_position.z);
+}
+
+// How many pixels each splat fills: its blend weights' sum, which is the gradient by its color where the image's is 1.
+@compute @workgroup_size(WORKGROUP)
+fn sum_weights(thread: Thread) {
+  let i = thread_number(thread);
+  if i >= view.splats {
+    return;
+  }
+  var sum = 0.0;
+  if wanted[i] != 0u {
+    sum = sum_of_pairs(i)[RED];
+  }
+  blend_weights[i] = sum;
 }
 
 fn sum_of_pairs(i: u32) -> array<f32, PROJECTED> {

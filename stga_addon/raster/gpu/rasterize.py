@@ -144,15 +144,40 @@ class Rasterizer:
         `gradients`. Returns `screen` (N,): for these rows, the length of the gradient with respect
         to the projected center in units of half the image.
         """
-        columns, rows = tile_grid(camera.width, camera.height)
-        given = {"v_image": v_image, "v_transmittance": v_transmittance or v_image}
-        given |= {"gradients": gradients, "screen": self.device.buffer("screen", splats.count)}
+        given = {"gradients": gradients, "screen": self.device.buffer("screen", splats.count)}
+        tables = self._blend_backward(work, rendering, camera, v_image, v_transmittance)
+        work.dispatch("project.backward", splats.count, tables | given)
+        return given["screen"]
+
+    def blend_weights(
+        self, work: Recording, rendering: Tables, splats: SplatTable, camera: Camera
+    ) -> Any:
+        """Record how many pixels each splat fills in a rendering of the whole image: the sums (N,)
+        of its blend weights."""
+        v_image = np.zeros((3, camera.height, camera.width), np.float32)
+        v_image[0] = 1
+        uploaded = self.device.upload("v_image", v_image)
+        tables = self._blend_backward(work, rendering, camera, uploaded)
+        weights = tables["blend_weights"] = self.device.buffer("blend_weights", splats.count)
+        work.dispatch("project.sum_weights", splats.count, tables)
+        return weights
+
+    def _blend_backward(
+        self,
+        work: Recording,
+        rendering: Tables,
+        camera: Camera,
+        v_image: Any,
+        v_transmittance: Any = None,
+    ) -> Tables:
+        """Record the gradient of every pair; returns the tables with those of the rendering."""
         self.device.buffer("pair_gradients", PROJECTED * self.capacity)
         constants = {} if v_transmittance is None else {"HAS_V_TRANSMITTANCE": True}
+        given = {"v_image": v_image, "v_transmittance": v_transmittance or v_image}
         tables = rendering | given
+        columns, rows = tile_grid(camera.width, camera.height)
         work.dispatch("blend.backward", Device.groups_of(columns * rows), tables, **constants)
-        work.dispatch("project.backward", splats.count, tables)
-        return given["screen"]
+        return tables
 
     def pairs_fit(self) -> bool:
         """Wait for the submitted work; whether its pairs fitted. If not, room for them is made."""

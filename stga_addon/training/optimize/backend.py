@@ -7,7 +7,7 @@ from typing import Protocol
 import numpy as np
 
 from ...capture.model import View
-from .state import Halving, TrainState
+from .state import TrainState
 
 
 @dataclass(frozen=True)
@@ -47,9 +47,9 @@ class Backend(Protocol):
     """Holds N splats in training, bound to F triangles, and steps, renders and edits them.
 
     Splats may lie on a device. Who decides about them reads the few columns that the decision needs
-    and names rows; the rows themselves stay where they are. A column has the name of `arrays_of`,
-    such as "parameters/xyz" (local units), "average/sh", "face" or "screen_gradient", and a row for
-    each splat. Rows are numbered from 0 in the order of the columns, which `keep` changes.
+    and names rows; the rows themselves stay where they are. A column has the name of `columns_of`,
+    such as "parameters/xyz" (local units), "average/color", "face" or "screen_gradient", and a row
+    for each splat. Rows are numbered from 0 in the order of the columns, which `keep` changes.
 
         columns = backend.columns(["parameters/opacity"])
         backend.keep(columns["parameters/opacity"] > -4)
@@ -95,13 +95,11 @@ class Backend(Protocol):
         ...
 
     def assign(self, rows: np.ndarray, values: Mapping[str, np.ndarray | float]) -> None:
-        """Write to the rows, (M,) numbers or (N,) bool, of columns: values (M, …), or a number."""
+        """Write to the rows, (M,) numbers or (N,) bool, of columns: values (M, …), or a number. No
+        row is bound to another triangle."""
         ...
 
     def keep(self, rows: np.ndarray) -> None:
-        """Remove all but these rows, (N,) bool or (M,) numbers in their new order."""
-        ...
-
-    def append_halves(self, halving: Halving) -> None:
-        """Append two halves of splats as the last rows (`with_halves`); the parents stay."""
+        """Remove all but these rows, (N,) bool or (M,) numbers in their new order, in which a row
+        may occur several times."""
         ...

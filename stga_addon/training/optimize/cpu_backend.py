@@ -18,7 +18,7 @@ from . import adam
 from .backend import Batch, RenderOptions
 from .frames import FrameStore
 from .image_loss import image_gradient, tile_rectangles, whole_image
-from .state import Halving, TrainState, arrays_of, assign_rows, keep_rows, with_halves
+from .state import TrainState, assign_rows, columns_of, keep_rows
 
 WITHOUT_COLOR = RenderOptions(rasterize.BLACK_BACKGROUND, sh_degree=0)
 
@@ -98,17 +98,14 @@ class CpuBackend:
         return {name: offset.value for name, offset in self.state.driven_offsets.items()}
 
     def columns(self, names: Collection[str]) -> dict[str, np.ndarray]:
-        arrays = arrays_of(self.state)
-        return {name: arrays[name] for name in names}
+        columns = columns_of(self.state)
+        return {name: columns[name] for name in names}
 
     def assign(self, rows: np.ndarray, values: Mapping[str, np.ndarray | float]) -> None:
         assign_rows(self.state, rows, values)
 
     def keep(self, rows: np.ndarray) -> None:
         self.state = keep_rows(self.state, rows)
-
-    def append_halves(self, halving: Halving) -> None:
-        self.state = with_halves(self.state, halving)
 
     def _backward(
         self,

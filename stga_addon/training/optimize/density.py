@@ -5,9 +5,21 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ...flame.quaternions import to_matrices
+from ...raster.cpu.layout import Parameters
 from .backend import Backend
 from .change import Turn
-from .state import PRUNED_BY, Halving, opacity_of, prunable
+from .state import PRUNED_BY, opacity_of, parameters_and_average, prunable
+
+HALVED = ("xyz", "rotation", "log_scale", "opacity")
+"""Parameters of splats that their halves are made from."""
+READ_COLUMNS = {
+    "screen_gradient",
+    "gradient_count",
+    *PRUNED_BY,
+    *(f"parameters/{name}" for name in HALVED),
+}
+WITHOUT_MOMENTUM = {f"first/{name}": 0.0 for name in Parameters._fields}
 
 
 @dataclass(frozen=True)
@@ -52,7 +64,7 @@ class DensityControl:
         start, end = self.span
         if not start <= turn.progress < end:
             return
-        columns = backend.columns(("screen_gradient", "gradient_count", *PRUNED_BY))
+        columns = backend.columns(READ_COLUMNS)
         face = columns["face"]
         within = np.ones(len(face), bool) if turn.region is None else turn.region[face]
         split = self._split(columns, within, turn)
@@ -61,8 +73,13 @@ class DensityControl:
         keep[split] = False
         rng = np.random.default_rng([self.seed, turn.iteration])
         distance = self.distance * (1 + self.jitter * rng.standard_normal((len(split), 1)))
-        backend.append_halves(Halving(split, distance, self.narrowing, 2 * self.min_opacity))
-        backend.keep(np.concatenate([keep, np.ones(2 * len(split), bool)]))
+        parents = {name: columns[f"parameters/{name}"][split] for name in HALVED}
+        kept = np.flatnonzero(keep)
+        backend.keep(np.concatenate([kept, split, split]))
+        # Adam's second moment and step count are the parent's, without which the first steps would
+        # all be as long as the rate
+        values = parameters_and_average(self._halves(parents, distance))
+        backend.assign(np.arange(len(kept), len(backend)), {**values, **WITHOUT_MOMENTUM})
         every = np.ones(len(backend), bool)
         backend.assign(every, {"screen_gradient": 0.0, "gradient_count": 0.0})
 
@@ -81,3 +98,27 @@ class DensityControl:
         count = max(0, min(room, int(share * within.sum())))
         rows = np.argsort(-score, kind="stable")[:count]
         return np.asarray(rows[score[rows] > 0])
+
+    def _halves(
+        self, parents: Mapping[str, np.ndarray], distance: np.ndarray
+    ) -> dict[str, np.ndarray]:
+        """HALVED of both halves of M splats: first all on one side, then all on the other, within
+        the parent's Gaussian in local units; distance (M, 1): `self.distance` of each."""
+        n = np.arange(len(distance))
+        log_scale = parents["log_scale"].copy()
+        longest = np.argmax(log_scale, axis=1)
+        length = np.exp(log_scale[n, longest])[:, None]
+        away = to_matrices(parents["rotation"])[n, :, longest] * length * distance
+        log_scale[n, longest] -= np.log(self.narrowing)
+        # of two Gaussians beside each other, so much narrower, that cover as much as one
+        alike = self.narrowing / 2 * opacity_of(parents["opacity"])
+        opacity = np.maximum(alike, 2 * self.min_opacity)
+        halves = {
+            **parents,
+            "log_scale": log_scale,
+            "opacity": np.log(opacity / (1 - opacity)).astype(np.float32),
+        }
+        sides = [
+            {**halves, "xyz": (parents["xyz"] + side * away).astype(np.float32)} for side in (-1, 1)
+        ]
+        return {name: np.concatenate([side[name] for side in sides]) for name in HALVED}

@@ -3,35 +3,50 @@
 from collections import deque
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
 from ...capture.model import View
 from ...raster.cpu.image_loss import LOSS_REACH_PX
+from ...raster.cpu.layout import Parameters
 from ...raster.gpu import optimizer, rasterize
 from ...raster.gpu.device import Device, Readback, Recording
 from ...raster.gpu.frames import Embedding
-from ...raster.gpu.layout import COUNTS, NEEDED, OVERFLOWED, splat_rows, split_rows
+from ...raster.gpu.layout import (
+    COUNTS,
+    LOG_SCALE,
+    NEEDED,
+    OPACITY_LOGIT,
+    OVERFLOWED,
+    ROTATION,
+    SH,
+    XYZ,
+    splat_rows,
+)
 from ...raster.gpu.optimizer import OffsetTables, OptimizerTables, image_loss, upload_target
+from ...raster.gpu.rows import Column, list_rows, read_columns, write_columns
 from ..settings import TrainingSettings
 from .adam import adam_options
 from .backend import Batch, RenderOptions
-from .cpu_backend import CpuBackend
+from .cpu_backend import WITHOUT_COLOR
 from .frames import FrameStore
-from .state import (
-    Halving,
-    OffsetState,
-    TrainState,
-    arrays_of,
-    assign_rows,
-    keep_rows,
-    with_halves,
-)
+from .state import OffsetState, TrainState, columns_of, state_of
 
 QUEUED_ITERATIONS = 2
 """Iterations that the device may be behind; losses are returned as many iterations late."""
-TABLES = ("gradients", "first", "second", "average")
-"""Tables of a `TrainState` beside the splats, each shaped as the splats."""
+TABLES = {
+    "parameters": "splats",
+    "gradients": "gradients",
+    "first": "first",
+    "second": "second",
+    "average": "average",
+}
+"""Arrays of a `TrainState` that are shaped as splats -> their table on the device."""
+HISTORY = {"steps": np.int32, "screen_gradient": np.float32, "gradient_count": np.float32}
+"""Columns of the table `history`."""
+KEPT = ("face", "unbound", "unseen_share")
+"""Columns that no iteration changes, which the host has as well."""
 
 
 @dataclass
@@ -52,7 +67,7 @@ class GpuBackend:
     changes nothing from there on; the host learns it when it reads that iteration's loss, makes
     room, and queues what was left out again.
 
-    Between steps, rows are edited in a copy in host memory, which the next step or picture uploads.
+    Between steps, the host reads columns and names rows; all others stay where they are.
     """
 
     def __init__(
@@ -69,8 +84,6 @@ class GpuBackend:
         self._triangles = len(capture.faces)
         distance_limits = settings.distance_limit * frames.units
         self._limits = np.column_stack([*frames.scale_limits(settings), distance_limits])
-        self._edited: TrainState | None = None
-        self._is_changed = False
         self._pending: deque[_Queued] = deque()
         self._readbacks = [Readback(device, COUNTS + 1) for _ in range(QUEUED_ITERATIONS)]
         self._rasterizer.make_room(0)
@@ -78,113 +91,120 @@ class GpuBackend:
         self.state = state
 
     def __len__(self) -> int:
-        return self._splats.count if self._edited is None else len(self._edited)
+        return self._splats.count
 
     @property
     def state(self) -> TrainState:
-        self._finish_all()
-        self._upload_edited()
-        count = len(self)
-        stride = self._splats.stride
-        coefficients = self._splats.coefficients
-        read = self.device.read
-        buffer = self.device.buffer
-        tables = [
-            split_rows(read(buffer(name, 0), (count, stride)), coefficients)
-            for name in ("splats", *TABLES)
-        ]
-        history = read(self._tables.history, (count, 3), np.uint32)
-        traits = read(self._tables.traits, (count, 2))
-        sums = history.view(np.float32)
-        offsets = {}
+        arrays = self.columns(HISTORY)
+        for part in TABLES:  # one by one, as there is room for
+            arrays |= self.columns([f"{part}/{name}" for name in Parameters._fields])
+        state = state_of(arrays | {name: array.copy() for name, array in self._kept.items()})
         for name, each in self._offsets.items():
             shape = self._triangles, 3, 3
             parts = (each.coefficients, each.first, each.second, each.average)
-            value, first, second, average = (read(part, shape) for part in parts)
-            steps = read(each.steps, (self._triangles,), np.int32)
-            offsets[name] = OffsetState(value, first, second, average, steps)
-        parameters, gradients, *moments, mean = tables
-        return TrainState(
-            parameters,
-            gradients,
-            moments[0],
-            moments[1],
-            mean,
-            history[:, 0].astype(np.int32),
-            read(self._splats.face, (count,), np.int32),
-            traits[:, 0] > 0,
-            traits[:, 1].copy(),
-            sums[:, 1].copy(),
-            sums[:, 2].copy(),
-            offsets,
-        )
+            value, first, second, average = (self.device.read(part, shape) for part in parts)
+            steps = self.device.read(each.steps, (self._triangles,), np.int32)
+            state.driven_offsets[name] = OffsetState(value, first, second, average, steps)
+        return state
 
     @state.setter
     def state(self, state: TrainState) -> None:
         self._finish_all()
-        self._edited = None
-        self._is_changed = False
         upload = self.device.upload
-        rows = {name: upload(name, splat_rows(getattr(state, name))) for name in TABLES}
-        self._gradients = rows.pop("gradients")
-        sums = (state.screen_gradient.view(np.uint32), state.gradient_count.view(np.uint32))
-        history = np.stack([state.steps.astype(np.uint32), *sums], axis=1)
-        traits = np.stack([state.unbound, state.unseen_share], axis=1, dtype=np.float32)
-        self._tables = OptimizerTables(
-            **rows,
-            history=upload("history", history),
-            traits=upload("traits", traits),
-            limits=upload("limits", self._limits.astype(np.float32)),
-        )
-        self._splats = rasterize.upload_splats(self.device, state.parameters, state.face)
-        by_triangle = optimizer.splats_by_triangle(state.face, self._triangles)
-        splats_of = upload("splats by triangle", by_triangle)
+        columns = columns_of(state)
+        tables = {
+            name: upload(name, splat_rows(getattr(state, part))) for part, name in TABLES.items()
+        }
+        history = [columns[name].view(np.uint32) for name in HISTORY]
+        tables["history"] = upload("history", np.stack(history, axis=1))
+        upload("limits", self._limits.astype(np.float32))
+        self._place(tables, {name: columns[name] for name in KEPT}, state.parameters.sh.shape[1])
         self._offsets = {}
         for name, offset in state.driven_offsets.items():
             parts = [upload(f"{name} {part}", each) for part, each in vars(offset).items()]
-            self._offsets[name] = OffsetTables._make([*parts, splats_of])
+            self._offsets[name] = OffsetTables._make([*parts, self._splats_by_triangle()])
 
-    def _host_state(self) -> TrainState:
-        """The copy that is edited: the latest state, which is read once between two steps."""
-        if self._edited is None:
-            self._edited = self.state
-        return self._edited
+    def _place(
+        self, tables: dict[str, Any], kept: dict[str, np.ndarray], coefficients: int
+    ) -> None:
+        """Take tables on the device, and columns KEPT, as those of the splats from now on."""
+        device = self.device
+        self._kept = kept
+        faces = device.upload("face", kept["face"].astype(np.uint32))
+        traits = np.stack([kept["unbound"], kept["unseen_share"]], axis=1, dtype=np.float32)
+        count = len(kept["face"])
+        self._splats = rasterize.SplatTable(tables["splats"], faces, count, coefficients)
+        self._gradients = tables["gradients"]
+        self._tables = OptimizerTables(
+            **{name: tables[name] for name in ("first", "second", "average", "history")},
+            traits=device.upload("traits", traits),
+            limits=device.buffer("limits", 0),
+        )
 
-    def _change(self, state: TrainState) -> None:
-        self._edited = state
-        self._is_changed = True
-
-    def _upload_edited(self) -> None:
-        if self._edited is not None and self._is_changed:
-            self.state = self._edited
-        self._edited = None
+    def _splats_by_triangle(self) -> Any:
+        by_triangle = optimizer.splats_by_triangle(self._kept["face"], self._triangles)
+        return self.device.upload("splats by triangle", by_triangle)
 
     def blend_weights(self, view: View) -> np.ndarray:
-        host = CpuBackend(self._settings, self._frames, self._host_state())
-        return host.blend_weights(view)
+        self._finish_all()
+        while True:
+            with self.device.record() as work:
+                rendering = self._render(work, view, WITHOUT_COLOR)
+                given = rendering, self._splats, view.camera
+                weights = self._rasterizer.blend_weights(work, *given)
+            if self._rasterizer.pairs_fit():
+                return self.device.read(weights, (len(self),))
 
     def coefficients(self) -> dict[str, np.ndarray]:
-        offsets = self._host_state().driven_offsets.items()
-        return {name: offset.value for name, offset in offsets}
+        self._finish_all()
+        shape = self._triangles, 3, 3
+        tables = self._offsets.items()
+        return {name: self.device.read(table.coefficients, shape) for name, table in tables}
 
     def columns(self, names: Collection[str]) -> dict[str, np.ndarray]:
-        arrays = arrays_of(self._host_state())
-        return {name: arrays[name] for name in names}
+        self._finish_all()
+        there = {name: self._column(name) for name in names if name not in KEPT}
+        read = read_columns(self.device, there, len(self))
+        return {name: self._kept[name] if name in KEPT else read[name] for name in names}
 
     def assign(self, rows: np.ndarray, values: Mapping[str, np.ndarray | float]) -> None:
-        state = self._host_state()
-        assign_rows(state, rows, values)
-        self._change(state)
+        self._finish_all()
+        numbers = np.flatnonzero(rows) if rows.dtype == bool else rows
+        if len(numbers):
+            columns = [(self._column(name), value) for name, value in values.items()]
+            write_columns(self.device, numbers, columns)
 
     def keep(self, rows: np.ndarray) -> None:
-        self._change(keep_rows(self._host_state(), rows))
+        self._finish_all()
+        numbers = np.flatnonzero(rows) if rows.dtype == bool else rows
+        tables = {
+            name: (self.device.buffer(name, 0), self._splats.stride) for name in TABLES.values()
+        }
+        tables["history"] = self._tables.history, len(HISTORY)
+        kept = {name: column[numbers] for name, column in self._kept.items()}
+        self._place(list_rows(self.device, numbers, tables), kept, self._splats.coefficients)
+        if self._offsets:
+            splats_of = self._splats_by_triangle()
+            for name, offset in self._offsets.items():
+                self._offsets[name] = offset._replace(splats_of=splats_of)
 
-    def append_halves(self, halving: Halving) -> None:
-        self._change(with_halves(self._host_state(), halving))
+    def _column(self, name: str) -> Column:
+        if name in HISTORY:
+            place = list(HISTORY).index(name)
+            return Column(self._tables.history, len(HISTORY), place, dtype=HISTORY[name])
+        part, field = name.split("/")
+        first, shape = {
+            "xyz": (XYZ, (3,)),
+            "rotation": (ROTATION, (4,)),
+            "log_scale": (LOG_SCALE, (3,)),
+            "opacity": (OPACITY_LOGIT, ()),
+            "color": (SH, (3,)),
+            "sh": (SH, (self._splats.coefficients, 3)),
+        }[field]
+        return Column(self.device.buffer(TABLES[part], 0), self._splats.stride, first, shape)
 
     def step(self, batch: Batch) -> float | None:
         """Queue one step; returns the loss of the iteration before the last, if global."""
-        self._upload_edited()
         loss = None
         if len(self._pending) == QUEUED_ITERATIONS:
             self._finish(0)
@@ -197,7 +217,6 @@ class GpuBackend:
 
     def render(self, view: View, options: RenderOptions) -> np.ndarray:
         self._finish_all()
-        self._upload_edited()
         while True:
             with self.device.record() as work:
                 rendering = self._render(work, view, options, averaged=True)

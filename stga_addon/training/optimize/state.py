@@ -4,14 +4,13 @@ import math
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from ...avatar.file import Avatar
-from ...avatar.splats import Splats, joined
+from ...avatar.splats import Splats
 from ...avatar.strain import STRAIN_COMPONENTS
-from ...flame.quaternions import to_matrices
 from ...raster.cpu.layout import Parameters
 from ...raster.cpu.optimizer import AdamTables
 
@@ -93,6 +92,7 @@ class TrainState:
 
 
 _SPLAT_FIELDS = [field.name for field in fields(TrainState) if field.name != "driven_offsets"]
+_HARMONICS = [f"{kind}/sh" for kind in ("parameters", "gradients", "first", "second", "average")]
 
 
 def new_state(splats: Splats, unseen_share: np.ndarray | None = None) -> TrainState:
@@ -138,50 +138,6 @@ def join(state: TrainState, other: TrainState) -> TrainState:
     return replace(state_of(rows), driven_offsets=state.driven_offsets)
 
 
-class Halving(NamedTuple):
-    """Splats that are split in two along their longest axis.
-
-    rows         (M,) of the splats
-    distance     (M, 1) float64 of either half's center from the parent's, in its standard deviation
-                 along that axis
-    narrowing    by which the halves are narrower along it
-    min_opacity  of a half, 0…1
-    """
-
-    rows: np.ndarray
-    distance: np.ndarray
-    narrowing: float
-    min_opacity: float
-
-
-def with_halves(state: TrainState, halving: Halving) -> TrainState:
-    """The state with halves of splats as the last rows: first all on one side, then all on the
-    other. Their parents are still there.
-
-    Halves inherit triangle, binding and unseen share, lie within the parent's Gaussian in local
-    units, and keep Adam's second moment and step count, without which their first steps would all
-    be as long as the rate.
-    """
-    kept = keep_rows(state, halving.rows)
-    parents = kept.splats()
-    pairs = join(kept, kept)
-    n = np.arange(len(parents))
-    longest = np.argmax(parents.log_scale, axis=1)
-    length = np.exp(parents.log_scale[n, longest])[:, None]
-    offset = to_matrices(parents.rotation)[n, :, longest] * length
-    parents.log_scale[n, longest] -= np.log(halving.narrowing)
-    # of two Gaussians beside each other, so much narrower, that cover as much as one
-    alike = halving.narrowing / 2 * opacity_of(parents.opacity)
-    opacity = np.maximum(alike, halving.min_opacity)
-    parents.opacity[:] = np.log(opacity / (1 - opacity))
-    away = offset * halving.distance
-    sides = [(parents.xyz + side * away).astype(np.float32) for side in (-1, 1)]
-    halves = new_state(joined([replace(parents, xyz=xyz) for xyz in sides]), pairs.unseen_share)
-    halves.second = pairs.second
-    halves.steps = pairs.steps
-    return join(state, halves)
-
-
 def opacity_of(logit: np.ndarray) -> np.ndarray:
     """(N,) float64 opacity 0…1 of logits (N,)."""
     return np.asarray(1 / (1 + np.exp(-logit.astype(np.float64))))
@@ -215,10 +171,25 @@ def with_offsets(state: TrainState, offsets: Collection[str], triangles: int) ->
 def assign_rows(
     state: TrainState, rows: np.ndarray, values: Mapping[str, np.ndarray | float]
 ) -> None:
-    """Write to rows of the arrays of `arrays_of`, in place."""
-    arrays = arrays_of(state)
+    """Write to rows of the columns of `columns_of`, in place."""
+    columns = columns_of(state)
     for name, value in values.items():
-        arrays[name][rows] = value
+        columns[name][rows] = value
+
+
+def columns_of(state: TrainState) -> dict[str, np.ndarray]:
+    """The arrays of `arrays_of`, and the constant coefficients of harmonics alone, such as
+    "average/color" (N, 3), as views."""
+    columns = arrays_of(state)
+    for name in _HARMONICS:
+        columns[name.removesuffix("sh") + "color"] = columns[name][:, 0]
+    return columns
+
+
+def parameters_and_average(values: Mapping[str, np.ndarray]) -> dict[str, np.ndarray | float]:
+    """The columns that give splats these values at once, in the avatar as well."""
+    kinds = ("parameters", "average")
+    return {f"{kind}/{name}": value for kind in kinds for name, value in values.items()}
 
 
 def arrays_of(state: TrainState) -> dict[str, np.ndarray]:

@@ -14,6 +14,7 @@ from ..settings import TrainingSettings
 from .backend import Backend
 from .change import Turn
 from .frames import FrameStore
+from .state import parameters_and_average
 from .surface import UNSEEN_COSINE
 from .unseen_sides import UnseenSides, unseen_sides
 
@@ -44,14 +45,16 @@ MIN_VARIANCE = 1e-14
 PULLED_COLUMNS = (
     "face",
     "unbound",
-    "parameters/sh",
+    "parameters/color",
     "parameters/opacity",
     "parameters/xyz",
     "parameters/rotation",
     "parameters/log_scale",
-    "second/sh",
+    "second/color",
     "second/opacity",
 )
+
+PINNED_KINDS = ("parameters", "average", "first", "second")
 
 
 class SurfacePrior:
@@ -100,20 +103,19 @@ class SurfacePrior:
     ) -> None:
         sides = self.sides
         face = columns["face"]
-        share = self._doubt(columns["second/sh"][:, 0], face)
+        share = self._doubt(columns["second/color"], face)
         least = SHOWN_COSINE if self._surface.has_few_cameras else UNSEEN_COSINE
         share[sides.shown[face] & (self._surface.facing[face] > least)] = 0
         is_pinned = sides.triangles[face] | self._is_under_lid(columns)
         rows = np.flatnonzero((share > MIN_PULL) & ~is_pinned)
         plausible = ((sides.color[face] - 0.5) / SH_C0).astype(np.float32)
-        sh = columns["parameters/sh"][rows]
-        sh[:, 0] += share[rows, None] * (plausible[rows] - sh[:, 0])
-        backend.assign(bound[rows], {"parameters/sh": sh})
+        color = columns["parameters/color"][rows]
+        color += share[rows, None] * (plausible[rows] - color)
+        backend.assign(bound[rows], {"parameters/color": color})
         rows = np.flatnonzero(is_pinned)
-        sh = np.zeros_like(columns["parameters/sh"][rows])
-        sh[:, 0] = plausible[rows]
-        moments = dict.fromkeys(("first/sh", "second/sh"), 0.0)
-        backend.assign(bound[rows], {**parameters_and_average({"sh": sh}), **moments})
+        zeros = dict.fromkeys((f"{kind}/sh" for kind in PINNED_KINDS), 0.0)
+        values = parameters_and_average({"color": plausible[rows]})
+        backend.assign(bound[rows], {**zeros, **values})
 
     def _pull_shapes(
         self, backend: Backend, bound: np.ndarray, columns: Mapping[str, np.ndarray]
@@ -164,12 +166,6 @@ class SurfacePrior:
         height = columns["parameters/xyz"][:, NORMAL_AXIS[self._frames.convention]]
         is_under = height < LID_DEPTH_SHARE * self._frames.layer_height[face]
         return np.asarray(self._surface.lids[face] & is_under)
-
-
-def parameters_and_average(values: Mapping[str, np.ndarray]) -> dict[str, np.ndarray | float]:
-    """The columns that give splats these values at once, in the avatar as well."""
-    kinds = ("parameters", "average")
-    return {f"{kind}/{name}": value for kind in kinds for name, value in values.items()}
 
 
 def thickness(rotation: np.ndarray, log_scale: np.ndarray, axis: int) -> np.ndarray:
