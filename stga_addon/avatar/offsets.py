@@ -18,6 +18,7 @@ frames; 0 where it is at rest. "normal": the change of the unit normal, world ax
 POSITION = "position"
 SCALE = "scale"
 COLOR = "color"
+TARGETS = (POSITION, SCALE, COLOR)
 
 
 @dataclass(frozen=True)

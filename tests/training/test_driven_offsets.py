@@ -1,7 +1,6 @@
 """Training of driven offsets: gradient, step, run folder."""
 
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -19,7 +18,7 @@ from stga_addon.training.optimize.state import new_offset
 from stga_addon.training.optimize.trainer import Trainer
 from stga_addon.training.run.checkpoint import trained_strain_range
 
-from .toys import quick_settings
+from .toys import quick_settings, random_state
 
 
 def squeezed(toy):
@@ -112,9 +111,9 @@ def test_the_step_is_adam_in_float64():
         smoothed = rng.normal(0, 1, (faces, 3)).astype(np.float32)
         if number == 2:
             gradient[rows[face[rows] == 3]] = np.inf
-        splats = SimpleNamespace(
-            driven_offsets={offset.name: state}, face=face, gradients=SimpleNamespace(xyz=gradient)
-        )
+        splats = random_state(40, faces)
+        splats = replace(splats, face=face, driven_offsets={offset.name: state})
+        splats.gradients.xyz[:] = gradient
         options = adam.PLAIN._replace(ema_share=np.float32(ema_share), epsilon=np.float32(epsilon))
         signal = {offset.signal: smoothed}.__getitem__
         rates = {offset.rate: rate}

@@ -103,3 +103,11 @@ class Blended(NamedTuple):
     transmittance: np.ndarray
     last: np.ndarray
     pair_blocks: np.ndarray
+
+
+def rows_by_triangle(face: np.ndarray, triangles: int) -> tuple[np.ndarray, np.ndarray]:
+    """The splats on each triangle, in order: where each one's begin (triangles + 1,) int64, and
+    their numbers (N,) int32; face (N,): the triangle of each splat."""
+    rows = np.argsort(face, kind="stable")
+    starts = np.searchsorted(face[rows], np.arange(triangles + 1))
+    return starts.astype(np.int64), rows.astype(np.int32)

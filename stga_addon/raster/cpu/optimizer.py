@@ -149,36 +149,60 @@ def add_screen_gradients(work, rows, screen_gradient, total, count):
             count[i] += ONE
 
 
-@jit
-def sum_by_triangle(rows, face, gradient, total):
-    """Add the first three columns of gradient (N, D) of the listed rows (M,) to the total (F, 3) of
-    their triangles."""
-    for n in range(len(rows)):
+@parallel(lambda lists, *_: len(lists[0]) - 1, piece=ROWS_PER_BLOCK)
+def step_offset(work, lists, stepped, sources, kind, signal, steps, parameter, options):
+    """One Adam step of a driven offset's coefficients on the triangles that have a splat among the
+    `stepped` (N,) bool; other triangles are not touched at all.
+
+    lists: `layout.rows_by_triangle`, of F triangles. sources: a tuple of `sum_of_triangle`'s arrays
+    (N, ·). kind: a tuple of whether the target is the scale, and of what the gradient is multiplied
+    by. signal (F, 3) drives the offset; steps (F,) int32 and parameter: AdamTables (F, 9), whose
+    gradient is not used.
+    """
+    call_helpers(work)
+    per_unit = kind[1]
+    total = np.empty(3, np.float32)
+    gradient = np.empty((ROWS_PER_BLOCK, 9), np.float32)
+    corrections = np.empty((3, ROWS_PER_BLOCK), np.float32)
+    triangles = np.empty(ROWS_PER_BLOCK, np.int32)
+    places = np.arange(ROWS_PER_BLOCK).astype(np.int32)
+    for begin, end in pieces(work):
+        count = 0
+        for f in range(begin, end):
+            if sum_of_triangle(f, lists, stepped, sources, kind[0], total):
+                for k in range(3):
+                    factor = per_unit * signal[f, k]
+                    for c in range(3):
+                        gradient[count, 3 * k + c] = factor * total[c]
+                triangles[count] = f
+                count += 1
+        trained = triangles[:count]
+        correct_bias(trained, steps, options, corrections)
+        for n in range(count):
+            steps[trained[n]] += 1
+        adam_block(trained, places[:count], parameter, gradient, corrections, options)
+
+
+@part_jit
+def sum_of_triangle(f, lists, stepped, sources, is_scale, total):
+    """Write to total (3,) the sum of the first three columns of sources[0] over a triangle's
+    stepped splats; or, first, the gradient of the logarithm of its frame's scale, from positions
+    and the gradients of positions and of the logarithms of scales, sources[1:]. Returns whether
+    there is such a splat."""
+    starts, rows = lists
+    gradient, xyz, v_xyz, v_log_scale = sources
+    is_any = False
+    total[:] = ZERO
+    for n in range(starts[f], starts[f + 1]):
         i = rows[n]
-        for c in range(3):
-            total[face[i], c] += gradient[i, c]
-
-
-@jit
-def sum_scale_gradient(rows, face, xyz, v_xyz, v_log_scale, total):
-    """Add to the first column of total (F, 3), of the listed rows' (M,) triangles, the gradient of
-    the logarithm of their frames' scale, from that of their splats' (N, 3)."""
-    for n in range(len(rows)):
-        i = rows[n]
-        for c in range(3):
-            total[face[i], 0] += xyz[i, c] * v_xyz[i, c] + v_log_scale[i, c]
-
-
-@jit
-def offset_gradient(triangles, signal, total, per_unit, out):
-    """Write to the listed triangles (L,) of out (F, 9) the gradient of a driven offset's
-    coefficients: per_unit · signal (F, 3) ⊗ total (F, 3)."""
-    for n in range(len(triangles)):
-        f = triangles[n]
-        for k in range(3):
-            factor = per_unit * signal[f, k]
+        if stepped[i]:
+            is_any = True
             for c in range(3):
-                out[f, 3 * k + c] = factor * total[f, c]
+                if is_scale:
+                    total[0] += xyz[i, c] * v_xyz[i, c] + v_log_scale[i, c]
+                else:
+                    total[c] += gradient[i, c]
+    return is_any
 
 
 @jit

@@ -6,6 +6,8 @@ path. The arithmetic is in `splat_block`; here, what is scattered in memory is c
 back.
 """
 
+import math
+
 import numpy as np
 
 from . import inline_jit, part_jit
@@ -57,6 +59,41 @@ def compose_frames(work, origin, rotation, scale, turn, shift, camera_origin, ca
                 for c in range(3):
                     along = t0 * rotation[f, 0, c] + t1 * rotation[f, 1, c] + t2 * rotation[f, 2, c]
                     camera_matrix[f, r, c] = scale[f] * along
+
+
+@parallel(lambda coefficients, *_: len(coefficients), piece=1024)
+def move_frames(work, coefficients, signal, target, rotation, unit, moved):
+    """Change face frames by a driven offset (`avatar.offsets`): coefficients (F, 3, 3) and signal
+    (F, 3) float32, target: its place among `offsets.TARGETS`.
+
+    rotation (F, 3, 3) and unit (F,) float64 are those of the frames before any change; moved: their
+    origin (F, 3) and scale (F,) float64, and color (F, 3) float32, of which one is changed.
+    """
+    origin, scale, color = moved
+    call_helpers(work)
+    for begin, end in pieces(work):
+        for f in range(begin, end):
+            s0 = signal[f, 0]
+            s1 = signal[f, 1]
+            s2 = signal[f, 2]
+            m = coefficients[f]
+            change0 = s0 * m[0, 0] + s1 * m[1, 0] + s2 * m[2, 0]
+            change1 = s0 * m[0, 1] + s1 * m[1, 1] + s2 * m[2, 1]
+            change2 = s0 * m[0, 2] + s1 * m[1, 2] + s2 * m[2, 2]
+            if target == 0:
+                for c in range(3):
+                    turned = (
+                        rotation[f, c, 0] * change0
+                        + rotation[f, c, 1] * change1
+                        + rotation[f, c, 2] * change2
+                    )
+                    origin[f, c] += unit[f] * turned
+            elif target == 1:
+                scale[f] *= math.exp(np.float64(change0))
+            else:
+                color[f, 0] += change0
+                color[f, 1] += change1
+                color[f, 2] += change2
 
 
 @part_jit

@@ -1,20 +1,21 @@
 """Rendering on the CPU: splats and a camera to an image, and the image's gradient back to the
 splats."""
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
 from math import prod
 from typing import Any
 
 import numpy as np
 
+from ...avatar import offsets
 from ...avatar.embedding import FaceFrames
 from ...capture.camera import Camera
 from . import tiles as tiling
 from .blend import blend_backward, blend_forward
 from .layout import PROJECTED, RED, TILE, Blended, CameraFrames, Parameters, Projection, TileLists
 from .optimizer import AdamOptions, AdamTables, ColorStep
-from .project import compose_frames, project_backward, project_forward
+from .project import compose_frames, move_frames, project_backward, project_forward
 
 LINE_BYTES = 64
 CHUNK_BYTES = 1 << 22
@@ -115,6 +116,24 @@ def frames_in_camera(
         intrinsics=np.array([camera.fl_x, camera.fl_y, camera.cx, camera.cy], np.float32),
         size=np.array([camera.width, camera.height], np.int64),
     )
+
+
+def moved_frames(
+    frames: FaceFrames, coefficients: Mapping[str, np.ndarray], signal: Callable[[str], np.ndarray]
+) -> FaceFrames:
+    """`avatar.offsets.moved_frames` by a kernel."""
+    if not coefficients:
+        return frames
+    color = np.zeros((len(frames.scale), 3), np.float32)
+    moved = frames.origin.copy(), frames.scale.copy(), color
+    targets = set()
+    for name, values in coefficients.items():
+        offset = offsets.OFFSETS[name]
+        targets.add(offset.target)
+        target = offsets.TARGETS.index(offset.target)
+        move_frames(values, signal(offset.signal), target, frames.rotation, frames.scale, moved)
+    found = replace(frames, origin=moved[0], scale=moved[1])
+    return replace(found, color=color) if offsets.COLOR in targets else found
 
 
 def render_forward(

@@ -9,7 +9,7 @@ import numpy as np
 
 from ...avatar.offsets import COLOR, OFFSETS, SCALE
 from ...avatar.splats import SH_C0
-from ..cpu.layout import Parameters
+from ..cpu.layout import Parameters, rows_by_triangle
 from ..cpu.optimizer import AdamOptions
 from ..cpu.rasterize import tile_grid
 from .device import Device, Recording, entry_points
@@ -154,9 +154,8 @@ def splats_by_triangle(face: np.ndarray, triangles: int) -> np.ndarray:
 
     face (N,): the triangle of each splat.
     """
-    by_triangle = np.argsort(face, kind="stable")
-    start = np.searchsorted(face[by_triangle], np.arange(triangles + 1)) + triangles + 1
-    return np.asarray(np.concatenate([start, by_triangle]), np.uint32)
+    starts, rows = rows_by_triangle(face, triangles)
+    return np.asarray(np.concatenate([starts + triangles + 1, rows]), np.uint32)
 
 
 def step_offsets(

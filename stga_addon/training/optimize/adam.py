@@ -12,9 +12,7 @@ from ...raster.cpu.optimizer import (
     AdamTables,
     ColorStep,
     adam_rows,
-    offset_gradient,
-    sum_by_triangle,
-    sum_scale_gradient,
+    step_offset,
 )
 from ..settings import TrainingSettings
 from .state import TrainState
@@ -79,29 +77,24 @@ def step_offsets(
     """
     if not state.driven_offsets:
         return
-    face = state.face
     gradients = state.gradients
-    count = len(next(iter(state.driven_offsets.values())).steps)
-    trained = np.zeros(count, bool)
-    trained[face[rows]] = True
-    # by target
-    listed = np.flatnonzero(trained).astype(np.int32)
-    totals = dict[str, np.ndarray]()
+    stepped = np.zeros(len(state), bool)
+    stepped[rows] = True
+    moved = state.parameters.xyz, gradients.xyz, gradients.log_scale
+    by_color = gradients.sh.reshape(len(state), -1)
     for name, own in state.driven_offsets.items():
         offset = OFFSETS[name]
-        if offset.target not in totals:
-            total = totals[offset.target] = np.zeros((count, 3), np.float32)
-            if offset.target == SCALE:
-                moved = state.parameters.xyz, gradients.xyz, gradients.log_scale
-                sum_scale_gradient(rows, face, *moved, total)
-            else:
-                by_splat = gradients.sh if offset.target == COLOR else gradients.xyz
-                sum_by_triangle(rows, face, by_splat.reshape(len(face), -1), total)
-        arrays = (own.value, np.empty_like(own.value), own.first, own.second, own.average)
-        tables = [array.reshape(count, -1) for array in arrays]
-        total = totals[offset.target]
-        gradient = tables[1]
-        per_unit = np.float32(1 / SH_C0 if offset.target == COLOR else 1)
-        offset_gradient(listed, signal(offset.signal), total, per_unit, gradient)
-        rate = np.full(gradient.shape[1], offset.rate_share * rates[offset.rate], np.float32)
-        adam_rows(listed, own.steps, (AdamTables._make([*tables, rate]),), options)
+        is_color = offset.target == COLOR
+        arrays = (own.value, own.value, own.first, own.second, own.average)
+        tables = [array.reshape(len(own.steps), 9) for array in arrays]
+        rate = np.full(9, offset.rate_share * rates[offset.rate], np.float32)
+        step_offset(
+            state.rows_by_triangle,
+            stepped,
+            (by_color if is_color else gradients.xyz, *moved),
+            (offset.target == SCALE, np.float32(1 / SH_C0 if is_color else 1)),
+            signal(offset.signal),
+            own.steps,
+            AdamTables._make([*tables, rate]),
+            options,
+        )

@@ -9,9 +9,10 @@ import numpy as np
 
 from ...avatar.embedding import MIN_DIVISOR, FaceFrames, face_areas, face_frames
 from ...avatar.lattice import SCALE
-from ...avatar.offsets import SIGNALS, moved_frames
+from ...avatar.offsets import SIGNALS
 from ...avatar.strain import strain_basis, trained_range
 from ...capture.model import Capture
+from ...raster.cpu.rasterize import moved_frames
 from ..settings import TrainingSettings
 from .initial_splats import voxel_size
 from .surface import Surface

@@ -12,7 +12,12 @@ from ...capture.camera import Camera
 from ...raster.cpu import USES_BUNDLED_KERNELS, image_loss, optimizer
 from ...raster.cpu.layout import Parameters
 from ...raster.cpu.precompile import compile_gradients, rasterizer_helper
-from ...raster.cpu.rasterize import frames_in_camera, render_backward, render_forward
+from ...raster.cpu.rasterize import (
+    frames_in_camera,
+    moved_frames,
+    render_backward,
+    render_forward,
+)
 from ...raster.cpu.threads import Team
 from ...render.device import adapter_name
 from ...worker.launch import is_preparing
@@ -98,9 +103,11 @@ def _step() -> None:
     screen = state.screen_gradient
     total = state.gradient_count
     optimizer.add_screen_gradients(rows, np.zeros(2, np.float32), screen, total)
-    state = with_offsets(state, OFFSETS, 2)
-    signal = np.zeros((2, 3), np.float32)
+    state = with_offsets(state, OFFSETS, 1)
+    signal = np.zeros((1, 3), np.float32)
     adam.step_offsets(state, rows, lambda name: signal, rates, adam.PLAIN)
+    coefficients = {name: offset.value for name, offset in state.driven_offsets.items()}
+    moved_frames(WORLD, coefficients, lambda name: signal)
 
 
 def _two_splats() -> TrainState:

@@ -11,7 +11,7 @@ import numpy as np
 from ...avatar.file import Avatar
 from ...avatar.splats import Splats
 from ...avatar.strain import STRAIN_COMPONENTS
-from ...raster.cpu.layout import Parameters
+from ...raster.cpu.layout import Parameters, rows_by_triangle
 from ...raster.cpu.optimizer import AdamTables
 
 
@@ -78,6 +78,12 @@ class TrainState:
             tables = [array.reshape(len(array), math.prod(array.shape[1:])) for array in arrays]
             found[name] = AdamTables._make((*tables, np.empty(tables[0].shape[1], np.float32)))
         return found
+
+    @cached_property
+    def rows_by_triangle(self) -> tuple[np.ndarray, np.ndarray]:
+        """The rows of the splats on each triangle that a driven offset moves."""
+        triangles = len(next(iter(self.driven_offsets.values())).steps)
+        return rows_by_triangle(self.face, triangles)
 
     @cached_property
     def has_unseen(self) -> bool:
