@@ -7,16 +7,17 @@ Work is recorded into one command encoder and submitted at once; nothing waits f
 import logging
 import re
 import weakref
-from collections.abc import Iterator, Mapping
+from collections.abc import Hashable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache
 from importlib.resources import files
 from time import sleep
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import wgpu
+from wgpu.backends.wgpu_native import ffi, lib
 
 from ...errors import DeviceError, StgaError
 from .adapters import adapters, is_software
@@ -69,6 +70,7 @@ class Device:
         self.dispatches = self.submits = self.waits = 0
         self._buffers: dict[str, Any] = {}
         self._groups: dict[tuple[int, ...], tuple[Any, list[Any]]] = {}
+        self._kept: dict[Hashable, list[_Command]] = {}
 
     @property
     def bytes(self) -> int:
@@ -88,7 +90,9 @@ class Device:
             # An eighth to spare, so that a slowly growing count does not allocate every time.
             most = max(needed, self.max_bytes // 4 * 4)
             size = needed if buffer is None else min(needed + needed // 32 * 4, most)
-            self._groups.clear()  # which would keep the old buffer's memory
+            # which would keep the old buffer's memory
+            self._groups.clear()
+            self._kept.clear()
             buffer = self._buffers[name] = self.new_buffer(name, size, _USAGE[usage])
         return buffer
 
@@ -181,9 +185,38 @@ class Device:
             found = self._groups[key] = group, buffers
         return found[0]
 
-    def record(self) -> "Recording":
-        """Begin to record work; used as a context manager it is submitted at the end."""
-        return Recording(self)
+    def record(self, key: Hashable = None) -> "Recording":
+        """Begin to record work; used as a context manager it is submitted at the end, and kept for
+        `repeat` if it has a key."""
+        return Recording(self, key)
+
+    def repeat(self, key: Hashable) -> bool:
+        """Submit what was recorded with that key again, to the same buffers; False where none is
+        kept, or buffers have changed since."""
+        commands = self._kept.get(key)
+        if commands is not None:
+            self._submit(commands)
+        return commands is not None
+
+    def _submit(self, commands: "Sequence[_Command]") -> None:
+        with self.errors():
+            encoder = self.gpu.create_command_encoder()
+            compute: Any = None
+            for command in commands:
+                if isinstance(command, _Dispatch):
+                    if compute is None:
+                        compute = encoder.begin_compute_pass()
+                    command.encode(compute._internal)
+                    continue
+                if compute is not None:
+                    compute.end()
+                    compute = None
+                command.encode(encoder)
+            if compute is not None:
+                compute.end()
+            self.gpu.queue.submit([encoder.finish()])
+        self.submits += 1
+        self.dispatches += sum(isinstance(command, _Dispatch) for command in commands)
 
     @staticmethod
     def groups_of(workgroups: int) -> tuple[int, int, int]:
@@ -215,18 +248,61 @@ class Device:
             raise
 
 
+class _Dispatch(NamedTuple):
+    """A kernel's pipeline, bind group and workgroups."""
+
+    pipeline: Any
+    group: Any
+    groups: Groups
+
+    def encode(self, compute: Any) -> None:
+        """By the library's own functions: its methods look for an error after each call, which
+        takes longer than the call; what is wrong is told when the commands are finished."""
+        lib.wgpuComputePassEncoderSetPipeline(compute, self.pipeline._internal)
+        lib.wgpuComputePassEncoderSetBindGroup(compute, 0, self.group._internal, 0, ffi.NULL)
+        if len(self.groups) == 2:
+            buffer, offset = self.groups
+            lib.wgpuComputePassEncoderDispatchWorkgroupsIndirect(compute, buffer._internal, offset)
+        else:
+            lib.wgpuComputePassEncoderDispatchWorkgroups(compute, *self.groups)
+
+
+class _Copy(NamedTuple):
+    """The first words of a buffer to another, from its word `to` on."""
+
+    source: Any
+    target: Any
+    words: int
+    to: int
+
+    def encode(self, encoder: Any) -> None:
+        encoder.copy_buffer_to_buffer(self.source, 0, self.target, 4 * self.to, 4 * self.words)
+
+
+class _Clear(NamedTuple):
+    """Zeros for the first words of a buffer, or for all of it."""
+
+    buffer: Any
+    words: int | None
+
+    def encode(self, encoder: Any) -> None:
+        encoder.clear_buffer(self.buffer, 0, None if self.words is None else 4 * self.words)
+
+
+_Command = _Dispatch | _Copy | _Clear
+
+
 class Recording:
     """Work for the device in the order in which it is recorded; each dispatch sees what those
     before it wrote.
 
-    dispatches  recorded so far
+    commands  recorded so far
     """
 
-    def __init__(self, device: Device) -> None:
+    def __init__(self, device: Device, key: Hashable = None) -> None:
         self.device = device
-        self.dispatches = 0
-        self._encoder = device.gpu.create_command_encoder()
-        self._pass: Any = None
+        self.commands: list[_Command] = []
+        self._key = key
 
     def dispatch(
         self, name: str, threads: int | Groups, tables: Mapping[str, Any] = NONE, **constants: float
@@ -238,29 +314,18 @@ class Recording:
         if isinstance(groups, int):
             # `thread_number` in WGSL numbers the threads
             groups = self.device.groups_of(-(-groups // WORKGROUP))
-        indirect = not isinstance(groups[0], int)
-        if not indirect and 0 in groups:
+        if isinstance(groups[0], int) and 0 in groups:
             return
-        if self._pass is None:
-            self._pass = self._encoder.begin_compute_pass()
-        compute = self._pass
-        compute.set_pipeline(kernel.pipeline)
-        compute.set_bind_group(0, self.device.bind(kernel, tables))
-        if indirect:
-            compute.dispatch_workgroups_indirect(*groups)
-        else:
-            compute.dispatch_workgroups(*groups)
-        self.dispatches += 1
+        bound = self.device.bind(kernel, tables)
+        self.commands.append(_Dispatch(kernel.pipeline, bound, groups))
 
     def copy(self, source: Any, target: Any, words: int, to: int = 0) -> None:
         """Copy the first words of a buffer to another, from its word `to` on."""
-        self._end_pass()
-        self._encoder.copy_buffer_to_buffer(source, 0, target, 4 * to, 4 * words)
+        self.commands.append(_Copy(source, target, words, to))
 
     def clear(self, buffer: Any, words: int | None = None) -> None:
         """Fill the beginning of a buffer, or all of it, with zeros."""
-        self._end_pass()
-        self._encoder.clear_buffer(buffer, 0, None if words is None else 4 * words)
+        self.commands.append(_Clear(buffer, words))
 
     def __enter__(self) -> "Recording":
         return self
@@ -268,16 +333,9 @@ class Recording:
     def __exit__(self, kind: Any, error: Any, trace: Any) -> None:
         """Hand the work to the device, without waiting for it, unless there was an error."""
         if error is None:
-            with self.device.errors():
-                self._end_pass()
-                self.device.gpu.queue.submit([self._encoder.finish()])
-                self.device.submits += 1
-                self.device.dispatches += self.dispatches
-
-    def _end_pass(self) -> None:
-        if self._pass is not None:
-            self._pass.end()
-            self._pass = None
+            self.device._submit(self.commands)
+            if self._key is not None:
+                self.device._kept[self._key] = self.commands
 
 
 class Readback:

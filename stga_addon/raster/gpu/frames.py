@@ -82,19 +82,23 @@ class Embedding:
             "normal_change": device.buffer("normal_change", len(rows) and 3 * len(faces)),
         }
         self.signals: dict[str, Any] = {}
+        self._uploaded: np.ndarray | None = None
 
     def upload(self, vertices: np.ndarray, camera: Camera) -> None:
         """Send a posed mesh (V, 3), world meters, and its camera before the recording is submitted.
+        An array that is there from before is not sent again.
 
         Shaders have no float64: a position becomes the float32 of its distance to the first vertex
         and the rest.
         """
         center = vertices[0] if len(vertices) else np.zeros(3)
-        local = vertices - center
-        parts = np.empty((len(vertices), 6), np.float32)
-        parts[:, :3] = local
-        parts[:, 3:] = local - parts[:, :3]
-        self._device.upload("vertices", parts)
+        if vertices is not self._uploaded:
+            local = vertices - center
+            parts = np.empty((len(vertices), 6), np.float32)
+            parts[:, :3] = local
+            parts[:, 3:] = local - parts[:, :3]
+            self._device.upload("vertices", parts)
+            self._uploaded = vertices
         turn = camera.world_to_camera[:3, :3]
         shift = camera.world_to_camera[:3, 3]
         self._device.uniform(

@@ -46,7 +46,7 @@ class _Move:
         device = self.work.device
         part = device.uniform(
             "Part",
-            f"part {self.work.dispatches}",
+            f"part {len(self.work.commands)}",
             stride=column.stride,
             first=column.first,
             width=column.width,

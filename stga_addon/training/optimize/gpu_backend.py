@@ -148,8 +148,9 @@ class GpuBackend:
     def blend_weights(self, view: View) -> np.ndarray:
         self._finish_all()
         while True:
+            uploaded = self._upload_view(view, WITHOUT_COLOR)
             with self.device.record() as work:
-                rendering = self._render(work, view, WITHOUT_COLOR)
+                rendering = self._record_view(work, uploaded)
                 given = rendering, self._splats, view.camera
                 weights = self._rasterizer.blend_weights(work, *given)
             if self._rasterizer.pairs_fit():
@@ -218,8 +219,9 @@ class GpuBackend:
     def render(self, view: View, options: RenderOptions) -> np.ndarray:
         self._finish_all()
         while True:
+            uploaded = self._upload_view(view, options)
             with self.device.record() as work:
-                rendering = self._render(work, view, options, averaged=True)
+                rendering = self._record_view(work, uploaded, averaged=True)
             if self._rasterizer.pairs_fit():
                 shape = 3, view.camera.height, view.camera.width
                 return self.device.read(rendering["image"], shape)
@@ -262,50 +264,52 @@ class GpuBackend:
             statistics=batch.accumulate,
             triangles=self._triangles,
         )
-        with self.device.record() as work:
-            splats = self._splats
-            camera = batch.view.camera
-            rendering = self._render(work, batch.view, batch.options, batch.selected)
-            v_image, loss = image_loss(
-                work,
-                camera.width,
-                camera.height,
-                whole=whole,
-                **{name: rendering[name] for name in ("view", "image", "touched")},
-            )
-            screen = self._rasterizer.backward(
-                work, rendering, splats, camera, v_image, self._gradients
-            )
-            given = {name: rendering[name] for name in ("view", "wanted")}
-            given |= {"gradients": self._gradients, "splats": splats.rows}
-            signals = self._embedding.signals
-            optimizer.step_offsets(work, self._triangles, self._offsets, signals, **given)
-            limited = bool(settings.scale_weight or settings.distance_weight)
-            given |= {"face": splats.face, "screen": screen}
-            optimizer.optimize(work, splats.count, splats.stride, limited, self._tables, **given)
-            counts = rasterize.counts_buffer(self.device)
-            queued.readback.copy_from(work, (counts, COUNTS), (loss, 1))
+        view = self._upload_view(batch.view, batch.options, batch.selected)
+        width = view.camera.width
+        height = view.camera.height
+        # all that decides about the commands, beside buffers
+        sizes = width, height, len(self), self._rasterizer.capacity
+        key = whole, *sizes, *self._offsets, id(queued.readback)
+        if not self.device.repeat(key):
+            with self.device.record(key) as work:
+                loss = self._record_step(work, view, whole)
+                counts = rasterize.counts_buffer(self.device)
+                queued.readback.copy_from(work, (counts, COUNTS), (loss, 1))
         queued.readback.start()
 
-    def _render(
-        self,
-        work: Recording,
-        view: View,
-        options: RenderOptions,
-        selected: np.ndarray | None = None,
-        averaged: bool = False,
-    ) -> rasterize.Tables:
-        """Record a view of the splats, moved by the driven offsets; averaged: of the moving average
-        of both.
-
-        Only the tiles around the splats on the selected triangles, if any are given.
-        """
+    def _record_step(self, work: Recording, view: rasterize.ViewOptions, whole: bool) -> Any:
+        """Record an iteration; returns the table of its loss."""
+        settings = self._settings
         splats = self._splats
-        moved = {name: tables.coefficients for name, tables in self._offsets.items()}
-        if averaged:
-            splats = replace(splats, rows=self._tables.average)
-            moved = {name: tables.average for name, tables in self._offsets.items()}
+        camera = view.camera
+        rendering = self._record_view(work, view)
+        v_image, loss = image_loss(
+            work,
+            camera.width,
+            camera.height,
+            whole=whole,
+            **{name: rendering[name] for name in ("view", "image", "touched")},
+        )
+        screen = self._rasterizer.backward(
+            work, rendering, splats, camera, v_image, self._gradients
+        )
+        given = {name: rendering[name] for name in ("view", "wanted")}
+        given |= {"gradients": self._gradients, "splats": splats.rows}
+        signals = self._embedding.signals
+        optimizer.step_offsets(work, self._triangles, self._offsets, signals, **given)
+        limited = bool(settings.scale_weight or settings.distance_weight)
+        given |= {"face": splats.face, "screen": screen}
+        optimizer.optimize(work, splats.count, splats.stride, limited, self._tables, **given)
+        return loss
+
+    def _upload_view(
+        self, view: View, options: RenderOptions, selected: np.ndarray | None = None
+    ) -> rasterize.ViewOptions:
+        """Send mesh, camera and selection of the next rendering: of the tiles around the splats on
+        the selected triangles, if any are given."""
         self._embedding.upload(self._frames.mesh(view.timestep), view.camera)
+        if selected is not None:
+            self.device.upload("selected", selected)
         given = rasterize.ViewOptions(
             view.camera,
             options.sh_degree,
@@ -314,8 +318,22 @@ class GpuBackend:
             focused=selected is not None,
             reach=LOSS_REACH_PX,
         )
-        uniform = self._rasterizer.upload_view(splats, given)
-        marked = None if selected is None else self.device.upload("selected", selected)
-        focus = None if marked is None else rasterize.mark_focus(work, splats, uniform, marked)
+        self._rasterizer.upload_view(self._splats, given)
+        return given
+
+    def _record_view(
+        self, work: Recording, view: rasterize.ViewOptions, averaged: bool = False
+    ) -> rasterize.Tables:
+        """Record the uploaded view of the splats, moved by the driven offsets; averaged: of the
+        moving average of both."""
+        splats = self._splats
+        moved = {name: tables.coefficients for name, tables in self._offsets.items()}
+        if averaged:
+            splats = replace(splats, rows=self._tables.average)
+            moved = {name: tables.average for name, tables in self._offsets.items()}
+        buffer = self.device.buffer
+        uniform = buffer("view", 0, "uniform")
+        marked = buffer("selected", 0)
+        focus = rasterize.mark_focus(work, splats, uniform, marked) if view.focused else None
         frames = self._embedding.compose(work, moved)
-        return self._rasterizer.forward(work, splats, frames, given, uniform, focus)
+        return self._rasterizer.forward(work, splats, frames, view, uniform, focus)
