@@ -30,8 +30,8 @@ class Far:
     def __len__(self):
         return len(self.real)
 
-    def columns(self, names):
-        found = {name: array.copy() for name, array in self.real.columns(names).items()}
+    def columns(self, names, rows=None):
+        found = {name: array.copy() for name, array in self.real.columns(names, rows).items()}
         for array in found.values():
             array.setflags(write=False)
         return found

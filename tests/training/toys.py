@@ -69,8 +69,8 @@ class Rows(CpuBackend):
     def __init__(self, state):
         self.state = state
 
-    def columns(self, names):
-        found = {name: array.copy() for name, array in super().columns(names).items()}
+    def columns(self, names, rows=None):
+        found = {name: array.copy() for name, array in super().columns(names, rows).items()}
         for array in found.values():
             array.setflags(write=False)
         return found

@@ -96,6 +96,31 @@ def move_frames(work, coefficients, signal, target, rotation, unit, moved):
                 color[f, 2] += change2
 
 
+@parallel(lambda rows, *_: len(rows), piece=4096)
+def count_marked(work, rows, xyz, face, frames, mask, shown, marked):
+    """Add 1 to shown (N,) int32 of the listed splats (M,) int32 whose centers xyz (N, 3) lie in a
+    camera's image, and to marked (N,) int32 where the mask (H, W) bool holds there; frames: a
+    CameraFrames of the mask's size."""
+    height, width = mask.shape
+    fl_x, fl_y, cx, cy = frames.intrinsics
+    call_helpers(work)
+    for begin, end in pieces(work):
+        for n in range(begin, end):
+            i = rows[n]
+            m = frames.matrix[face[i]]
+            t = frames.origin[face[i]]
+            z = m[2, 0] * xyz[i, 0] + m[2, 1] * xyz[i, 1] + m[2, 2] * xyz[i, 2] + t[2]
+            if z > block.NEAR_M:
+                x = m[0, 0] * xyz[i, 0] + m[0, 1] * xyz[i, 1] + m[0, 2] * xyz[i, 2] + t[0]
+                y = m[1, 0] * xyz[i, 0] + m[1, 1] * xyz[i, 1] + m[1, 2] * xyz[i, 2] + t[1]
+                column = fl_x * x / z + cx
+                row = fl_y * y / z + cy
+                if 0 <= column < width and 0 <= row < height:
+                    shown[i] += 1
+                    if mask[int(row), int(column)]:
+                        marked[i] += 1
+
+
 @part_jit
 def _load(rows, splats, face, frames, b):
     """Copy the listed splats (at most BLOCK_SPLATS) and their frames to the block `b`."""

@@ -60,22 +60,26 @@ class _Move:
         self.work.dispatch(f"rows.{kernel}", self.rows * column.width, tables)
 
 
-def read_columns(device: Device, columns: Mapping[str, Column], rows: int) -> dict[str, np.ndarray]:
-    """The first rows of all columns, copied to host memory at once."""
+def read_columns(
+    device: Device, columns: Mapping[str, Column], rows: int | np.ndarray
+) -> dict[str, np.ndarray]:
+    """Columns of rows, (M,) numbers or so many of the first, copied to host memory at once."""
+    count = rows if isinstance(rows, int) else len(rows)
+    numbers = None if isinstance(rows, int) else device.upload(NUMBERS, rows.astype(np.uint32))
     starts = {}
     total = 0
     for name, column in columns.items():
         starts[name] = total
-        total += rows * column.width
+        total += count * column.width
     packed = device.buffer(PACKED, total)
     with device.record() as work:
         for name, column in columns.items():
-            _Move(work, packed, rows).record("gather", column, starts[name])
+            _Move(work, packed, count, numbers).record("gather", column, starts[name])
     words = device.read(packed, (total,), np.uint32)
     found = {}
     for name, column in columns.items():
-        of_column = words[starts[name] :][: rows * column.width]
-        found[name] = of_column.view(column.dtype).reshape(rows, *column.shape)
+        of_column = words[starts[name] :][: count * column.width]
+        found[name] = of_column.view(column.dtype).reshape(count, *column.shape)
     return found
 
 

@@ -90,8 +90,11 @@ class Backend(Protocol):
         """Driven offset -> its latest coefficients (F, 3, 3) float32, not to be written to."""
         ...
 
-    def columns(self, names: Collection[str]) -> dict[str, np.ndarray]:
-        """The named columns (N, …), not to be written to; they may be copies in host memory."""
+    def columns(
+        self, names: Collection[str], rows: np.ndarray | None = None
+    ) -> dict[str, np.ndarray]:
+        """The named columns (N, …), not to be written to; they may be copies in host memory. Of
+        some rows, (M,) numbers: copies (M, …)."""
         ...
 
     def assign(self, rows: np.ndarray, values: Mapping[str, np.ndarray | float]) -> None:

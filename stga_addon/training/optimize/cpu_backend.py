@@ -97,9 +97,12 @@ class CpuBackend:
     def coefficients(self) -> dict[str, np.ndarray]:
         return {name: offset.value for name, offset in self.state.driven_offsets.items()}
 
-    def columns(self, names: Collection[str]) -> dict[str, np.ndarray]:
+    def columns(
+        self, names: Collection[str], rows: np.ndarray | None = None
+    ) -> dict[str, np.ndarray]:
         columns = columns_of(self.state)
-        return {name: columns[name] for name in names}
+        found = {name: columns[name] for name in names}
+        return found if rows is None else {name: each.take(rows, 0) for name, each in found.items()}
 
     def assign(self, rows: np.ndarray, values: Mapping[str, np.ndarray | float]) -> None:
         assign_rows(self.state, rows, values)

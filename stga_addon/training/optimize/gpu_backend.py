@@ -162,11 +162,16 @@ class GpuBackend:
         tables = self._offsets.items()
         return {name: self.device.read(table.coefficients, shape) for name, table in tables}
 
-    def columns(self, names: Collection[str]) -> dict[str, np.ndarray]:
+    def columns(
+        self, names: Collection[str], rows: np.ndarray | None = None
+    ) -> dict[str, np.ndarray]:
         self._finish_all()
+        here = {name: self._kept[name] for name in names if name in KEPT}
         there = {name: self._column(name) for name in names if name not in KEPT}
-        read = read_columns(self.device, there, len(self))
-        return {name: self._kept[name] if name in KEPT else read[name] for name in names}
+        if rows is not None:
+            here = {name: column[rows] for name, column in here.items()}
+        wanted = len(self) if rows is None else rows
+        return here | (read_columns(self.device, there, wanted) if there else {})
 
     def assign(self, rows: np.ndarray, values: Mapping[str, np.ndarray | float]) -> None:
         self._finish_all()

@@ -8,13 +8,14 @@ from functools import cached_property
 import numpy as np
 from scipy.ndimage import binary_dilation
 
-from ...avatar.embedding import FaceFrames, points_to_world
+from ...avatar.embedding import FaceFrames
 from ...capture.camera import Camera
 from ...capture.images import area_mean, read_mask
 from ...capture.model import Capture
+from ...raster.cpu.project import count_marked
+from ...raster.cpu.rasterize import frames_in_camera
 from .backend import Backend
 from .change import Turn
-from .initial_splats import pixels_of
 from .state import PRUNED_BY, prunable
 
 MAX_OUTLINES = 16
@@ -104,12 +105,10 @@ def is_outside(
     """(N,) bool: whether points (N, 3), local to triangles (N,), lie outside of most of the
     outlines in whose image they lie; frames: of a timestep's triangles."""
     seen, outside = np.zeros((2, len(face)), np.int32)
-    rows = np.arange(len(face))
+    rows = np.arange(len(face), dtype=np.int32)
     for n, outline in enumerate(outlines):
         left = len(outlines) - n  # without those that all of these could not make a stray
         rows = rows[outside[rows] + left > MAX_OUTSIDE_SHARE * (seen[rows] + left)]
-        points = points_to_world(xyz[rows], frames(outline.timestep), face[rows])
-        x, y, shown = pixels_of(points, outline.camera)
-        seen[rows] += shown
-        outside[rows] += shown & outline.clear[y, x]
+        in_camera = frames_in_camera(frames(outline.timestep), outline.camera)
+        count_marked(rows, xyz, face, in_camera, outline.clear, seen, outside)
     return np.asarray(outside > MAX_OUTSIDE_SHARE * seen)

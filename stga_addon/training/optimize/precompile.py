@@ -12,6 +12,7 @@ from ...capture.camera import Camera
 from ...raster.cpu import USES_BUNDLED_KERNELS, image_loss, optimizer
 from ...raster.cpu.layout import Parameters
 from ...raster.cpu.precompile import compile_gradients, rasterizer_helper
+from ...raster.cpu.project import count_marked
 from ...raster.cpu.rasterize import (
     frames_in_camera,
     moved_frames,
@@ -107,7 +108,9 @@ def _step() -> None:
     signal = np.zeros((1, 3), np.float32)
     adam.step_offsets(state, rows, lambda name: signal, rates, adam.PLAIN)
     coefficients = {name: offset.value for name, offset in state.driven_offsets.items()}
-    moved_frames(WORLD, coefficients, lambda name: signal)
+    seen = frames_in_camera(moved_frames(WORLD, coefficients, lambda name: signal), CAMERA)
+    counts = np.zeros((2, 2), np.int32)
+    count_marked(rows, xyz, face, seen, np.ones((16, 16), bool), *counts)
 
 
 def _two_splats() -> TrainState:
