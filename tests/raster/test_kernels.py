@@ -103,6 +103,9 @@ SCENES = {
     "dark": replace(cloud(19), splats=cloud(19).splats | {"sh": cloud(19).splats["sh"] - 0.5}),
     "single": cloud(20, count=1, spread=0.0, log_scale=-1.0, logit=2.0),
     "many layers": cloud(30, count=700, size=(40, 40), log_scale=-1.5, logit=-3.0),
+    # which the GPU cuts
+    "long lists": cloud(31, count=2600, size=(20, 18), log_scale=-1.0, logit=-5.0),
+    "long lists, closed": cloud(32, count=1500, size=(20, 18), log_scale=-1.0, logit=-2.5),
 }
 
 

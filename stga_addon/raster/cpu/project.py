@@ -37,7 +37,7 @@ SPLATS_PER_PIECE = 4 * BLOCK_SPLATS
 """That a thread takes over at a time."""
 
 
-@parallel(lambda origin, *_: len(origin), piece=4096)
+@parallel(lambda origin, *_: len(origin), piece=1024)
 def compose_frames(work, origin, rotation, scale, turn, shift, camera_origin, camera_matrix):
     """Face frames as a camera sees them: camera_matrix = turn @ rotation · scale, camera_origin =
     turn @ origin + shift.

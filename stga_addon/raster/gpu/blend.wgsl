@@ -1,9 +1,18 @@
-// Alpha blending of the splats of each tile, forward and backward; see `cpu/blend.py`. A workgroup is a tile.
+// Alpha blending of the splats of each tile, forward and backward; see `cpu/blend.py`. Forward, a workgroup is a tile;
+// backward, SEGMENT_PAIRS of its pairs: those at a head's outline have ten times as many as others.
 
 var<storage> touched: array<u32>;
 var<storage> pair_slot: array<u32>; // (P,) a pair's slot; by tile, near to far
 var<storage> pixels: array<vec2u>; // (H, W) transmittance f32, and one past the last contributing pair
 var<storage> v_transmittance: array<f32>; // (H, W), if HAS_V_TRANSMITTANCE
+// Of the segment that begins after each cut of a tile's list: the color (3) that it adds to the tile's pixels, and
+// their transmittance before it; (P / SEGMENT_PAIRS + 1, 4, PIXELS), a cut's row by its pair's number.
+var<storage> segments: array<f32>;
+var<storage> segment_tile: array<u32>; // (P / SEGMENT_PAIRS + 1) the tile of the cut, if there is one
+
+fn segment_word(pair: u32, column: u32, local: u32) -> u32 {
+  return (pair / SEGMENT_PAIRS * 4u + column) * PIXELS + local;
+}
 
 struct Splat {
   mean: vec2f, // from the tile's corner
@@ -70,9 +79,20 @@ fn forward(thread: Thread) {
   var t = 1.0;
   var last = 0u;
   let range = tile_range[tile];
+  for (var cut = range.x + (1u + local) * SEGMENT_PAIRS; cut < range.y; cut += WORKGROUP * SEGMENT_PAIRS) {
+    segment_tile[cut / SEGMENT_PAIRS] = tile;
+  }
+  var segment = range.x;
+  var segment_color = vec3f(0.0);
   for (var begin = range.x; begin < range.y; begin += WORKGROUP) {
     if !anyone_open(open, local) {
       break;
+    }
+    if begin - segment == SEGMENT_PAIRS {
+      write_segment_color(segment, range.x, local, segment_color);
+      segment = begin;
+      segment_color = vec3f(0.0);
+      segments[segment_word(segment, 3u, local)] = t;
     }
     if begin + local < range.y {
       batch[local] = fetch(marked_splat(begin + local) & ~WANTED, vec2f(corner));
@@ -92,10 +112,12 @@ fn forward(thread: Thread) {
         break;
       }
       color += a * t * splat.color;
+      segment_color += a * t * splat.color;
       t = after;
       last = begin + q - range.x + 1u;
     }
   }
+  write_segment_color(segment, range.x, local, segment_color);
   if !is_inside(pixel) {
     return;
   }
@@ -106,6 +128,15 @@ fn forward(thread: Thread) {
   image[area + n] = color.y;
   image[2u * area + n] = color.z;
   pixels[n] = vec2u(bitcast<u32>(t), last);
+}
+
+// What a segment adds, unless it is the tile's first.
+fn write_segment_color(segment: u32, first: u32, local: u32, color: vec3f) {
+  if segment > first {
+    segments[segment_word(segment, 0u, local)] = color.x;
+    segments[segment_word(segment, 1u, local)] = color.y;
+    segments[segment_word(segment, 2u, local)] = color.z;
+  }
 }
 
 // Whether any pixel of the tile is open; also separates the use of one batch from the fetching of the next.
@@ -122,6 +153,42 @@ fn anyone_open(open: bool, local: u32) -> bool {
     is_open = atomicLoad(&open_pixels);
   }
   return workgroupUniformLoad(&is_open) == 1u;
+}
+
+// Part of a tile's list: the pairs from `begin` to one before `end`; an empty one has the tile NO_TILE.
+struct Segment {
+  tile: u32,
+  begin: u32,
+  end: u32,
+}
+
+const NO_TILE: u32 = 0xffffffffu;
+
+// A workgroup's: first those that tiles begin with, then those behind cuts.
+fn segment_of(group: u32) -> Segment {
+  let none = Segment(NO_TILE, 0u, 0u);
+  let tiles = view.tiles_x * view.tiles_y;
+  let cut = group - min(group, tiles);
+  if cut > view.capacity / SEGMENT_PAIRS {
+    return none;
+  }
+  var tile = group;
+  if group >= tiles {
+    tile = segment_tile[cut];
+  }
+  if tile >= tiles || touched[tile] == 0u {
+    return none;
+  }
+  let range = tile_range[tile];
+  var begin = range.x;
+  if group >= tiles {
+    let first = range.x / SEGMENT_PAIRS;
+    begin += (cut - min(cut, first)) * SEGMENT_PAIRS;
+    if cut <= first || begin >= range.y { // what an earlier image has left
+      return none;
+    }
+  }
+  return Segment(tile, begin, min(range.y, begin + SEGMENT_PAIRS));
 }
 
 // Gradient of every wanted pair of the touched tiles with respect to its splat's projected columns.
@@ -141,18 +208,19 @@ const SUM_STRIDE: u32 = PAIR_THREADS + 1u; // so that sums side by side lie in d
 
 var<workgroup> scratch: array<f32, 2u * BATCH * PIXELS>;
 var<workgroup> v_color: array<vec3f, PIXELS>;
-var<workgroup> deepest_last: atomic<u32>;
+var<workgroup> deepest_past: atomic<u32>;
 var<workgroup> nearest_wanted: atomic<u32>;
 var<workgroup> walk: vec2u; // first pair, and one past the last, that matter
 
 @compute @workgroup_size(WORKGROUP)
 fn backward(thread: Thread) {
   let local = thread.local;
-  let tile = workgroup_number(thread);
-  if tile >= view.tiles_x * view.tiles_y || touched[tile] == 0u {
+  let segment = segment_of(workgroup_number(thread));
+  if segment.tile == NO_TILE {
     return;
   }
-  let corner = tile_corner(tile);
+  let range = tile_range[segment.tile];
+  let corner = tile_corner(segment.tile);
   let pixel = corner + vec2u(local % TILE, local / TILE);
   let center = pixel_center(local);
   var v = vec3f(0.0);
@@ -170,10 +238,20 @@ fn backward(thread: Thread) {
       behind += v_transmittance[n];
     }
     behind *= t;
+    if range.x + last > segment.end {
+      for (var cut = segment.end; cut < range.x + last; cut += SEGMENT_PAIRS) {
+        let color = vec3f(
+          segments[segment_word(cut, 0u, local)],
+          segments[segment_word(cut, 1u, local)],
+          segments[segment_word(cut, 2u, local)],
+        );
+        behind += dot(color, v);
+      }
+      t = segments[segment_word(segment.end, 3u, local)];
+    }
   }
   v_color[local] = v;
-  let range = tile_range[tile];
-  let bounds = find_walk(range, last, local);
+  let bounds = find_walk(segment, range.x + last, local);
   for (var end = bounds.y; end > bounds.x; end -= min(end, BATCH)) {
     let begin = max(bounds.x + BATCH, end) - BATCH;
     var any_wanted = 0u;
@@ -219,15 +297,16 @@ fn backward(thread: Thread) {
   }
 }
 
-// The pairs from the nearest wanted one to the deepest that any pixel sees; writes zeros for the wanted ones behind.
-fn find_walk(range: vec2u, last: u32, local: u32) -> vec2u {
+// Of a segment, the pairs from the nearest wanted one to the deepest that any pixel sees; writes zeros for the wanted
+// ones behind. past: one past this pixel's last.
+fn find_walk(segment: Segment, past: u32, local: u32) -> vec2u {
   if local == 0u {
-    atomicStore(&deepest_last, 0u);
-    atomicStore(&nearest_wanted, range.y);
+    atomicStore(&deepest_past, segment.begin);
+    atomicStore(&nearest_wanted, segment.end);
   }
   workgroupBarrier();
-  atomicMax(&deepest_last, last);
-  for (var j = range.x + local; j < range.y; j += WORKGROUP) {
+  atomicMax(&deepest_past, min(past, segment.end));
+  for (var j = segment.begin + local; j < segment.end; j += WORKGROUP) {
     if marked_splat(j) >= WANTED {
       atomicMin(&nearest_wanted, j);
       break;
@@ -235,10 +314,10 @@ fn find_walk(range: vec2u, last: u32, local: u32) -> vec2u {
   }
   workgroupBarrier();
   if local == 0u {
-    walk = vec2u(atomicLoad(&nearest_wanted), range.x + atomicLoad(&deepest_last));
+    walk = vec2u(atomicLoad(&nearest_wanted), atomicLoad(&deepest_past));
   }
   let found = workgroupUniformLoad(&walk);
-  for (var j = found.y + local; j < range.y; j += WORKGROUP) {
+  for (var j = found.y + local; j < segment.end; j += WORKGROUP) {
     if marked_splat(j) >= WANTED {
       for (var c = 0u; c < PROJECTED; c++) {
         pair_gradients[pair_slot[j] * PROJECTED + c] = 0.0;

@@ -12,11 +12,11 @@ from typing import Any
 import numpy as np
 
 from ...capture.camera import Camera
-from ..cpu.layout import PROJECTED, TILE, CameraFrames, Parameters
+from ..cpu.layout import PIXELS, PROJECTED, TILE, CameraFrames, Parameters
 from ..cpu.rasterize import tile_grid
 from . import layout
 from .device import Device, Groups, Recording
-from .layout import COUNTS, DIGIT_BITS, SORT_BLOCK, WORKGROUP
+from .layout import COUNTS, DIGIT_BITS, SEGMENT_PAIRS, SORT_BLOCK, WORKGROUP
 
 INITIAL_PAIR_CAPACITY = 1 << 18
 """Pairs that a rasterizer has room for at first: 14 MB."""
@@ -108,6 +108,8 @@ class Rasterizer:
         counts = counts_buffer(self.device)
         words = {"touched": tiles, "rendered": tiles, "wanted": count, "slots": 2 * count}
         words |= {"tile_range": 2 * tiles, "slot_tile": room, "slot_splat": room}
+        cuts = room // SEGMENT_PAIRS + 1
+        words |= {"segments": 4 * PIXELS * cuts, "segment_tile": cuts}
         words["pairs_until"] = count + -(-count // WORKGROUP)
         tables = {name: buffer(name, each) for name, each in words.items()}
         tables |= {"view": view, "focus": buffer("rect", 0) if focus is None else focus}
@@ -176,7 +178,8 @@ class Rasterizer:
         given = {"v_image": v_image, "v_transmittance": v_transmittance or v_image}
         tables = rendering | given
         columns, rows = tile_grid(camera.width, camera.height)
-        work.dispatch("blend.backward", Device.groups_of(columns * rows), tables, **constants)
+        groups = Device.groups_of(columns * rows + self.capacity // SEGMENT_PAIRS + 1)
+        work.dispatch("blend.backward", groups, tables, **constants)
         return tables
 
     def pairs_fit(self) -> bool:
