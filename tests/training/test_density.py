@@ -12,7 +12,7 @@ from stga_addon.raster.cpu.autograd import render_differentiable
 from stga_addon.raster.cpu.layout import Parameters
 from stga_addon.training.optimize.change import Turn
 from stga_addon.training.optimize.density import DensityControl
-from stga_addon.training.optimize.state import arrays_of, new_state
+from stga_addon.training.optimize.state import arrays_of, keep_rows, new_state
 
 from .toys import Rows, bits, random_state
 
@@ -40,12 +40,21 @@ def control(state, budget=1000, share=1.0, seed=0):
     return rows.state
 
 
+def survivors_first(new, state, listed):
+    """What a turn made of the state, which is in the order of the triangles: the survivors in their
+    own order, then the halves of the listed ones, all on one side before those on the other."""
+    assert (np.diff(new.face) >= 0).all()
+    survivors = np.setdiff1d(np.arange(len(state)), listed)
+    face = state.face[np.concatenate([survivors, listed, listed])]
+    return keep_rows(new, np.argsort(np.argsort(face, kind="stable")))
+
+
 def test_survivors_keep_everything_and_children_what_steadies_them():
     """Catches moments of other rows, children without one, and splits of what many see."""
     listed = [3, 17, 30]
     state = busy_state(listed)
     before = bits(state)
-    after = bits(new := control(state))
+    after = bits(new := survivors_first(control(state), state, listed))
     survivors = np.setdiff1d(np.arange(COUNT), listed)
     assert len(new) == COUNT + 3
     for name, old in before.items():
@@ -79,7 +88,7 @@ def test_children_stand_on_either_side_along_the_longest_axis():
     state = busy_state(listed)
     parents = state.splats()
     state.unseen_share[:] = np.arange(COUNT) / COUNT
-    controlled = control(state)
+    controlled = survivors_first(control(state), state, listed)
     children = controlled.splats().rows(np.arange(COUNT - 4, COUNT + 4))
     for n, row in enumerate(listed):
         pair = children.rows(np.array([n, n + 4]))

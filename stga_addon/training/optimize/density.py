@@ -75,11 +75,15 @@ class DensityControl:
         distance = self.distance * (1 + self.jitter * rng.standard_normal((len(split), 1)))
         parents = {name: columns[f"parameters/{name}"][split] for name in HALVED}
         kept = np.flatnonzero(keep)
-        backend.keep(np.concatenate([kept, split, split]))
+        rows = np.concatenate([kept, split, split])
+        # by triangle, so that what is read together lies together in memory
+        order = np.argsort(face[rows], kind="stable")
+        backend.keep(rows[order])
         # Adam's second moment and step count are the parent's, without which the first steps would
         # all be as long as the rate
         values = parameters_and_average(self._halves(parents, distance))
-        backend.assign(np.arange(len(kept), len(backend)), {**values, **WITHOUT_MOMENTUM})
+        halves = np.argsort(order)[len(kept) :]
+        backend.assign(halves, {**values, **WITHOUT_MOMENTUM})
         every = np.ones(len(backend), bool)
         backend.assign(every, {"screen_gradient": 0.0, "gradient_count": 0.0})
 
@@ -113,12 +117,12 @@ class DensityControl:
         # of two Gaussians beside each other, so much narrower, that cover as much as one
         alike = self.narrowing / 2 * opacity_of(parents["opacity"])
         opacity = np.maximum(alike, 2 * self.min_opacity)
-        halves = {
+        either = {
             **parents,
             "log_scale": log_scale,
             "opacity": np.log(opacity / (1 - opacity)).astype(np.float32),
         }
         sides = [
-            {**halves, "xyz": (parents["xyz"] + side * away).astype(np.float32)} for side in (-1, 1)
+            {**either, "xyz": (parents["xyz"] + side * away).astype(np.float32)} for side in (-1, 1)
         ]
         return {name: np.concatenate([side[name] for side in sides]) for name in HALVED}

@@ -260,6 +260,7 @@ def _placed_splats(frames: FrameStore, settings: TrainingSettings) -> tuple[Trai
     whole, first = (splats_per_triangle(order(triangles)) for order in orders)
     lattice = int((~splats.unbound).sum())
     splats = joined([splats, layer])
+    splats = splats.rows(np.argsort(splats.face, kind="stable"))
     state = new_state(splats, unseen_share(capture, settings.convention, splats))
     state = with_offsets(state, settings.driven_offsets, triangles)
     return state, len(state) + lattice * whole // first - lattice
