@@ -24,8 +24,10 @@ SHOWN_COSINE = 0.5
 those that others are compared with; above the second, what views show keeps its color."""
 DOUBT = 0.3
 MIN_PULL = 0.02
+MAX_USUAL_SPLATS = 5_000
 """Gradient, as a share of the median of well seen splats, at which a splat is pulled halfway to
-what is plausible at a turn; the least share of the way that is worth it."""
+what is plausible at a turn; the least share of the way that is worth it; well seen splats that are
+looked at."""
 HIDDEN_ORDER = 1
 HIDDEN_OPACITY = 3.0
 HIDDEN_FLATNESS = 0.25
@@ -76,36 +78,49 @@ class SurfacePrior:
     def sides(self) -> UnseenSides:
         return unseen_sides(self._surface)
 
+    @cached_property
+    def may_be_pulled(self) -> np.ndarray:
+        """(F,) bool: triangles some of whose splats may be; of many cameras, few."""
+        surface = self._surface
+        may_be = ~self._keeps_color | self.sides.triangles | surface.lids | surface.is_flat
+        return np.asarray(may_be | (surface.turned_away > 0))
+
+    @cached_property
+    def _keeps_color(self) -> np.ndarray:
+        """(F,) bool: triangles whose color views show."""
+        least = SHOWN_COSINE if self._surface.has_few_cameras else UNSEEN_COSINE
+        return np.asarray(self.sides.shown & (self._surface.facing > least))
+
     def prepare(self) -> None:
-        self.sides  # noqa: B018
-        self._surface.is_flat  # noqa: B018
+        self.may_be_pulled  # noqa: B018
 
     def apply(self, backend: Backend, turn: Turn) -> None:
-        columns = backend.columns(PULLED_COLUMNS)
-        bound = np.flatnonzero(~columns["unbound"])
-        columns = {name: column[bound] for name, column in columns.items()}
-        self._pull_colors(backend, bound, columns)
-        self._pull_shapes(backend, bound, columns)
+        where = backend.columns(("face", "unbound"))
+        is_bound = ~where["unbound"]
+        bound = np.flatnonzero(is_bound & self.may_be_pulled[where["face"]])
+        if not len(bound):
+            return
+        well_seen = is_bound & (self._surface.facing > WELL_SEEN_COSINE)[where["face"]]
+        usual = np.flatnonzero(well_seen if well_seen.any() else is_bound)
+        usual = usual[:: 1 + len(usual) // MAX_USUAL_SPLATS]
+        moments = backend.columns(("second/color", "second/opacity"), usual)
+        columns = backend.columns(PULLED_COLUMNS, bound)
+        self._pull_colors(backend, bound, columns, moments["second/color"])
+        self._pull_shapes(backend, bound, columns, moments["second/opacity"])
         self._flatten(backend, bound, columns)
         self._keep_layer(backend, bound, columns)
 
-    def _doubt(self, second: np.ndarray, face: np.ndarray) -> np.ndarray:
-        """Share (N,) in 0…1 of what is plausible: 1 where views tell nothing, a half where
-        gradients are DOUBT times those of well seen splats. second (N, C): Adam's moments."""
-        told = np.sqrt(second.mean(1))
-        is_well_seen = self._surface.facing[face] > WELL_SEEN_COSINE
-        usual = told[is_well_seen] if is_well_seen.any() else told
-        little = DOUBT * np.median(usual) + np.finfo(np.float32).tiny
-        return np.asarray(little / (little + told), np.float32)
-
     def _pull_colors(
-        self, backend: Backend, bound: np.ndarray, columns: Mapping[str, np.ndarray]
+        self,
+        backend: Backend,
+        bound: np.ndarray,
+        columns: Mapping[str, np.ndarray],
+        usual: np.ndarray,
     ) -> None:
         sides = self.sides
         face = columns["face"]
-        share = self._doubt(columns["second/color"], face)
-        least = SHOWN_COSINE if self._surface.has_few_cameras else UNSEEN_COSINE
-        share[sides.shown[face] & (self._surface.facing[face] > least)] = 0
+        share = doubt(columns["second/color"], usual)
+        share[self._keeps_color[face]] = 0
         is_pinned = sides.triangles[face] | self._is_under_lid(columns)
         rows = np.flatnonzero((share > MIN_PULL) & ~is_pinned)
         plausible = ((sides.color[face] - 0.5) / SH_C0).astype(np.float32)
@@ -118,10 +133,14 @@ class SurfacePrior:
         backend.assign(bound[rows], {**zeros, **values})
 
     def _pull_shapes(
-        self, backend: Backend, bound: np.ndarray, columns: Mapping[str, np.ndarray]
+        self,
+        backend: Backend,
+        bound: np.ndarray,
+        columns: Mapping[str, np.ndarray],
+        usual: np.ndarray,
     ) -> None:
         face = columns["face"]
-        share = self._doubt(columns["second/opacity"][:, None], face)
+        share = doubt(columns["second/opacity"][:, None], usual[:, None])
         share *= self._surface.turned_away[face]
         rows = np.flatnonzero(share > MIN_PULL)
         share = share[rows]
@@ -166,6 +185,14 @@ class SurfacePrior:
         height = columns["parameters/xyz"][:, NORMAL_AXIS[self._frames.convention]]
         is_under = height < LID_DEPTH_SHARE * self._frames.layer_height[face]
         return np.asarray(self._surface.lids[face] & is_under)
+
+
+def doubt(second: np.ndarray, usual: np.ndarray) -> np.ndarray:
+    """Share (N,) in 0…1 of what is plausible: 1 where views tell nothing, a half where gradients
+    are DOUBT times those of well seen splats. second (N, C): Adam's moments; usual (M, C): those
+    of well seen splats."""
+    little = DOUBT * np.median(np.sqrt(usual.mean(1))) + np.finfo(np.float32).tiny
+    return np.asarray(little / (little + np.sqrt(second.mean(1))), np.float32)
 
 
 def thickness(rotation: np.ndarray, log_scale: np.ndarray, axis: int) -> np.ndarray:
