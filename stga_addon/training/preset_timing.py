@@ -78,9 +78,7 @@ def seconds_per_iteration(
     selective = settings.strategy == "selective"
     selection = select_capture(capture, settings.selection) if selective else {}
     trainer = Trainer(capture, settings, selection, device=device)
-    begin = perf_counter()
     trainer.prepare_turns()
-    once_s = perf_counter() - begin
     # shares of the run at which splats are split: by its own count, this one hardly ever would
     (start, end) = settings.density_span
     interval = settings.density_interval
@@ -110,7 +108,7 @@ def seconds_per_iteration(
     # are quick.
     measured = times[WARM_UP_ITERATIONS:]
     step_s = float(np.average(measured, weights=measured))
-    once_s += max(0.0, sum(split_s) - len(split_s) * step_s)
+    once_s = max(0.0, sum(split_s) - len(split_s) * step_s)
     if settings.tracking and settings.seconds is None:
         once_s += _tracking_seconds(trainer, replace(settings, iterations=iterations))
     return step_s + once_s / iterations

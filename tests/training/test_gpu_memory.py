@@ -103,4 +103,4 @@ def test_memory_is_the_cpus_and_as_documented(toy, monkeypatch):
         [[float(figure.replace(",", "")) for figure in row.groups()] for row in rows if row]
     )
     np.testing.assert_allclose(np.stack([on_cpu, on_gpu], 1), documented, rtol=0.02, atol=0.6)
-    assert (np.abs(on_gpu / on_cpu - 1) < 0.3).all()
+    assert (np.abs(on_gpu / on_cpu - 1) < 0.4).all()

@@ -18,7 +18,7 @@ WANTED = 0x80000000
 MAX_GROUPS = 65535
 """Workgroups along one dimension of a dispatch."""
 DIGIT_BITS = 11
-SORT_BLOCK = 2048
+SORT_BLOCK = 1024
 """Keys that a workgroup sorts."""
 SEGMENT_PAIRS = 512
 """Pairs of a tile that a workgroup looks at on the way back; a multiple of WORKGROUP."""
