@@ -105,7 +105,12 @@ class Surface:
     def turned_away(self) -> np.ndarray:
         """(F,) share in 0…1 of what views do not tell of a triangle's shape, by how it faces them:
         1 where it faces away, 0 where it does not graze."""
-        beyond = max(self.grazing_cosine, UNSEEN_COSINE + 1e-9)
+        return self.turned_from(GRAZING_COSINE)
+
+    def turned_from(self, cosine: float) -> np.ndarray:
+        """(F,) 1 where a triangle faces away from all cameras, less the better it faces one, 0 from
+        this cosine of the angle on; with many cameras, which outlines tell enough, 1 or 0."""
+        beyond = cosine if self.has_few_cameras else UNSEEN_COSINE + 1e-9
         return np.asarray(np.interp(self.facing, (UNSEEN_COSINE, beyond), (1, 0)))
 
     @cached_property

@@ -15,13 +15,13 @@ from .backend import Backend
 from .change import Turn
 from .frames import FrameStore
 from .state import parameters_and_average
-from .surface import UNSEEN_COSINE
 from .unseen_sides import UnseenSides, unseen_sides
 
 WELL_SEEN_COSINE = 0.8
 SHOWN_COSINE = 0.5
 """Of the angle between a triangle and the camera that it faces most: above the first, gradients are
-those that others are compared with; above the second, what views show keeps its color."""
+those that others are compared with; above the second, what views show keeps its color, below it
+the less the more it turns away."""
 DOUBT = 0.3
 MIN_PULL = 0.02
 MAX_USUAL_SPLATS = 5_000
@@ -33,10 +33,9 @@ HIDDEN_OPACITY = 3.0
 HIDDEN_FLATNESS = 0.25
 """Of the layer on hidden triangles: order of the lattice where none is chosen, logit, and how much
 thinner it is than the lattice's splats."""
-LID_DEPTH_SHARE = 0.5
 BESIDE_LID_SHARE = 0.6
-"""Of the depth of the layer under lids, below which a splat belongs to it; of its scale, at lids'
-edges and in the mouth, where it would stand out beside the eye and the lips."""
+"""Of the scale of the layer under lids, at their edges and in the mouth, where it would stand out
+beside the eye and the lips."""
 BORDER_INSET = 0.6
 """Of the distance from the middle of a triangle, and of the scale, at the mesh's edge."""
 FLAT_VOXELS = 0.25
@@ -82,14 +81,13 @@ class SurfacePrior:
     def may_be_pulled(self) -> np.ndarray:
         """(F,) bool: triangles some of whose splats may be; of many cameras, few."""
         surface = self._surface
-        may_be = ~self._keeps_color | self.sides.triangles | surface.lids | surface.is_flat
-        return np.asarray(may_be | (surface.turned_away > 0))
+        may_be = self.sides.triangles | surface.lids | surface.is_flat
+        return np.asarray(may_be | (self._color_share > 0) | (surface.turned_away > 0))
 
     @cached_property
-    def _keeps_color(self) -> np.ndarray:
-        """(F,) bool: triangles whose color views show."""
-        least = SHOWN_COSINE if self._surface.has_few_cameras else UNSEEN_COSINE
-        return np.asarray(self.sides.shown & (self._surface.facing > least))
+    def _color_share(self) -> np.ndarray:
+        """(F,) by which colors are pulled where views tell nothing of a splat; 0: not at all."""
+        return np.where(self.sides.shown, self._surface.turned_from(SHOWN_COSINE), 1.0)
 
     def prepare(self) -> None:
         self.may_be_pulled  # noqa: B018
@@ -119,8 +117,7 @@ class SurfacePrior:
     ) -> None:
         sides = self.sides
         face = columns["face"]
-        share = doubt(columns["second/color"], usual)
-        share[self._keeps_color[face]] = 0
+        share = doubt(columns["second/color"], usual) * self._color_share[face]
         is_pinned = sides.triangles[face] | self._is_under_lid(columns)
         rows = np.flatnonzero((share > MIN_PULL) & ~is_pinned)
         plausible = ((sides.color[face] - 0.5) / SH_C0).astype(np.float32)
@@ -141,7 +138,7 @@ class SurfacePrior:
     ) -> None:
         face = columns["face"]
         share = doubt(columns["second/opacity"][:, None], usual[:, None])
-        share *= self._surface.turned_away[face]
+        share = (share * self._surface.turned_away[face]) ** 2  # little of what outlines show
         rows = np.flatnonzero(share > MIN_PULL)
         share = share[rows]
         opacity = columns["parameters/opacity"][rows]
@@ -180,11 +177,18 @@ class SurfacePrior:
         backend.assign(bound[rows], parameters_and_average(layer_on(self._frames, face[rows])))
 
     def _is_under_lid(self, columns: Mapping[str, np.ndarray]) -> np.ndarray:
-        """(N,) bool: splats of the layer under lids."""
-        face = columns["face"]
-        height = columns["parameters/xyz"][:, NORMAL_AXIS[self._frames.convention]]
-        is_under = height < LID_DEPTH_SHARE * self._frames.layer_height[face]
-        return np.asarray(self._surface.lids[face] & is_under)
+        """(N,) bool: the splats of the layer under lids, each the nearest to its place. By depth,
+        lids' own splats would join it, as training moves them by more than the tenth of a
+        millimeter that it is deep, and never leave it."""
+        rows = np.flatnonzero(self._surface.lids[columns["face"]])
+        face = columns["face"][rows]
+        place = layer_on(self._frames, face)["xyz"]
+        distance = np.linalg.norm(columns["parameters/xyz"][rows] - place, axis=1)
+        order = np.lexsort((distance, face))
+        _, first = np.unique(face[order], return_index=True)
+        is_under = np.zeros(len(columns["face"]), bool)
+        is_under[rows[order[first]]] = True
+        return is_under
 
 
 def doubt(second: np.ndarray, usual: np.ndarray) -> np.ndarray:

@@ -26,8 +26,9 @@ SPREAD_VIEWS = 12
 OPEN_VIEWS = 6
 """Training views whose colors are looked at, spread over all, and of the timesteps in which the
 mouth is highest."""
-MIN_TEETH_SHARE = 0.08
-"""Of the teeth's triangles, half of which are behind others, that views show at least."""
+MIN_TEETH_SHARE = 0.04
+"""Of the pixels that show the mouth, that teeth fill at least; a slit between lips is as well one
+of the mesh alone."""
 SOURCE_COSINE = 0.5
 FRINGE_COSINE = 0.2
 """Of the angle between a triangle and a camera: below the first, others do not take its color,
@@ -96,6 +97,7 @@ def unseen_sides(surface: Surface) -> UnseenSides:
     hidden, partner = mirror_images(capture, unseen, is_source)
     found[hidden] = color[partner]
     inside = _unseen_inside(capture, pixels > 0, is_outside)
+    inside |= _unseen_teeth(capture, pixels, shown)
     within = inside | (~is_outside & ~shown)
     found[within] = inside_colors(capture, color, shown, within)
     return UnseenSides((is_outside & (cosine < UNSEEN_COSINE)) | inside, shown, found)
@@ -128,15 +130,19 @@ def _color_views(capture: Capture) -> list[View]:
 
 
 def _unseen_inside(capture: Capture, shown: np.ndarray, is_outside: np.ndarray) -> np.ndarray:
-    """(F,) bool: triangles of the inside that no view shows, nor any neighbor of theirs. Teeth of
-    which hardly any is shown count as unseen. None in a long recording whose meshes are files: not
-    all of its mouths were looked for."""
+    """(F,) bool: triangles of the inside that no view shows, nor any neighbor of theirs. None in a
+    long recording whose meshes are files: not all of its mouths were looked for."""
     if capture.flame is None and len(capture.timesteps) > SPREAD_VIEWS:
         return np.zeros(len(shown), bool)
     touched = np.zeros(len(capture.neutral), bool)
     touched[capture.faces[shown]] = True
-    inside = ~is_outside & ~touched[capture.faces].any(1)
+    return np.asarray(~is_outside & ~touched[capture.faces].any(1))
+
+
+def _unseen_teeth(capture: Capture, pixels: np.ndarray, shown: np.ndarray) -> np.ndarray:
+    """(F,) bool: teeth that the pixels (F,) do not show well, or all where lips hide them."""
     teeth = teeth_of(capture)
-    if (teeth & shown).sum() < MIN_TEETH_SHARE * teeth.sum():
-        inside |= teeth
-    return np.asarray(inside)
+    in_mouth = pixels[capture.regions.get("mouth", teeth)].sum()
+    if pixels[teeth].sum() < MIN_TEETH_SHARE * in_mouth:
+        return teeth
+    return np.asarray(teeth & ~shown)
