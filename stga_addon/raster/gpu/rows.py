@@ -42,8 +42,7 @@ class _Move:
     numbers: Any = None
 
     def record(self, kernel: str, column: Column, at: int = 0, alike: bool = False) -> None:
-        """Record a kernel of rows.wgsl; at: the word from which on the column is packed; alike: one
-        value is, for all."""
+        """A kernel of rows.wgsl; at: the word where the column is packed, alike: one for all."""
         device = self.work.device
         part = device.uniform(
             "Part",

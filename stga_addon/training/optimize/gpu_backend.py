@@ -120,10 +120,9 @@ class GpuBackend:
         upload("limits", self._limits.astype(np.float32))
         self._place(tables, {name: columns[name] for name in KEPT}, state.parameters.sh.shape[1])
         self._offsets = {}
-        splats_of = self._splats_by_triangle()
         for name, offset in state.driven_offsets.items():
             parts = [upload(f"{name} {part}", each) for part, each in vars(offset).items()]
-            self._offsets[name] = OffsetTables._make([*parts, splats_of])
+            self._offsets[name] = OffsetTables._make([*parts, self._splats_by_triangle()])
 
     def _place(
         self, tables: dict[str, Any], kept: dict[str, np.ndarray], coefficients: int
@@ -190,9 +189,10 @@ class GpuBackend:
         tables["history"] = self._tables.history, len(HISTORY)
         kept = {name: column[numbers] for name, column in self._kept.items()}
         self._place(list_rows(self.device, numbers, tables), kept, self._splats.coefficients)
-        splats_of = self._splats_by_triangle()
-        for name, offset in self._offsets.items():
-            self._offsets[name] = offset._replace(splats_of=splats_of)
+        if self._offsets:
+            splats_of = self._splats_by_triangle()
+            for name, offset in self._offsets.items():
+                self._offsets[name] = offset._replace(splats_of=splats_of)
 
     def _column(self, name: str) -> Column:
         if name in HISTORY:

@@ -195,10 +195,10 @@ def hull_points(
     """
     mesh = capture.mesh(views[0].timestep)
     voxel = voxel_size(mesh)
-    points, color = _hull_surface(mesh, capture.faces, views, voxel)
+    points = _hull_surface(mesh, capture.faces, views, voxel)
     distance, face = _followed(capture, views[0].timestep, points, torso)
     outside = distance > MIN_MESH_DISTANCE_M
-    world = _new_splats(points[outside], voxel, sh_degree, color[outside])
+    world = _new_splats(points[outside], voxel, sh_degree)
     frames = face_frames(mesh, capture.faces, capture.neutral, convention)
     hull = to_local(world, frames, face[outside])
     seen = read_torso_points(capture.root) if torso and len(views) <= FEW_CAMERAS else None
@@ -255,10 +255,11 @@ def flat_points(
     points = camera.unproject(centers, depth[cKDTree(pixels).query(centers)[1]])
     _, face = _followed(capture, view.timestep, points, torso)
     frames = face_frames(mesh, capture.faces, capture.neutral, convention)
-    splats = _new_splats(points, voxel, sh_degree, read_image(view)[pixel][beside] / 255)
+    splats = _new_splats(points, voxel, sh_degree)
     if neck is None:
         return to_local(splats, frames, face)
     cut = ~pixels_of(points, camera)[2]
+    splats.sh[cut, 0] = (read_image(view)[pixel][beside][cut] / 255 - 0.5) / SH_C0
     splats.log_scale[cut] = np.log(voxel)
     splats.opacity[cut] = CONTINUED_OPACITY
     below = below_neck(neck, view.timestep, points)
@@ -302,9 +303,8 @@ def _mesh_samples(mesh: np.ndarray, faces: np.ndarray) -> np.ndarray:
 
 def _hull_surface(
     mesh: np.ndarray, faces: np.ndarray, views: Sequence[View], voxel: float
-) -> tuple[np.ndarray, np.ndarray]:
-    """Grid points (N, 3) on the surface of the visual hull that are visible beside the mesh, and
-    the mean color (N, 3) in 0…1 of the images there."""
+) -> np.ndarray:
+    """Grid points (N, 3) on the surface of the visual hull that are visible beside the mesh."""
     low = mesh.min(0)
     high = mesh.max(0)
     margin = GRID_MARGIN_SHARE * np.linalg.norm(high - low)
@@ -343,7 +343,6 @@ def _hull_surface(
     points = np.stack([axis[row] for axis, row in zip(axes, rows, strict=True)], axis=1)
     inside = np.ones(len(points), bool)
     visible, exposed = np.zeros((2, len(points)), np.int32)
-    color = np.zeros((len(points), 3))
     for view, mask in zip(views, foreground, strict=True):
         beside = ~_silhouette(mesh, faces, view.camera)
         remaining = np.flatnonzero(inside)
@@ -353,13 +352,11 @@ def _hull_surface(
         y = y[seen]
         visible[remaining] += 1
         exposed[remaining] += beside[y, x]
-        color[remaining] += beside[y, x, None] * (read_image(view)[y, x] / 255)
         inside[remaining] = mask[y, x]
     solid = within.copy()
     solid[within] = inside & (visible >= min_visible)
     surface = (solid & ~binary_erosion(solid))[within]
-    found = surface & (exposed >= np.maximum(1, MIN_EXPOSED_SHARE * len(views)))
-    return points[found], color[found] / exposed[found, None]
+    return np.asarray(points[surface & (exposed >= np.maximum(1, MIN_EXPOSED_SHARE * len(views)))])
 
 
 def _silhouette(mesh: np.ndarray, faces: np.ndarray, camera: Camera) -> np.ndarray:
@@ -384,13 +381,9 @@ def pixels_of(points: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarra
     return np.where(seen, x, 0).astype(int), np.where(seen, y, 0).astype(int), seen
 
 
-def _new_splats(
-    points: np.ndarray, voxel: float, sh_degree: int, color: np.ndarray | float = MIDDLE_GRAY
-) -> Splats:
-    """Unbound spheres of one voxel's size at world points (N, 3); color (N, 3) in 0…1."""
+def _new_splats(points: np.ndarray, voxel: float, sh_degree: int) -> Splats:
+    """Gray unbound spheres of one voxel's size at world points (N, 3)."""
     n = len(points)
-    sh = np.zeros((n, (sh_degree + 1) ** 2, 3), np.float32)
-    sh[:, 0] = (np.asarray(color) - 0.5) / SH_C0
     rotation = np.tile(np.array([1, 0, 0, 0], np.float32), (n, 1))
     log_scale = np.log(voxel / 2)
     return Splats(
@@ -398,7 +391,7 @@ def _new_splats(
         rotation,
         np.full((n, 3), log_scale, np.float32),
         np.zeros(n, np.float32),
-        sh,
+        np.zeros((n, (sh_degree + 1) ** 2, 3), np.float32),
         np.zeros(n, np.int32),
         np.ones(n, bool),
     )
