@@ -24,10 +24,8 @@ those that others are compared with; above the second, what views show keeps its
 the less the more it turns away."""
 DOUBT = 0.3
 MIN_PULL = 0.02
-MAX_USUAL_SPLATS = 5_000
 """Gradient, as a share of the median of well seen splats, at which a splat is pulled halfway to
-what is plausible at a turn; the least share of the way that is worth it; well seen splats that are
-looked at."""
+what is plausible at a turn; the least share of the way that is worth it."""
 HIDDEN_ORDER = 1
 HIDDEN_OPACITY = 3.0
 HIDDEN_FLATNESS = 0.25
@@ -100,7 +98,6 @@ class SurfacePrior:
             return
         well_seen = is_bound & (self._surface.facing > WELL_SEEN_COSINE)[where["face"]]
         usual = np.flatnonzero(well_seen if well_seen.any() else is_bound)
-        usual = usual[:: 1 + len(usual) // MAX_USUAL_SPLATS]
         moments = backend.columns(("second/color", "second/opacity"), usual)
         columns = backend.columns(PULLED_COLUMNS, bound)
         self._pull_colors(backend, bound, columns, moments["second/color"])
