@@ -15,6 +15,7 @@ from numba import types
 from numba.extending import intrinsic
 
 from stga_addon.raster.cpu import jit
+from stga_addon.raster.cpu import threads as kernel_threads
 from stga_addon.raster.cpu.elementary import fetch_add, latest, yield_processor
 from stga_addon.raster.cpu.threads import (
     call_helpers,
@@ -254,6 +255,30 @@ def test_an_interrupt_leaves_the_threads_usable():
     met = np.zeros(4, np.int64)
     meet(met, 100_000_000)
     assert (met == 3).all()
+
+
+def test_an_interrupt_as_helpers_are_taken_gives_them_back(monkeypatch):
+    """Catches a Ctrl-C after which all kernels run on one thread, for ever."""
+    set_threads(3)
+    team = kernel_threads._team
+    lock = team._busy
+
+    class Interrupted:
+        release = lock.release
+
+        def acquire(self, blocking):
+            assert lock.acquire(blocking)
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(team, "_busy", Interrupted())
+    with pytest.raises(KeyboardInterrupt):
+        meet(np.zeros(4, np.int64), 1)
+    monkeypatch.setattr(team, "_busy", lock)
+    taken = []
+    other = threading.Thread(target=lambda: taken.append(lock.acquire(blocking=False)))
+    other.start()
+    other.join()
+    assert taken == [True]
 
 
 @jit

@@ -15,7 +15,7 @@ import os
 from collections.abc import Callable
 from functools import wraps
 from itertools import pairwise
-from threading import Lock, Thread
+from threading import RLock, Thread
 from typing import Any
 
 import numpy as np
@@ -105,39 +105,48 @@ class Team:
         self.helpers = helpers
         self._words = np.zeros(SLOTS + SLOT_WORDS * (helpers + 1), np.int64)
         self._errors: list[BaseException] = []
-        self._busy = Lock()
+        self._busy = RLock()  # which only its owner can release
         self._threads: list[Thread] = []
 
     def run(self, kernel: Any, units: int, piece: int, arguments: tuple[Any, ...]) -> None:
         """Call a kernel on this thread and helpers, until all its units are done; on this one alone
         while another thread has the helpers."""
         limit = min(self.helpers, -(-units // piece) - 1)
-        if limit == 0 or not self._busy.acquire(blocking=False):
-            work = np.zeros(SEEN, np.int64)
-            work[UNITS] = units
-            work[PIECE] = piece
-            kernel(work, *arguments)
-            return
         try:
-            if not self._threads:
-                self.start()
-            words = self._words
-            words[:SEEN] = 0
-            words[UNITS] = units
-            words[PIECE] = piece
-            words[LIMIT] = limit
-            try:
-                kernel(words, *arguments)
-            except BaseException as error:
-                self._errors.append(error)
-                words[FAILED] = 1
-                join(words)
-            if self._errors:
-                first = self._errors[0]  # which made others fail
-                self._errors.clear()
-                raise first
+            if limit > 0 and self._busy.acquire(blocking=False):
+                self._run_together(kernel, (units, piece, limit), arguments)
+                return
         finally:
-            self._busy.release()
+            # An interrupt may come after any call: before it is known here that they were taken,
+            # and after that of `suppress`.
+            try:  # noqa: SIM105
+                self._busy.release()
+            except RuntimeError:  # it is another's, or nobody's
+                pass
+        work = np.zeros(SEEN, np.int64)
+        work[UNITS] = units
+        work[PIECE] = piece
+        kernel(work, *arguments)
+
+    def _run_together(
+        self, kernel: Any, sizes: tuple[int, int, int], arguments: tuple[Any, ...]
+    ) -> None:
+        """`run` with helpers; sizes: units, those of a piece, and how many helpers are of use."""
+        if not self._threads:
+            self.start()
+        words = self._words
+        words[:SEEN] = 0
+        words[UNITS], words[PIECE], words[LIMIT] = sizes
+        try:
+            kernel(words, *arguments)
+        except BaseException as error:
+            self._errors.append(error)
+            words[FAILED] = 1
+            join(words)
+        if self._errors:
+            first = self._errors[0]  # which made others fail
+            self._errors.clear()
+            raise first
 
     def start(self) -> None:
         """Start the helpers; once dismissed, they end at once."""
