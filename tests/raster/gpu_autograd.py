@@ -10,7 +10,7 @@ from stga_addon.avatar.embedding import WORLD
 from stga_addon.raster.cpu.layout import Parameters
 from stga_addon.raster.cpu.rasterize import frames_in_camera
 from stga_addon.raster.gpu.device import Device
-from stga_addon.raster.gpu.layout import split_rows
+from stga_addon.raster.gpu.layout import LOG_SCALE, OPACITY_LOGIT, ROTATION, SH, XYZ
 from stga_addon.raster.gpu.rasterize import Rasterizer, ViewOptions, upload_frames, upload_splats
 
 
@@ -50,6 +50,17 @@ class _Blend(torch.autograd.Function):
         _, _, gradients = render(options, camera_frames, face, splats, cotangents)
         given = [torch.from_numpy(gradient) for gradient in gradients]
         return None, None, None, *given[: len(ctx.needs_input_grad) - 3]
+
+
+def split_rows(rows, coefficients):
+    """The opposite of `layout.splat_rows`: copies of its columns; coefficients: K."""
+    return Parameters(
+        xyz=rows[:, XYZ:ROTATION].copy(),
+        rotation=rows[:, ROTATION:LOG_SCALE].copy(),
+        log_scale=rows[:, LOG_SCALE:OPACITY_LOGIT].copy(),
+        opacity=rows[:, OPACITY_LOGIT].copy(),
+        sh=rows[:, SH:].reshape(len(rows), coefficients, 3).copy(),
+    )
 
 
 def render(options, camera_frames, face, splats, cotangents=None, rasterizer=None):

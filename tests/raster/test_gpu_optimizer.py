@@ -7,8 +7,8 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from raster import gpu_device
+from raster.gpu_autograd import split_rows
 from stga_addon.raster.cpu.layout import Parameters
-from stga_addon.raster.gpu.layout import split_rows
 from stga_addon.raster.gpu.optimizer import OptimizerTables, optimize, upload_step
 from stga_addon.training.optimize.adam import PLAIN
 

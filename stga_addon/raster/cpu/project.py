@@ -10,6 +10,7 @@ import math
 
 import numpy as np
 
+from ...avatar.offsets import TARGETS
 from . import inline_jit, part_jit
 from . import splat_block as block
 from .elementary import prefetch
@@ -61,10 +62,13 @@ def compose_frames(work, origin, rotation, scale, turn, shift, camera_origin, ca
                     camera_matrix[f, r, c] = scale[f] * along
 
 
+POSITION, SCALE, COLOR = range(len(TARGETS))
+
+
 @parallel(lambda coefficients, *_: len(coefficients), piece=1024)
 def move_frames(work, coefficients, signal, target, rotation, unit, moved):
     """Change face frames by a driven offset (`avatar.offsets`): coefficients (F, 3, 3) and signal
-    (F, 3) float32, target: its place among `offsets.TARGETS`.
+    (F, 3) float32; target: POSITION, SCALE or COLOR.
 
     rotation (F, 3, 3) and unit (F,) float64 are those of the frames before any change; moved: their
     origin (F, 3) and scale (F,) float64, and color (F, 3) float32, of which one is changed.
@@ -80,7 +84,7 @@ def move_frames(work, coefficients, signal, target, rotation, unit, moved):
             change0 = s0 * m[0, 0] + s1 * m[1, 0] + s2 * m[2, 0]
             change1 = s0 * m[0, 1] + s1 * m[1, 1] + s2 * m[2, 1]
             change2 = s0 * m[0, 2] + s1 * m[1, 2] + s2 * m[2, 2]
-            if target == 0:
+            if target == POSITION:
                 for c in range(3):
                     turned = (
                         rotation[f, c, 0] * change0
@@ -88,9 +92,9 @@ def move_frames(work, coefficients, signal, target, rotation, unit, moved):
                         + rotation[f, c, 2] * change2
                     )
                     origin[f, c] += unit[f] * turned
-            elif target == 1:
+            elif target == SCALE:
                 scale[f] *= math.exp(np.float64(change0))
-            else:
+            elif target == COLOR:
                 color[f, 0] += change0
                 color[f, 1] += change1
                 color[f, 2] += change2

@@ -1,6 +1,6 @@
 """WebGPU device: buffers that grow, kernels from WGSL files, recorded work, late readback.
 
-Work is recorded into one command encoder and submitted at once; nothing waits for the device except
+Work is recorded as commands, which are submitted at once; nothing waits for the device except
 `read` and `Readback.result`. A failure of driver or memory becomes a DeviceError.
 """
 
@@ -70,7 +70,7 @@ class Device:
         self.dispatches = self.submits = self.waits = 0
         self._buffers: dict[str, Any] = {}
         self._groups: dict[tuple[int, ...], tuple[Any, list[Any]]] = {}
-        self._kept: dict[Hashable, list[_Command]] = {}
+        self._recorded: dict[Hashable, list[_Command]] = {}
 
     @property
     def bytes(self) -> int:
@@ -92,7 +92,7 @@ class Device:
             size = needed if buffer is None else min(needed + needed // 32 * 4, most)
             # which would keep the old buffer's memory
             self._groups.clear()
-            self._kept.clear()
+            self._recorded.clear()
             buffer = self._buffers[name] = self.new_buffer(name, size, _USAGE[usage])
         return buffer
 
@@ -193,7 +193,7 @@ class Device:
     def repeat(self, key: Hashable) -> bool:
         """Submit what was recorded with that key again, to the same buffers; False where none is
         kept, or buffers have changed since."""
-        commands = self._kept.get(key)
+        commands = self._recorded.get(key)
         if commands is not None:
             self._submit(commands)
         return commands is not None
@@ -335,7 +335,7 @@ class Recording:
         if error is None:
             self.device._submit(self.commands)
             if self._key is not None:
-                self.device._kept[self._key] = self.commands
+                self.device._recorded[self._key] = self.commands
 
 
 class Readback:

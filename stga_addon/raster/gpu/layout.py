@@ -144,18 +144,6 @@ def list_words(lists: strain.IndexLists) -> np.ndarray:
     return np.asarray(np.concatenate([lists.indptr + len(lists.indptr), lists.indices]), np.uint32)
 
 
-def split_rows(rows: np.ndarray, coefficients: int) -> Parameters:
-    """The opposite of `splat_rows`: copies of its columns; coefficients: K."""
-    n = len(rows)
-    return Parameters(
-        xyz=rows[:, XYZ:ROTATION].copy(),
-        rotation=rows[:, ROTATION:LOG_SCALE].copy(),
-        log_scale=rows[:, LOG_SCALE:OPACITY_LOGIT].copy(),
-        opacity=rows[:, OPACITY_LOGIT].copy(),
-        sh=rows[:, SH:].reshape(n, coefficients, 3).copy(),
-    )
-
-
 def prelude_wgsl() -> str:
     """The structs and every constant that Python and WGSL share."""
     kinds = {"f": "f32", "u": "u32"}

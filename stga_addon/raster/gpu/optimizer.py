@@ -17,7 +17,7 @@ from .layout import SH, WORKGROUP, XYZ
 from .rasterize import DEPTH_BITS, MAX_TILE_BITS, sort_passes
 
 KERNEL_FILES = ("frames", "project", "tiles", "blend", "image_loss", "optimizer", "rows")
-"""Of the kernels of an iteration and what is changed between two, beside those of `sort`."""
+"""Of the kernels of an iteration, and of those between two, beside those of `sort`."""
 STEP_OFFSET = "optimizer.step_offset"
 """What any iteration may dispatch beside sorting and steps of driven offsets."""
 RATES = (*Parameters._fields, "sh_rest", "strain_color")

@@ -19,7 +19,7 @@ from .device import Device, Groups, Recording
 from .layout import COUNTS, DIGIT_BITS, SEGMENT_PAIRS, SORT_BLOCK, WORKGROUP
 
 INITIAL_PAIR_CAPACITY = 1 << 18
-"""Pairs that a rasterizer has room for at first: 14 MB."""
+"""Pairs that a rasterizer has room for at first: 18 MB."""
 DEPTH_BITS = 32
 MAX_TILE_BITS = 22
 Tables = dict[str, Any]

@@ -1,5 +1,5 @@
-"""Rows of tables between steps: some columns are read, rows are listed anew, columns of some rows
-are written."""
+"""Rows of tables between steps: columns are read, rows taken in another order, columns of some rows
+written."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -42,7 +42,8 @@ class _Move:
     numbers: Any = None
 
     def record(self, kernel: str, column: Column, at: int = 0, alike: bool = False) -> None:
-        """A kernel of rows.wgsl; at: the word where the column is packed, alike: one for all."""
+        """Record a kernel of rows.wgsl; at: the word from which on the column is packed; alike: one
+        value is, for all rows."""
         device = self.work.device
         part = device.uniform(
             "Part",
@@ -98,20 +99,20 @@ def write_columns(
             at += len(words)
 
 
-def list_rows(
+def take_rows(
     device: Device, rows: np.ndarray, tables: Mapping[str, tuple[Any, int]]
 ) -> dict[str, Any]:
-    """Tables of these rows (M,), in this order, in place of their own; tables: the device's buffers
-    by name, and words per row."""
+    """Put these rows (M,), in this order, in place of all rows; tables: the device's buffers by
+    name, and words per row. Returns the buffers that hold them now."""
     count = len(rows)
     numbers = device.upload(NUMBERS, rows.astype(np.uint32))
     packed = device.buffer(PACKED, count * max(stride for _, stride in tables.values()))
-    listed = {}
+    taken = {}
     with device.record() as work:
         for name, (table, stride) in tables.items():
             whole = Column(table, stride, 0, (stride,))
             _Move(work, packed, count, numbers).record("gather", whole)
-            listed[name] = device.buffer(name, count * stride)
+            taken[name] = device.buffer(name, count * stride)
             if count:
-                work.copy(packed, listed[name], count * stride)
-    return listed
+                work.copy(packed, taken[name], count * stride)
+    return taken

@@ -12,13 +12,13 @@ from .change import Turn
 from .state import PRUNED_BY, opacity_of, parameters_and_average, prunable
 
 HALVED = ("xyz", "rotation", "log_scale", "opacity")
-"""Parameters of splats that their halves are made from."""
-READ_COLUMNS = {
+"""Parameters of splats that halves have others of, or that these depend on."""
+READ_COLUMNS = (
     "screen_gradient",
     "gradient_count",
     *PRUNED_BY,
     *(f"parameters/{name}" for name in HALVED),
-}
+)
 WITHOUT_MOMENTUM = {f"first/{name}": 0.0 for name in Parameters._fields}
 
 

@@ -25,7 +25,7 @@ from ...raster.gpu.layout import (
     splat_rows,
 )
 from ...raster.gpu.optimizer import OffsetTables, OptimizerTables, image_loss, upload_target
-from ...raster.gpu.rows import Column, list_rows, read_columns, write_columns
+from ...raster.gpu.rows import Column, read_columns, take_rows, write_columns
 from ..settings import TrainingSettings
 from .adam import adam_options
 from .backend import Batch, RenderOptions
@@ -45,7 +45,7 @@ TABLES = {
 """Arrays of a `TrainState` that are shaped as splats -> their table on the device."""
 HISTORY = {"steps": np.int32, "screen_gradient": np.float32, "gradient_count": np.float32}
 """Columns of the table `history`."""
-KEPT = ("face", "unbound", "unseen_share")
+FIXED = ("face", "unbound", "unseen_share")
 """Columns that no iteration changes, which the host has as well."""
 
 
@@ -98,7 +98,7 @@ class GpuBackend:
         arrays = self.columns(HISTORY)
         for part in TABLES:  # one by one, as there is room for
             arrays |= self.columns([f"{part}/{name}" for name in Parameters._fields])
-        state = state_of(arrays | {name: array.copy() for name, array in self._kept.items()})
+        state = state_of(arrays | {name: array.copy() for name, array in self._fixed.items()})
         for name, each in self._offsets.items():
             shape = self._triangles, 3, 3
             parts = (each.coefficients, each.first, each.second, each.average)
@@ -118,21 +118,22 @@ class GpuBackend:
         history = [columns[name].view(np.uint32) for name in HISTORY]
         tables["history"] = upload("history", np.stack(history, axis=1))
         upload("limits", self._limits.astype(np.float32))
-        self._place(tables, {name: columns[name] for name in KEPT}, state.parameters.sh.shape[1])
+        self._place(tables, {name: columns[name] for name in FIXED}, state.parameters.sh.shape[1])
         self._offsets = {}
+        splats_of = self._splats_by_triangle() if state.driven_offsets else None
         for name, offset in state.driven_offsets.items():
             parts = [upload(f"{name} {part}", each) for part, each in vars(offset).items()]
-            self._offsets[name] = OffsetTables._make([*parts, self._splats_by_triangle()])
+            self._offsets[name] = OffsetTables._make([*parts, splats_of])
 
     def _place(
-        self, tables: dict[str, Any], kept: dict[str, np.ndarray], coefficients: int
+        self, tables: dict[str, Any], fixed: dict[str, np.ndarray], coefficients: int
     ) -> None:
-        """Take tables on the device, and columns KEPT, as those of the splats from now on."""
+        """Take tables on the device, and columns FIXED, as those of the splats from now on."""
         device = self.device
-        self._kept = kept
-        faces = device.upload("face", kept["face"].astype(np.uint32))
-        traits = np.stack([kept["unbound"], kept["unseen_share"]], axis=1, dtype=np.float32)
-        count = len(kept["face"])
+        self._fixed = fixed
+        faces = device.upload("face", fixed["face"].astype(np.uint32))
+        traits = np.stack([fixed["unbound"], fixed["unseen_share"]], axis=1, dtype=np.float32)
+        count = len(fixed["face"])
         self._splats = rasterize.SplatTable(tables["splats"], faces, count, coefficients)
         self._gradients = tables["gradients"]
         self._tables = OptimizerTables(
@@ -142,7 +143,7 @@ class GpuBackend:
         )
 
     def _splats_by_triangle(self) -> Any:
-        by_triangle = optimizer.splats_by_triangle(self._kept["face"], self._triangles)
+        by_triangle = optimizer.splats_by_triangle(self._fixed["face"], self._triangles)
         return self.device.upload("splats by triangle", by_triangle)
 
     def blend_weights(self, view: View) -> np.ndarray:
@@ -166,8 +167,8 @@ class GpuBackend:
         self, names: Collection[str], rows: np.ndarray | None = None
     ) -> dict[str, np.ndarray]:
         self._finish_all()
-        here = {name: self._kept[name] for name in names if name in KEPT}
-        there = {name: self._column(name) for name in names if name not in KEPT}
+        here = {name: self._fixed[name] for name in names if name in FIXED}
+        there = {name: self._column(name) for name in names if name not in FIXED}
         if rows is not None:
             here = {name: column[rows] for name, column in here.items()}
         wanted = len(self) if rows is None else rows
@@ -187,8 +188,8 @@ class GpuBackend:
             name: (self.device.buffer(name, 0), self._splats.stride) for name in TABLES.values()
         }
         tables["history"] = self._tables.history, len(HISTORY)
-        kept = {name: column[numbers] for name, column in self._kept.items()}
-        self._place(list_rows(self.device, numbers, tables), kept, self._splats.coefficients)
+        fixed = {name: column[numbers] for name, column in self._fixed.items()}
+        self._place(take_rows(self.device, numbers, tables), fixed, self._splats.coefficients)
         if self._offsets:
             splats_of = self._splats_by_triangle()
             for name, offset in self._offsets.items():

@@ -137,13 +137,6 @@ def keep_rows(state: TrainState, keep: np.ndarray) -> TrainState:
     return replace(kept, driven_offsets=state.driven_offsets)
 
 
-def join(state: TrainState, other: TrainState) -> TrainState:
-    """All rows of both states, in order."""
-    more = arrays_of(other)
-    rows = {name: np.concatenate([own, more[name]]) for name, own in arrays_of(state).items()}
-    return replace(state_of(rows), driven_offsets=state.driven_offsets)
-
-
 def opacity_of(logit: np.ndarray) -> np.ndarray:
     """(N,) float64 opacity 0…1 of logits (N,)."""
     return np.asarray(1 / (1 + np.exp(-logit.astype(np.float64))))

@@ -43,7 +43,6 @@ a change. Views of a narrow cone do not tell it."""
 MIN_VARIANCE = 1e-14
 PULLED_COLUMNS = (
     "face",
-    "unbound",
     "parameters/color",
     "parameters/opacity",
     "parameters/xyz",
@@ -52,8 +51,8 @@ PULLED_COLUMNS = (
     "second/color",
     "second/opacity",
 )
-
 PINNED_KINDS = ("parameters", "average", "first", "second")
+"""What is read of the splats that may be pulled; arrays of those whose color is pinned."""
 
 
 class SurfacePrior:
