@@ -154,7 +154,8 @@ def test_hair_goes_round_the_head(angles, height, fringe, hair, from_one_side, t
     """Also gray hair, hardly brighter than skin in the shade, and that of a head that does not
     turn, of which a fringe is shown, from below. Catches a back of the head in the color of skin, a
     neck with hair or in the color of clothes, clothes that end where the camera does, a closed
-    mouth that is skin inside, teeth that are too white, and lips with a dark rim."""
+    mouth that is skin inside, teeth that are too white, lips with a dark rim, and an eye that is
+    skin where it looks aside."""
     model = flame_model(None)
     neutral = model.v_template
     centers = neutral[model.faces].mean(1)
@@ -172,8 +173,9 @@ def test_hair_goes_round_the_head(angles, height, fringe, hair, from_one_side, t
     color = np.where(centers[:, 2:] < 0.02, shaded, SKIN)
     color[level > hairline] = hair
     color[level < -2.2] = CLOTH
-    for eye in ("left_eyeball", "right_eyeball"):
-        color[faces_within(model.faces, model.masks[eye])] = EYES
+    masks = (model.masks[eye] for eye in ("left_eyeball", "right_eyeball"))
+    eyeballs = np.any([faces_within(model.faces, mask) for mask in masks], axis=0)
+    color[eyeballs] = EYES
     views = []
     for number, angle in enumerate(np.radians(angles)):
         eye = [np.sin(angle), height, np.cos(angle)]
@@ -195,6 +197,9 @@ def test_hair_goes_round_the_head(angles, height, fringe, hair, from_one_side, t
         assert (off < 25).mean() > 0.9, part
     if len(angles) == 1:
         return
+    behind_lids = eyeballs & sides.triangles & ~Surface(bare).outside
+    assert behind_lids.sum() > 20
+    assert_allclose(sides.color[behind_lids], np.tile(EYES / 255, (behind_lids.sum(), 1)), atol=0.02)
     teeth = faces_within(model.faces, model.masks["teeth"])
     assert sides.triangles[teeth].all()
     part = connected_parts(len(neutral), model.faces)[model.faces[:, 0]]

@@ -1,5 +1,6 @@
 """Which seen triangles of a head unseen ones look like: hair has hair, a neck a neck."""
 
+from collections.abc import Collection
 from dataclasses import dataclass
 
 import numpy as np
@@ -47,6 +48,7 @@ its shades, as a share of the scalp's most different ones; the least standard de
 in colors of 0…1; triangles around one over which what is found is smoothed."""
 
 EYEBALLS = ("left_eyeball", "right_eyeball")
+TEETH = ("teeth",)
 LINING_REACH = 1.1
 TONGUE_REACH = 0.5
 """How far a mouth's lining is from its middle, in that unit; what else reaches so near to it is
@@ -167,8 +169,9 @@ def inside_colors(
     capture: Capture, color: np.ndarray, shown: np.ndarray, inside: np.ndarray
 ) -> np.ndarray:
     """Colors (M, 3) of triangles `inside` (F,) bool, which show where mouth or lids move as in no
-    view: teeth, gums and lining near the mouth, in the light on the person's lips and eyes;
-    elsewhere as the skin around. color, shown: of `mean_colors`."""
+    view: teeth, gums and lining near the mouth, in the light on the person's lips and eyes; what
+    lids hide of eyeballs, as white as the rest; elsewhere as the skin around. color, shown: of
+    `mean_colors`."""
     faces = capture.faces
     centers = np.asarray(capture.neutral)[faces].mean(1)
     skin = skin_of(capture)
@@ -177,6 +180,9 @@ def inside_colors(
         return np.asarray(color[inside])
     near = nearest_rows(centers[known], centers[inside], SMOOTHED)
     found = np.median(color[known[near]], axis=1)
+    eyes = eyeballs_of(capture)
+    white = _white_of_eyes(color[eyes & shown])
+    found[eyes[inside]] = white
     at = head_coordinates(capture)
     if at is None:
         return np.asarray(found)
@@ -189,7 +195,6 @@ def inside_colors(
     in_mouth = np.isin(part, part[~skin & (away < TONGUE_REACH)])
     within = inside & (in_mouth | (skin & (away < LINING_REACH)))
     depth = cKDTree(centers[lips]).query(centers[within])[0] / at.unit
-    white = _white_of_eyes(capture, color, shown)
     colors = np.vstack([LIP_SHARE * np.median(color[lips], axis=0), GUM_SHARES * white])
     inner = np.stack([np.interp(depth, DEPTHS, channel) for channel in colors.T], axis=1)
     teeth = teeth_of(capture)[within]
@@ -198,15 +203,11 @@ def inside_colors(
     return np.asarray(found)
 
 
-def _white_of_eyes(capture: Capture, color: np.ndarray, shown: np.ndarray) -> np.ndarray:
-    masks = {} if capture.flame is None else capture.flame.model.masks
-    eyes = np.zeros(len(shown), bool)
-    for name in set(EYEBALLS) & set(masks):
-        eyes |= faces_within(capture.faces, masks[name])
-    bright = color[eyes & shown]
-    if not len(bright):
+def _white_of_eyes(shown: np.ndarray) -> np.ndarray:
+    """Of the colors (M, 3) of eyeballs' triangles that views show."""
+    if not len(shown):
         return WHITE
-    bright = bright[np.argsort(bright.sum(1))]
+    bright = shown[np.argsort(shown.sum(1))]
     return np.asarray(bright[int(WHITE_QUANTILE * len(bright)) :].mean(0))
 
 
@@ -218,7 +219,17 @@ def skin_of(capture: Capture) -> np.ndarray:
 
 def teeth_of(capture: Capture) -> np.ndarray:
     """(F,) bool: teeth, where the head model says which they are."""
+    return _in_masks(capture, TEETH)
+
+
+def eyeballs_of(capture: Capture) -> np.ndarray:
+    """(F,) bool: eyeballs, where the head model says which they are."""
+    return _in_masks(capture, EYEBALLS)
+
+
+def _in_masks(capture: Capture, names: Collection[str]) -> np.ndarray:
     masks = {} if capture.flame is None else capture.flame.model.masks
-    if "teeth" not in masks:
-        return np.zeros(len(capture.faces), bool)
-    return faces_within(capture.faces, masks["teeth"])
+    found = np.zeros(len(capture.faces), bool)
+    for name in masks.keys() & set(names):
+        found |= faces_within(capture.faces, masks[name])
+    return found
