@@ -193,7 +193,7 @@ def inside_colors(
     away = np.linalg.norm(centers - centers[mouth].mean(0), axis=1) / at.unit
     part = connected_parts(len(capture.neutral), faces)[faces[:, 0]]
     in_mouth = np.isin(part, part[~skin & (away < TONGUE_REACH)])
-    within = inside & (in_mouth | (skin & (away < LINING_REACH)))
+    within = inside & (in_mouth | lining_of(capture))
     depth = cKDTree(centers[lips]).query(centers[within])[0] / at.unit
     colors = np.vstack([LIP_SHARE * np.median(color[lips], axis=0), GUM_SHARES * white])
     inner = np.stack([np.interp(depth, DEPTHS, channel) for channel in colors.T], axis=1)
@@ -215,6 +215,17 @@ def skin_of(capture: Capture) -> np.ndarray:
     """(F,) bool: the largest connected part of the mesh."""
     part = connected_parts(len(capture.neutral), capture.faces)[capture.faces[:, 0]]
     return np.asarray(part == np.bincount(part).argmax())
+
+
+def lining_of(capture: Capture) -> np.ndarray:
+    """(F,) bool: skin so near to the middle of the mouth that it may line it; none where it is not
+    known where that is."""
+    at = head_coordinates(capture)
+    if at is None:
+        return np.zeros(len(capture.faces), bool)
+    centers = np.asarray(capture.neutral)[capture.faces].mean(1)
+    away = np.linalg.norm(centers - centers[capture.regions["mouth"]].mean(0), axis=1)
+    return np.asarray(skin_of(capture) & (away < LINING_REACH * at.unit))
 
 
 def teeth_of(capture: Capture) -> np.ndarray:

@@ -7,7 +7,7 @@ import numpy as np
 from scipy.ndimage import binary_dilation
 from scipy.spatial import cKDTree
 
-from ...capture.camera import look_at
+from ...capture.camera import Camera, look_at
 from ...capture.images import read_view
 from ...capture.mesh_geometry import connected_parts, rasterize, silhouette, triangle_normals
 from ...capture.model import Capture, View, evenly_spread, views_by_timestep
@@ -21,7 +21,7 @@ FACING_MESHES = 48
 second counts in a recording of minutes; fewer where each one's mesh is a file, which takes long."""
 UNSEEN_COSINE = -0.1
 HIDDEN_COSINE = 0.0
-GRAZING_COSINE = 0.35
+GRAZING_COSINE = 0.2
 """Of the angle between a triangle and the camera that it faces most: below the first, not even hair
 stands in an outline; below the second, the triangle is hidden; below the third, it fills little of
 any image. In many cameras' outlines, the last two are seen well enough."""
@@ -46,6 +46,10 @@ LID_STRETCH = 1.8
 MIN_SQUARED_AREA = 1e-28
 """Expressions that pull lids out of their folds, and how much longer they make them; squared
 meters, of triangles without area."""
+MARGIN_SHARE = 0.01
+MAX_BESIDE_SHARE = 0.1
+"""Error of masks, as a share of the image's height; share of the outlines that a triangle may lie
+outside of, where it is tracked well."""
 STANDING_VOXELS = 1.5
 STANDING_REACH_VOXELS = 4
 """A surface is not known to be flat that is so near to where hair, or a collar, is so high."""
@@ -118,6 +122,35 @@ class Surface:
         """(F,) bool: triangles of the outside that face away from all cameras."""
         limit = HIDDEN_COSINE if self.has_few_cameras else UNSEEN_COSINE
         return np.asarray(self.outside & (self.facing < limit))
+
+    @cached_property
+    def closed(self) -> np.ndarray:
+        """(F,) bool: hidden triangles, but for those that stick out: opaque there, nothing would be
+        seen through the head."""
+        return np.asarray(self.hidden & ~self.sticks_out)
+
+    @cached_property
+    def sticks_out(self) -> np.ndarray:
+        """(F,) bool: triangles that lie outside of some masks, or touch one that does, as an ear of
+        a head whose turn is tracked too far: they have to be as transparent as images say."""
+        seen, beside = np.zeros((2, len(self.outside)), int)
+        for view in self._outline_views:
+            scale = min(1.0, SAMPLED_HEIGHT_PIXELS / view.camera.height)
+            small, _, mask = read_view(view, scale)
+            if mask is None:
+                continue
+            center, _ = _centers_and_normals(self.capture, view.timestep)
+            at, within = _pixels(small.camera, center)
+            margin = max(1, round(MARGIN_SHARE * small.camera.height))
+            seen += within
+            beside += within & ~binary_dilation(mask > 127, iterations=margin)[at]
+        touched = np.zeros(len(self.capture.neutral), bool)
+        touched[self.capture.faces[beside > MAX_BESIDE_SHARE * np.maximum(seen, 1)]] = True
+        return np.asarray(touched[self.capture.faces].any(1))
+
+    @property
+    def _outline_views(self) -> list[View]:
+        return evenly_spread(self.capture.views["train"], OUTLINE_VIEWS)
 
     @cached_property
     def lids(self) -> np.ndarray:
@@ -206,7 +239,7 @@ class Surface:
     def _outlines(self) -> tuple[np.ndarray, np.ndarray]:
         """Sum (F,) of the heights, and in how many masks' outlines each triangle lies."""
         total, count = np.zeros((2, len(self.outside)))
-        for view in evenly_spread(self.capture.views["train"], OUTLINE_VIEWS):
+        for view in self._outline_views:
             rows, height = self._heights_in(view)
             total[rows] += height
             count[rows] += 1
@@ -226,10 +259,7 @@ class Surface:
         heights = np.arange(MAX_HEIGHT_VOXELS * STEPS_PER_VOXEL + 1) * voxel / STEPS_PER_VOXEL
         points = center[rows, None] + heights[:, None] * normal[rows, None]
         camera = small.camera
-        pixels, _ = camera.project(points.reshape(-1, 3))
-        x, y = np.floor(pixels).T.astype(int)
-        within = (x >= 0) & (x < camera.width) & (y >= 0) & (y < camera.height)
-        at = np.where(within, y, 0), np.where(within, x, 0)
+        at, within = _pixels(camera, points.reshape(-1, 3))
         shape = len(rows), len(heights)
         covered = silhouette(capture.mesh(view.timestep), capture.faces[cosine > 0], camera)
         beside = (within & ~binary_dilation(covered)[at]).reshape(shape)
@@ -243,6 +273,18 @@ class Surface:
 def _centers_and_normals(capture: Capture, timestep: int) -> tuple[np.ndarray, np.ndarray]:
     corners = np.asarray(capture.mesh(timestep), np.float64)[capture.faces]
     return corners.mean(1), unit(triangle_normals(corners), 1e-20)
+
+
+Places = tuple[np.ndarray, np.ndarray]
+
+
+def _pixels(camera: Camera, points: np.ndarray) -> tuple[Places, np.ndarray]:
+    """Row and column of each point's (N, 3) pixel, and whether it lies in the image; the first
+    pixel where it does not."""
+    places, _ = camera.project(points)
+    x, y = np.floor(places).T.astype(int)
+    within = (x >= 0) & (x < camera.width) & (y >= 0) & (y < camera.height)
+    return (np.where(within, y, 0), np.where(within, x, 0)), within
 
 
 def _cosine(center: np.ndarray, normal: np.ndarray, view: View) -> np.ndarray:

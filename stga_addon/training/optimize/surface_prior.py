@@ -134,7 +134,8 @@ class SurfacePrior:
     ) -> None:
         face = columns["face"]
         share = doubt(columns["second/opacity"][:, None], usual[:, None])
-        share = (share * self._surface.turned_away[face]) ** 2  # little of what outlines show
+        turned_away = np.where(self._surface.sticks_out, 0, self._surface.turned_away)
+        share = (share * turned_away[face]) ** 2  # little of what outlines show
         rows = np.flatnonzero(share > MIN_PULL)
         share = share[rows]
         opacity = columns["parameters/opacity"][rows]
@@ -168,7 +169,8 @@ class SurfacePrior:
         """Splats of the mouth's unseen inside, and those under lids, stay as `layer_on` has them:
         views of closed mouths and open eyes would make them any size."""
         face = columns["face"]
-        is_inside = (self.sides.triangles & ~self._surface.outside)[face]
+        surface = self._surface
+        is_inside = (self.sides.triangles & ~surface.outside & ~surface.sticks_out)[face]
         rows = np.flatnonzero(is_inside | self._is_under_lid(columns))
         backend.assign(bound[rows], parameters_and_average(layer_on(self._frames, face[rows])))
 
@@ -216,7 +218,7 @@ def flattened(
 
 
 def hidden_splats(frames: FrameStore, settings: TrainingSettings) -> Splats:
-    """A dense opaque layer on the hidden triangles, in which no view splits splats: on skin and
+    """A dense opaque layer on the `closed` triangles, in which no view splits splats: on skin and
     clothes, or where the outer layer of hair is. Under lids as well, whose own splats, trained on
     open eyes, would leave gaps when they close."""
     capture = frames.capture
@@ -230,10 +232,10 @@ def hidden_splats(frames: FrameStore, settings: TrainingSettings) -> Splats:
         HIDDEN_OPACITY,
         convention=frames.convention,
     )
-    lids = np.flatnonzero(surface.lids & ~surface.hidden)
+    lids = np.flatnonzero(surface.lids & ~surface.closed)
     under = layer.rows(np.searchsorted(layer.face, lids))
     under = replace(under, **layer_on(frames, lids))
-    layer = layer.rows(surface.hidden[layer.face])
+    layer = layer.rows(surface.closed[layer.face])
     face = layer.face
     inset = np.where(surface.border, BORDER_INSET, 1.0)[face]
     xyz = layer.xyz * inset[:, None]

@@ -249,13 +249,13 @@ def _placed_splats(frames: FrameStore, settings: TrainingSettings) -> tuple[Trai
     capture = frames.capture
     triangles = len(capture.faces)
     splats = initial_splats(capture, settings)
-    hidden = ~splats.unbound & frames.surface.hidden[splats.face]
+    closed = ~splats.unbound & frames.surface.closed[splats.face]
     layer = hidden_splats(frames, settings)
     color = np.zeros((triangles, 3), np.float32)
     bound = ~splats.unbound
     color[splats.face[bound]] = splats.sh[bound, 0]
     layer.sh[:, 0] = color[layer.face]
-    splats = splats.rows(~hidden)
+    splats = splats.rows(~closed)
     orders = settings.lattice_order, settings.first_lattice_order
     whole, first = (splats_per_triangle(order(triangles)) for order in orders)
     lattice = int((~splats.unbound).sum())

@@ -16,7 +16,9 @@ from .likeness import (
     head_coordinates,
     inside_colors,
     kinds_of,
+    lining_of,
     nearest_rows,
+    skin_of,
     sources_around_head,
     teeth_of,
 )
@@ -130,13 +132,15 @@ def _color_views(capture: Capture) -> list[View]:
 
 
 def _unseen_inside(capture: Capture, shown: np.ndarray, is_outside: np.ndarray) -> np.ndarray:
-    """(F,) bool: triangles of the inside that no view shows, nor any neighbor of theirs. None in a
-    long recording whose meshes are files: not all of its mouths were looked for."""
+    """(F,) bool: triangles inside of mouth and eyes that no view shows, nor any neighbor of theirs.
+    Not the folds of ears, which other views show. None in a long recording whose meshes are files:
+    not all of its mouths were looked for."""
     if capture.flame is None and len(capture.timesteps) > SPREAD_VIEWS:
         return np.zeros(len(shown), bool)
     touched = np.zeros(len(capture.neutral), bool)
     touched[capture.faces[shown]] = True
-    return np.asarray(~is_outside & ~touched[capture.faces].any(1))
+    may_line = ~skin_of(capture) | lining_of(capture)
+    return np.asarray(may_line & ~is_outside & ~touched[capture.faces].any(1))
 
 
 def _unseen_teeth(capture: Capture, pixels: np.ndarray, shown: np.ndarray) -> np.ndarray:
