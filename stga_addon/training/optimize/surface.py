@@ -134,23 +134,27 @@ class Surface:
         """(F,) bool: triangles that lie outside of some masks, or touch one that does, as an ear of
         a head whose turn is tracked too far: they have to be as transparent as images say."""
         seen, beside = np.zeros((2, len(self.outside)), int)
-        for view in self._outline_views:
-            scale = min(1.0, SAMPLED_HEIGHT_PIXELS / view.camera.height)
-            small, _, mask = read_view(view, scale)
-            if mask is None:
-                continue
+        for view, mask in self._masks:
             center, _ = _centers_and_normals(self.capture, view.timestep)
-            at, within = _pixels(small.camera, center)
-            margin = max(1, round(MARGIN_SHARE * small.camera.height))
+            row, column, within = _pixels(view.camera, center)
+            margin = max(1, round(MARGIN_SHARE * view.camera.height))
             seen += within
-            beside += within & ~binary_dilation(mask > 127, iterations=margin)[at]
+            covered = binary_dilation(mask > 127, iterations=margin)
+            beside += within & ~covered[row, column]
         touched = np.zeros(len(self.capture.neutral), bool)
         touched[self.capture.faces[beside > MAX_BESIDE_SHARE * np.maximum(seen, 1)]] = True
         return np.asarray(touched[self.capture.faces].any(1))
 
-    @property
-    def _outline_views(self) -> list[View]:
-        return evenly_spread(self.capture.views["train"], OUTLINE_VIEWS)
+    @cached_property
+    def _masks(self) -> list[tuple[View, np.ndarray]]:
+        """Views, made small, whose outlines are measured, and their masks (H, W) uint8."""
+        found = []
+        for view in evenly_spread(self.capture.views["train"], OUTLINE_VIEWS):
+            scale = min(1.0, SAMPLED_HEIGHT_PIXELS / view.camera.height)
+            small, _, mask = read_view(view, scale)
+            if mask is not None:
+                found.append((small, mask))
+        return found
 
     @cached_property
     def lids(self) -> np.ndarray:
@@ -239,33 +243,31 @@ class Surface:
     def _outlines(self) -> tuple[np.ndarray, np.ndarray]:
         """Sum (F,) of the heights, and in how many masks' outlines each triangle lies."""
         total, count = np.zeros((2, len(self.outside)))
-        for view in self._outline_views:
-            rows, height = self._heights_in(view)
+        for view, mask in self._masks:
+            rows, height = self._heights_in(view, mask)
             total[rows] += height
             count[rows] += 1
         return total, count
 
-    def _heights_in(self, view: View) -> tuple[np.ndarray, np.ndarray]:
+    def _heights_in(self, view: View, mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Triangles in the outline of one view, and how high its mask reaches above them."""
         capture = self.capture
         voxel = voxel_size(np.asarray(capture.neutral))
-        scale = min(1.0, SAMPLED_HEIGHT_PIXELS / view.camera.height)
-        small, _, mask = read_view(view, scale)
         center, normal = _centers_and_normals(capture, view.timestep)
         cosine = _cosine(center, normal, view)
         rows = np.flatnonzero(self.outside & (np.abs(cosine) < OUTLINE_COSINE))
-        if mask is None or not len(rows):
+        if not len(rows):
             return np.zeros(0, int), np.zeros(0)
         heights = np.arange(MAX_HEIGHT_VOXELS * STEPS_PER_VOXEL + 1) * voxel / STEPS_PER_VOXEL
         points = center[rows, None] + heights[:, None] * normal[rows, None]
-        camera = small.camera
-        at, within = _pixels(camera, points.reshape(-1, 3))
+        camera = view.camera
+        row, column, within = _pixels(camera, points.reshape(-1, 3))
         shape = len(rows), len(heights)
         covered = silhouette(capture.mesh(view.timestep), capture.faces[cosine > 0], camera)
-        beside = (within & ~binary_dilation(covered)[at]).reshape(shape)
+        beside = (within & ~binary_dilation(covered)[row, column]).reshape(shape)
         is_outline = beside[:, heights <= OUTLINE_VOXELS * voxel].any(1) & beside[:, -1]
         is_outline &= within.reshape(shape).all(1)
-        is_foreground = (within & (mask > 127)[at]).reshape(shape)
+        is_foreground = (within & (mask > 127)[row, column]).reshape(shape)
         steps = np.maximum(np.cumprod(is_foreground, axis=1).sum(1) - 1, 0)
         return rows[is_outline], heights[steps[is_outline]]
 
@@ -275,16 +277,13 @@ def _centers_and_normals(capture: Capture, timestep: int) -> tuple[np.ndarray, n
     return corners.mean(1), unit(triangle_normals(corners), 1e-20)
 
 
-Places = tuple[np.ndarray, np.ndarray]
-
-
-def _pixels(camera: Camera, points: np.ndarray) -> tuple[Places, np.ndarray]:
+def _pixels(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Row and column of each point's (N, 3) pixel, and whether it lies in the image; the first
     pixel where it does not."""
     places, _ = camera.project(points)
     x, y = np.floor(places).T.astype(int)
     within = (x >= 0) & (x < camera.width) & (y >= 0) & (y < camera.height)
-    return (np.where(within, y, 0), np.where(within, x, 0)), within
+    return np.where(within, y, 0), np.where(within, x, 0), within
 
 
 def _cosine(center: np.ndarray, normal: np.ndarray, view: View) -> np.ndarray:
