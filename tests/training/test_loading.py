@@ -50,6 +50,7 @@ def test_no_mesh_is_read_on_the_training_thread(tmp_path, monkeypatch):
     run = make_run(capture, "global", iterations=len(timesteps) - 1)
     # which read meshes once, before training and after it
     monkeypatch.setattr(Surface, "facing", np.ones(len(opened.faces)))
+    monkeypatch.setattr(Surface, "sticks_out", np.zeros(len(opened.faces), bool))
     for name in ("prepare", "apply"):
         monkeypatch.setattr(SurfacePrior, name, lambda *_: None)
     monkeypatch.setattr(session, "triangle_residuals", no_residuals)
