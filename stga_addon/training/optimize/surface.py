@@ -125,8 +125,8 @@ class Surface:
 
     @cached_property
     def closed(self) -> np.ndarray:
-        """(F,) bool: hidden triangles, but for those that stick out: opaque there, nothing would be
-        seen through the head."""
+        """(F,) bool: hidden triangles that an opaque layer closes, so that no view shines through:
+        all but those that stick out."""
         return np.asarray(self.hidden & ~self.sticks_out)
 
     @cached_property
