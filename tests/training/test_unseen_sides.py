@@ -227,7 +227,7 @@ def test_hair_goes_round_the_head(angles, height, fringe, hair, bundled, tmp_pat
 
 def test_what_lips_and_lids_hide(bundled, tmp_path):
     """Catches a closed mouth that is skin inside, teeth that are too white, lips with a dark rim,
-    and an eye that is skin where it looks aside."""
+    an eye that is skin where it looks aside, and folds of ears that count as the mouth's inside."""
     sides = sides_of(filmed(bundled, painted(bundled), TURNS_DEG, 0.0, tmp_path))
     hidden = sides.triangles & ~Surface(bundled).outside
     behind_lids = eyeballs_of(bundled) & hidden
@@ -237,6 +237,9 @@ def test_what_lips_and_lids_hide(bundled, tmp_path):
     centers, _ = middles(bundled)
     model = bundled.flame.model
     teeth = faces_within(bundled.faces, model.masks["teeth"])
+    folds = ~Surface(bundled).outside & (np.abs(centers[:, 0]) > 0.06)
+    assert folds.sum() > 20
+    assert not sides.triangles[folds].any()
     assert sides.triangles[teeth].all()
     part = connected_parts(len(bundled.neutral), bundled.faces)[bundled.faces[:, 0]]
     away = np.linalg.norm(centers - centers[bundled.regions["mouth"]].mean(0), axis=1)
@@ -273,3 +276,11 @@ def test_what_sticks_out_of_masks_is_not_closed(bundled, tmp_path):
     assert_array_equal(
         np.unique(layer.face[surface.hidden[layer.face]]), np.flatnonzero(surface.closed)
     )
+    state = Trainer(capture, quick_settings(iterations=1), {}).state
+    state.parameters.opacity[:] = -5
+    SurfacePrior(FrameStore(capture, "stga", False)).apply(Rows(state), Turn(20, 0.5, len(state)))
+    bound = ~state.unbound
+    assert (state.parameters.opacity[bound & beyond[state.face]] == -5).all()
+    assert (
+        state.parameters.opacity[bound & (surface.closed & (surface.facing < -0.1))[state.face]] > 2
+    ).all()

@@ -180,9 +180,9 @@ def inside_colors(
         return np.asarray(color[inside])
     near = nearest_rows(centers[known], centers[inside], SMOOTHED)
     found = np.median(color[known[near]], axis=1)
-    eyes = eyeballs_of(capture)
-    white = _white_of_eyes(color[eyes & shown])
-    found[eyes[inside]] = white
+    eyeballs = eyeballs_of(capture)
+    white = _white_of_eyes(color[eyeballs & shown])
+    found[eyeballs[inside]] = white
     at = head_coordinates(capture)
     if at is None:
         return np.asarray(found)
@@ -203,11 +203,11 @@ def inside_colors(
     return np.asarray(found)
 
 
-def _white_of_eyes(shown: np.ndarray) -> np.ndarray:
-    """Of the colors (M, 3) of eyeballs' triangles that views show."""
-    if not len(shown):
+def _white_of_eyes(colors: np.ndarray) -> np.ndarray:
+    """(3,) of the colors (M, 3) of those triangles of eyeballs that views show."""
+    if not len(colors):
         return WHITE
-    bright = shown[np.argsort(shown.sum(1))]
+    bright = colors[np.argsort(colors.sum(1))]
     return np.asarray(bright[int(WHITE_QUANTILE * len(bright)) :].mean(0))
 
 

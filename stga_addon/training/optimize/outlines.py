@@ -48,12 +48,16 @@ def read_outlines(capture: Capture, seed: int) -> list[Outline]:
         if mask is None:
             continue
         camera = view.camera.scaled(min(1.0, MAX_OUTLINE_HEIGHT_PX / view.camera.height))
-        margin = max(1, round(TOLERANCE_SHARE * camera.height))
         covered = area_mean(mask, camera.height, camera.width) > 127
-        outlines.append(
-            Outline(view.timestep, camera, ~binary_dilation(covered, iterations=margin))
-        )
+        outlines.append(Outline(view.timestep, camera, clear_of(covered)))
     return outlines
+
+
+def clear_of(covered: np.ndarray) -> np.ndarray:
+    """(H, W) bool: pixels that a mask, which covers these (H, W) bool, leaves clear, with a
+    margin."""
+    margin = max(1, round(TOLERANCE_SHARE * len(covered)))
+    return np.asarray(~binary_dilation(covered, iterations=margin))
 
 
 class OutlinePruning:

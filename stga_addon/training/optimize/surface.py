@@ -14,6 +14,7 @@ from ...capture.model import Capture, View, evenly_spread, views_by_timestep
 from ...flame.quaternions import unit
 from .initial_splats import FEW_CAMERAS, SAMPLED_HEIGHT_PIXELS, mirrored, voxel_size
 from .likeness import head_coordinates, kinds_of, nearest_rows
+from .outlines import clear_of
 
 FACING_TIMESTEPS = 300
 FACING_MESHES = 48
@@ -46,10 +47,8 @@ LID_STRETCH = 1.8
 MIN_SQUARED_AREA = 1e-28
 """Expressions that pull lids out of their folds, and how much longer they make them; squared
 meters, of triangles without area."""
-MARGIN_SHARE = 0.01
 MAX_BESIDE_SHARE = 0.1
-"""Error of masks, as a share of the image's height; share of the outlines that a triangle may lie
-outside of, where it is tracked well."""
+"""Share of the masks in whose image a triangle lies, that it may lie outside of."""
 STANDING_VOXELS = 1.5
 STANDING_REACH_VOXELS = 4
 """A surface is not known to be flat that is so near to where hair, or a collar, is so high."""
@@ -137,10 +136,8 @@ class Surface:
         for view, mask in self._masks:
             center, _ = _centers_and_normals(self.capture, view.timestep)
             row, column, within = _pixels(view.camera, center)
-            margin = max(1, round(MARGIN_SHARE * view.camera.height))
             seen += within
-            covered = binary_dilation(mask > 127, iterations=margin)
-            beside += within & ~covered[row, column]
+            beside += within & clear_of(mask > 127)[row, column]
         touched = np.zeros(len(self.capture.neutral), bool)
         touched[self.capture.faces[beside > MAX_BESIDE_SHARE * np.maximum(seen, 1)]] = True
         return np.asarray(touched[self.capture.faces].any(1))

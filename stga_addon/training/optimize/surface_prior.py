@@ -169,8 +169,7 @@ class SurfacePrior:
         """Splats of the mouth's unseen inside, and those under lids, stay as `layer_on` has them:
         views of closed mouths and open eyes would make them any size."""
         face = columns["face"]
-        surface = self._surface
-        is_inside = (self.sides.triangles & ~surface.outside & ~surface.sticks_out)[face]
+        is_inside = (self.sides.triangles & ~self._surface.outside)[face]
         rows = np.flatnonzero(is_inside | self._is_under_lid(columns))
         backend.assign(bound[rows], parameters_and_average(layer_on(self._frames, face[rows])))
 
