@@ -15,7 +15,7 @@ from ..errors import StgaError, shorten
 from ..files import check_version, npz_outlines, parse_json, read_npz, write_npz
 from .embedding import CONVENTIONS, FaceFrames, face_areas, face_frames
 from .offsets import COLOR, OFFSETS, POSITION, SCALE, SIGNALS, moved_frames, offset_of
-from .splats import ARRAYS, Splats
+from .splats import ARRAYS, SH_C0, Splats, sh_color
 from .strain import STRAIN_COMPONENTS, TRAINED_RANGE, StrainBasis, at_rest, strain_basis
 
 FORMAT = "stga-avatar"
@@ -41,6 +41,7 @@ _LIGHT_ARRAYS = {
 }
 """Field -> shape, -1: vertices."""
 _PREFIX = "light_"
+_OPTIONAL_ARRAYS = "strain_range", "linear_base", "filmed_along"
 MIN_COLOR_CHANGE = 1 / 255
 MIN_SHIFT_M = 2e-4
 MIN_SCALE_CHANGE = 0.02
@@ -99,6 +100,9 @@ class Avatar:
     driven_offsets  name -> (F, 3, 3) float32 of `offsets.OFFSETS`: change of a triangle's splats by
                     each of three components of a signal
     light       what relighting needs, None where it was not estimated
+    filmed_along  (3,) float32: unit direction in which the only cameras look, world axes; what
+                  harmonics add from aside is plausible only (`colored_aside`). None: of several, or
+                  all that harmonics add is trained
     linear_base  (N, 4) float32: constant coefficients and logit of each splat with which renderers
                  that blend in linear light come nearest to it (`render.linear_fit`); None: those
                  of `splats`
@@ -116,7 +120,18 @@ class Avatar:
     strain_range: np.ndarray | None = None
     driven_offsets: Mapping[str, np.ndarray] = field(default_factory=dict)
     light: AvatarLight | None = None
+    filmed_along: np.ndarray | None = None
     linear_base: np.ndarray | None = None
+
+    @property
+    def as_trained(self) -> "Avatar":
+        """With the colors that cameras saw in all directions."""
+        if self.filmed_along is None:
+            return self
+        color = sh_color(self.splats.sh, self.filmed_along[None])
+        sh = ((color - 0.5) / SH_C0)[:, None].astype(np.float32)
+        splats = replace(self.splats, sh=sh)
+        return replace(self, splats=splats, filmed_along=None, linear_base=None)
 
     @property
     def for_linear_light(self) -> "Avatar":
@@ -131,7 +146,7 @@ class Avatar:
     @property
     def arrays(self) -> dict[str, np.ndarray]:
         """Those of a file, by name, but for regions and light."""
-        optional = {"strain_range": self.strain_range, "linear_base": self.linear_base}
+        optional = {name: getattr(self, name) for name in _OPTIONAL_ARRAYS}
         given = {name: array for name, array in optional.items() if array is not None}
         own = {name: getattr(self.splats, name) for name in ARRAYS}
         mesh = {"neutral": self.neutral, "faces": self.faces}
@@ -227,7 +242,7 @@ def read_avatar(path: Path) -> Avatar:
     _check_shapes(path, _avatar_of(path, header, outlines))
     if "light" in header:
         _check_light_shapes(path, outlines)
-    optional = ("strain_range", "linear_base", *OFFSETS, *(_PREFIX + n for n in _LIGHT_ARRAYS))
+    optional = (*_OPTIONAL_ARRAYS, *OFFSETS, *(_PREFIX + name for name in _LIGHT_ARRAYS))
     arrays = read_npz(path, (*needed, *optional))
     avatar = _avatar_of(path, header, arrays)
     _check(path, avatar)
@@ -253,6 +268,7 @@ def _avatar_of(path: Path, header: dict[str, Any], arrays: Mapping[str, np.ndarr
         strain_range=arrays.get("strain_range"),
         driven_offsets={name: arrays[name] for name in OFFSETS if name in arrays},
         linear_base=arrays.get("linear_base"),
+        filmed_along=arrays.get("filmed_along"),
     )
 
 
@@ -299,6 +315,7 @@ def _check_shapes(path: Path, avatar: Avatar) -> None:
         "faces": ("int32", (-1, 3)),
         "strain_range": ("float32", (faces, *TRAINED_RANGE.shape)),
         "linear_base": ("float32", (count, 4)),
+        "filmed_along": ("float32", (3,)),
     }
     for name, array in avatar.arrays.items():
         _check_shape(path, name, array, *kinds[name])

@@ -188,3 +188,17 @@ def sh_color(sh: np.ndarray, direction: np.ndarray) -> np.ndarray:
     terms = enumerate(harmonics(*direction.T)[1 : sh.shape[1]], 1)
     rest = sum(term[:, None] * sh[:, k] for k, term in terms)
     return 0.5 + SH_C0 * sh[:, 0] + rest
+
+
+def colored_aside(
+    splats: Splats, direction: np.ndarray, share: np.ndarray, color: np.ndarray
+) -> Splats:
+    """Splats of degree 0 that look as they do along one unit direction (3,) from the eye, and the
+    more it turns from there, as a color (N, 3), sRGB: by a share (N,) of the way times the squared
+    sine of the angle. Of degree 2, which holds just that."""
+    directions = unit(np.random.default_rng(0).normal(size=(64, 3)))
+    sine = 1 - (directions @ direction) ** 2
+    terms = np.linalg.lstsq(_basis(directions, 9), sine, rcond=None)[0]
+    change = share[:, None] * (color - sh_color(splats.sh, direction[None]))
+    sh = at_degree(splats, 2).sh + terms[:, None] * change[:, None]
+    return replace(splats, sh=sh.astype(np.float32))

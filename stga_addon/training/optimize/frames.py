@@ -16,6 +16,7 @@ from ...raster.cpu.rasterize import moved_frames
 from ..settings import TrainingSettings
 from .initial_splats import voxel_size
 from .surface import Surface
+from .unseen_sides import UnseenSides, unseen_sides
 
 CACHE_BYTES = 256e6
 BYTES_PER_TRIANGLE = 170
@@ -99,6 +100,10 @@ class FrameStore:
         share = np.where(self.surface.border, BORDER_DISTANCE_SHARE, 1.0)
         hair = self.surface.hair_height / self.unit_lengths
         return np.asarray(settings.stray_limit * self.units * share + hair, np.float32)
+
+    @cached_property
+    def sides(self) -> UnseenSides:
+        return unseen_sides(self.surface)
 
     @cached_property
     def layer_height(self) -> np.ndarray:

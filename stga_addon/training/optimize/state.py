@@ -126,9 +126,9 @@ def new_state(splats: Splats, unseen_share: np.ndarray | None = None) -> TrainSt
 
 
 def state_of_avatar(avatar: Avatar) -> TrainState:
-    """A copy of an avatar's splats and driven offsets with zero moments."""
+    """A copy of an avatar's splats, as trained, and driven offsets with zero moments."""
     offsets = {name: new_offset(values) for name, values in avatar.driven_offsets.items()}
-    return replace(new_state(avatar.splats), driven_offsets=offsets)
+    return replace(new_state(avatar.as_trained.splats), driven_offsets=offsets)
 
 
 def keep_rows(state: TrainState, keep: np.ndarray) -> TrainState:

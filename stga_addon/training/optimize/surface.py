@@ -47,6 +47,7 @@ LID_STRETCH = 1.8
 MIN_SQUARED_AREA = 1e-28
 """Expressions that pull lids out of their folds, and how much longer they make them; squared
 meters, of triangles without area."""
+MAX_APART_DEG = 12.0
 MAX_BESIDE_SHARE = 0.1
 """Share of the masks in whose image a triangle lies, that it may lie outside of."""
 STANDING_VOXELS = 1.5
@@ -92,6 +93,17 @@ class Surface:
             triangle, _ = rasterize(neutral, self.capture.faces, camera)
             seen[np.unique(triangle[triangle >= 0])] = True
         return seen
+
+    @cached_property
+    def filmed_along(self) -> np.ndarray | None:
+        """(3,) float32: unit direction in which all training views look at the head, world axes;
+        None where they differ by more than MAX_APART_DEG."""
+        views = evenly_spread(self.capture.views["train"], OUTLINE_VIEWS)
+        away = [self.capture.mesh(view.timestep).mean(0) - view.camera.position for view in views]
+        directions = unit(np.array(away))
+        along = unit(directions.mean(0))
+        apart = np.degrees(np.arccos(np.clip(directions @ along, -1, 1)))
+        return along.astype(np.float32) if apart.max() < MAX_APART_DEG else None
 
     @cached_property
     def has_few_cameras(self) -> bool:

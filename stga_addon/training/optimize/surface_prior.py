@@ -15,7 +15,6 @@ from .backend import Backend
 from .change import Turn
 from .frames import FrameStore
 from .state import parameters_and_average
-from .unseen_sides import UnseenSides, unseen_sides
 
 WELL_SEEN_COSINE = 0.8
 SHOWN_COSINE = 0.5
@@ -71,20 +70,16 @@ class SurfacePrior:
         self._surface = frames.surface
 
     @cached_property
-    def sides(self) -> UnseenSides:
-        return unseen_sides(self._surface)
-
-    @cached_property
     def may_be_pulled(self) -> np.ndarray:
         """(F,) bool: triangles some of whose splats may be; of many cameras, few."""
         surface = self._surface
-        may_be = self.sides.triangles | surface.lids | surface.is_flat
+        may_be = self._frames.sides.triangles | surface.lids | surface.is_flat
         return np.asarray(may_be | (self._color_share > 0) | (surface.turned_away > 0))
 
     @cached_property
     def _color_share(self) -> np.ndarray:
         """(F,) by which colors are pulled where views tell nothing of a splat; 0: not at all."""
-        return np.where(self.sides.shown, self._surface.turned_from(SHOWN_COSINE), 1.0)
+        return np.where(self._frames.sides.shown, self._surface.turned_from(SHOWN_COSINE), 1.0)
 
     def prepare(self) -> None:
         self.may_be_pulled  # noqa: B018
@@ -111,7 +106,7 @@ class SurfacePrior:
         columns: Mapping[str, np.ndarray],
         usual: np.ndarray,
     ) -> None:
-        sides = self.sides
+        sides = self._frames.sides
         face = columns["face"]
         share = doubt(columns["second/color"], usual) * self._color_share[face]
         is_pinned = sides.triangles[face] | self._is_under_lid(columns)
@@ -169,7 +164,7 @@ class SurfacePrior:
         """Splats of the mouth's unseen inside, and those under lids, stay as `layer_on` has them:
         views of closed mouths and open eyes would make them any size."""
         face = columns["face"]
-        is_inside = (self.sides.triangles & ~self._surface.outside)[face]
+        is_inside = (self._frames.sides.triangles & ~self._surface.outside)[face]
         rows = np.flatnonzero(is_inside | self._is_under_lid(columns))
         backend.assign(bound[rows], parameters_and_average(layer_on(self._frames, face[rows])))
 

@@ -24,6 +24,7 @@ from .outlines import OutlinePruning
 from .state import TrainState, new_state, with_offsets
 from .strays import StrayReset
 from .surface_prior import SurfacePrior, hidden_splats
+from .unseen_sides import plausible_aside
 
 EXTEND_LOCAL_SHARE = 0.5
 """Of an extension's budget, in which what the new takes need is trained, before all splats."""
@@ -202,8 +203,12 @@ class Trainer:
         state = self.state
         settings = self.settings
         capture = self.capture
+        splats = state.splats(averaged=True)
+        along = self.frames.surface.filmed_along if splats.sh_degree == 0 else None
+        if along is not None:
+            splats = plausible_aside(splats, along, self.frames.sides)
         return Avatar(
-            splats=state.splats(averaged=True),
+            splats=splats,
             convention=settings.convention,
             neutral=capture.neutral.astype(np.float32),
             faces=capture.faces,
@@ -214,6 +219,7 @@ class Trainer:
             principal_point=principal_point,
             strain_range=strain_range,
             driven_offsets={n: each.average.copy() for n, each in state.driven_offsets.items()},
+            filmed_along=along,
         ).without_invisible_offsets
 
     def prepare_turns(self) -> None:

@@ -1,10 +1,12 @@
 """Colors of what no training view shows, sides of the head and the inside of a closed mouth."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 
 from ...avatar.embedding import MIN_DIVISOR, face_areas
+from ...avatar.splats import Splats, colored_aside
 from ...capture.mesh_geometry import connected_parts
 from ...capture.model import Capture, View, evenly_spread, views_by_timestep
 from .initial_splats import mean_colors, mirror_images
@@ -42,16 +44,22 @@ MIN_SHOWN_SHARE = 0.1
 """Of the pixels that usually show as much of the surface: a folded eyelid has less."""
 SOURCE_TRIANGLES = 100
 """Of whose colors a hidden triangle has the median."""
+ASIDE_SHARE = 0.75
+"""Of the way to their usual color on which hair, neck and clothes are at a right angle to views."""
 
 
 @dataclass(frozen=True)
 class UnseenSides:
     """Triangles (F,) bool that no view shows; those (F,) bool that the views whose colors were
-    looked at show well; the color (F, 3) in 0…1 that each triangle plausibly has."""
+    looked at show well; the color (F, 3) in 0…1 that each triangle plausibly has; triangles (F,)
+    bool of hair, neck and clothes, which look alike all around, and the usual color (F, 3) there.
+    """
 
     triangles: np.ndarray
     shown: np.ndarray
     color: np.ndarray
+    is_regular: np.ndarray
+    usual: np.ndarray
 
 
 def unseen_sides(surface: Surface) -> UnseenSides:
@@ -70,7 +78,8 @@ def unseen_sides(surface: Surface) -> UnseenSides:
     is_source = (pixels > 0) & is_outside & (cosine > SOURCE_COSINE) & ~surface.lids
     sources = np.flatnonzero(is_source)
     if not len(sources):
-        return UnseenSides(np.zeros_like(shown), shown, color)
+        none = np.zeros_like(shown)
+        return UnseenSides(none, shown, color, none, color)
     unseen = is_outside & (cosine < surface.grazing_cosine)
     found = color.copy()
     centers = np.asarray(capture.neutral)[capture.faces].mean(1)
@@ -81,28 +90,58 @@ def unseen_sides(surface: Surface) -> UnseenSides:
         own = sources[part[sources] == number] if (part[sources] == number).any() else sources
         near = nearest_rows(centers[own], centers[rows], SOURCE_TRIANGLES)
         found[rows] = np.median(color[own[near]], axis=1)
+    usual = color.copy()
+    is_regular = np.zeros_like(shown)
+    is_fringe = is_outside & (pixels > 0) & (cosine > FRINGE_COSINE)
     at = head_coordinates(capture)
     if at is not None:
-        kinds = kinds_of(at, is_outside)
-        is_face = is_source & ~kinds["scalp"] & ~kinds["body"] & (at.level < BROWS_LEVEL)
-        for kind, members in kinds.items():
-            own = np.flatnonzero(members & is_source)
-            if kind == "scalp":
-                if not len(own):
-                    own = _fringe(at, is_outside & (pixels > 0) & (cosine > FRINGE_COSINE))
-                own = hairy_triangles(own, centers, color, color[is_face])
+        for members, own in _regular_parts(at, surface, is_source, is_fringe, color):
             rows = np.flatnonzero(members & unseen)
-            if len(own) and len(rows):
+            if len(rows):
                 copied = color[sources_around_head(at, own, rows)]
                 around = nearest_rows(centers[rows], centers[rows], SMOOTHED)
                 found[rows] = np.median(copied[around], axis=1)
+            near = nearest_rows(centers[own], centers[members], SOURCE_TRIANGLES)
+            usual[members] = np.median(color[own[near]], axis=1)
+            is_regular |= members
     hidden, partner = mirror_images(capture, unseen, is_source)
     found[hidden] = color[partner]
     inside = _unseen_inside(capture, pixels > 0, is_outside)
     inside |= _unseen_teeth(capture, pixels, shown)
     within = inside | (~is_outside & ~shown)
     found[within] = inside_colors(capture, color, shown, within)
-    return UnseenSides((is_outside & (cosine < UNSEEN_COSINE)) | inside, shown, found)
+    triangles = (is_outside & (cosine < UNSEEN_COSINE)) | inside
+    usual[unseen] = found[unseen]
+    return UnseenSides(triangles, shown, found, is_regular, usual)
+
+
+def plausible_aside(splats: Splats, along: np.ndarray, sides: UnseenSides) -> Splats:
+    """Splats that were seen along one direction (3,) only: those of hair, neck and clothes have
+    their usual color from aside, as sheen and strands are elsewhere from there."""
+    share = np.where(sides.is_regular, ASIDE_SHARE, 0.0)[splats.face]
+    return colored_aside(splats, along, share, sides.usual[splats.face])
+
+
+def _regular_parts(
+    at: HeadCoordinates,
+    surface: Surface,
+    is_source: np.ndarray,
+    is_fringe: np.ndarray,
+    color: np.ndarray,
+) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """The triangles (F,) bool of hair, and of neck with clothes, and rows of those whose colors
+    they have; no part of which none is shown."""
+    capture = surface.capture
+    centers = np.asarray(capture.neutral)[capture.faces].mean(1)
+    kinds = kinds_of(at, surface.outside)
+    is_face = is_source & ~kinds["scalp"] & ~kinds["body"] & (at.level < BROWS_LEVEL)
+    for kind, members in kinds.items():
+        own = np.flatnonzero(members & is_source)
+        if kind == "scalp":
+            own = own if len(own) else _fringe(at, is_fringe)
+            own = hairy_triangles(own, centers, color, color[is_face])
+        if len(own):
+            yield members, own
 
 
 def _fringe(at: HeadCoordinates, shown: np.ndarray) -> np.ndarray:

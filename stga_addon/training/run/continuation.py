@@ -41,6 +41,8 @@ MIN_UNLIKE_RESIDUAL = 0.05
 """How much larger than its take's median, and how large, the residual of a strange view is."""
 MIN_GROUP_VIEWS = 4
 """Evaluation views of a group at least, where it has so many."""
+ROUNDING = 1e-5
+"""By which values of an avatar differ that went through a file."""
 
 
 def select_for_takes(
@@ -96,7 +98,7 @@ def starting_state(
         raise StgaError(
             f"{folder / AVATAR}: has changed since this continuation was started from it"
         )
-    avatar = read_avatar(folder / AVATAR)
+    avatar = read_avatar(folder / AVATAR).as_trained
     state = state_of_avatar(avatar)
     kept = None
     if (folder / CHECKPOINT).exists():
@@ -106,8 +108,11 @@ def starting_state(
         ours = {**vars(avatar.splats), **avatar.driven_offsets}
         latest = replace(avatar, driven_offsets=offsets).without_invisible_offsets
         theirs = {**vars(kept.splats(averaged=True)), **latest.driven_offsets}
-        alike = (np.array_equal(array, theirs[name]) for name, array in ours.items())
-        if ours.keys() == theirs.keys() and all(alike):
+        if ours.keys() == theirs.keys() and all(
+            array.shape == theirs[name].shape
+            and np.allclose(array, theirs[name], rtol=0, atol=ROUNDING)
+            for name, array in ours.items()
+        ):
             parameters = Parameters(*(array.copy() for array in kept.average))
             screen, count = np.zeros((2, len(kept)), np.float32)
             state = replace(
