@@ -22,6 +22,8 @@ def test_round_trip_is_exact(is_empty, tmp_path, avatar):
     if is_empty:
         nothing = avatar.splats.rows(np.arange(0))
         avatar = replace(avatar, regions={}, settings={}, splats=nothing)
+    along = np.array([0.0, 0.6, -0.8], np.float32)
+    avatar = replace(avatar, filmed_along=along)
     write_avatar(tmp_path / "a.npz", avatar)
     back = read_avatar(tmp_path / "a.npz")
     for name in SPLAT_FIELDS:
@@ -29,7 +31,7 @@ def test_round_trip_is_exact(is_empty, tmp_path, avatar):
         want = getattr(avatar.splats, name)
         assert have.dtype == want.dtype, name
         assert_array_equal(have, want, err_msg=name)
-    for name in ("neutral", "faces"):
+    for name in ("neutral", "faces", "filmed_along"):
         assert_array_equal(getattr(back, name), getattr(avatar, name), err_msg=name)
     for name in ("convention", "settings", "background"):
         assert getattr(back, name) == getattr(avatar, name)

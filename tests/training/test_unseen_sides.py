@@ -8,14 +8,18 @@ from capture import factory
 from numpy.testing import assert_allclose, assert_array_equal
 from PIL import Image
 
+from stga_addon.avatar.lattice import lattice_splats
+from stga_addon.avatar.splats import colored_aside, sh_color
 from stga_addon.capture.camera import look_at
 from stga_addon.capture.images import read_image
 from stga_addon.capture.mesh_geometry import connected_parts, rasterize
 from stga_addon.capture.model import View
 from stga_addon.flame.model import faces_within
 from stga_addon.flame.parts import flame_model, key_regions
+from stga_addon.render.render import render_avatar
 from stga_addon.training.optimize.change import Turn
 from stga_addon.training.optimize.frames import FrameStore
+from stga_addon.training.optimize.state import state_of_avatar
 from stga_addon.training.optimize.surface import Surface
 from stga_addon.training.optimize.surface_prior import SurfacePrior, hidden_splats
 from stga_addon.training.optimize.trainer import Trainer
@@ -284,3 +288,52 @@ def test_what_sticks_out_of_masks_is_not_closed(bundled, tmp_path):
     assert (
         state.parameters.opacity[bound & (surface.closed & (surface.facing < -0.1))[state.face]] > 2
     ).all()
+
+
+def test_hair_from_aside(bundled, tmp_path):
+    """Catches an avatar of one camera that does not look from there as it was trained, streaks of
+    hair that run around the head as they shine in front, a face that is smoothed with them, a
+    training that goes on with what is plausible only, and views from several sides that are taken
+    for one."""
+    color = painted(bundled)
+    streak = (np.arange(len(color)) % 4 == 0) & (color == HAIR).all(1)
+    color[streak] = GRAY
+    capture = filmed(bundled, color, (0,), 0.6, tmp_path)
+    view = capture.views["train"][0]
+    trainer = Trainer(capture, quick_settings(iterations=1, sh_degree=0, sh_steps=()), {})
+    avatar = trainer.avatar("", None)
+    splats = avatar.splats
+    trained = trainer.state.splats(averaged=True)
+    drawn = render_avatar(avatar, capture.neutral, view.camera)
+    assert_allclose(drawn, np.clip(trainer.render(view), 0, 1), atol=0.03)
+    seen = 0.5 + 0.28209479177387814 * trained.sh[:, 0]
+    along = avatar.filmed_along
+    assert_allclose(along, np.array([0, -0.6, -1]) / np.hypot(0.6, 1), atol=0.1)
+    aside = sh_color(splats.sh, np.array([[1.0, 0, 0]]))
+    _, level = middles(capture)
+    facing = Surface(capture).facing[splats.face]
+    shown = ~splats.unbound & (facing > 0.6)
+    hair = ~splats.unbound & (facing > 0.2) & (level[splats.face] > 1.2)
+    assert hair.sum() > 20
+    assert aside[hair].std(0).max() < 0.5 * seen[hair].std(0).max()
+    cheeks = shown & (np.abs(level[splats.face]) < 0.5)
+    assert_allclose(aside[cheeks], seen[cheeks], atol=1e-5)
+    assert_allclose(state_of_avatar(avatar).parameters.sh, trained.sh, atol=1e-5)
+    around = filmed(bundled, color, (-30, 30), 0.0, tmp_path)
+    assert Trainer(around, trainer.settings, {}).avatar("", None).filmed_along is None
+
+
+def test_colors_aside_by_the_squared_sine():
+    """Catches coefficients of other signs or directions than those that splats are drawn with."""
+    rng = np.random.default_rng(0)
+    direction, away = np.linalg.qr(rng.normal(size=(3, 3)))[0][:, :2].T
+    splats = lattice_splats(rng.normal(size=(4, 3)), np.array([[0, 1, 2], [1, 2, 3]]), 1, 0)
+    splats.sh[:] = rng.normal(size=splats.sh.shape)
+    share = rng.random(len(splats))
+    color = rng.random((len(splats), 3))
+    colored = colored_aside(splats, direction, share, color)
+    seen = sh_color(splats.sh, direction[None])
+    for angle in (0, 0.3, 1.1, np.pi / 2, 2.5, np.pi):
+        looked = np.cos(angle) * direction + np.sin(angle) * away
+        expected = seen + (np.sin(angle) ** 2 * share)[:, None] * (color - seen)
+        assert_allclose(sh_color(colored.sh, looked[None]), expected, atol=1e-5)

@@ -11,6 +11,7 @@ from ...capture.camera import Camera, look_at
 from ...capture.images import read_view
 from ...capture.mesh_geometry import connected_parts, rasterize, silhouette, triangle_normals
 from ...capture.model import Capture, View, evenly_spread, views_by_timestep
+from ...flame.model import torso_faces
 from ...flame.quaternions import unit
 from .initial_splats import FEW_CAMERAS, SAMPLED_HEIGHT_PIXELS, mirrored, voxel_size
 from .likeness import head_coordinates, kinds_of, nearest_rows
@@ -50,6 +51,8 @@ meters, of triangles without area."""
 MAX_APART_DEG = 12.0
 MAX_BESIDE_SHARE = 0.1
 """Share of the masks in whose image a triangle lies, that it may lie outside of."""
+MAX_STICKING_SHARE = 0.05
+"""Of a torso's triangles, that are where images show the body."""
 STANDING_VOXELS = 1.5
 STANDING_REACH_VOXELS = 4
 """A surface is not known to be flat that is so near to where hair, or a collar, is so high."""
@@ -220,7 +223,8 @@ class Surface:
     @cached_property
     def is_flat(self) -> np.ndarray:
         """(F,) bool: hidden triangles and, where few cameras do not tell how thick it is, skin and
-        clothes, above which no outline shows anything to stand."""
+        clothes, above which no outline shows anything to stand. Not the torso where parts of it
+        stick out of masks: what images show there, as arms and hands, is elsewhere."""
         if head_coordinates(self.capture) is None or not self.has_few_cameras:
             return self.hidden
         voxel = voxel_size(np.asarray(self.capture.neutral))
@@ -230,6 +234,10 @@ class Surface:
             center = np.asarray(self.capture.neutral, np.float64)[self.capture.faces].mean(1)
             distance, _ = cKDTree(center[stands]).query(center)
             bare &= distance > STANDING_REACH_VOXELS * voxel
+        if self.capture.flame is not None:
+            torso = torso_faces(self.capture.flame.model)
+            sticking = np.count_nonzero(self.sticks_out & torso)
+            bare &= ~(torso & (sticking > MAX_STICKING_SHARE * np.count_nonzero(torso)))
         return np.asarray(bare | self.hidden)
 
     @cached_property

@@ -17,10 +17,8 @@ from .frames import FrameStore
 from .state import parameters_and_average
 
 WELL_SEEN_COSINE = 0.8
-SHOWN_COSINE = 0.5
-"""Of the angle between a triangle and the camera that it faces most: above the first, gradients are
-those that others are compared with; above the second, what views show keeps its color, below it
-the less the more it turns away."""
+"""Of the angle between a triangle and the camera that it faces most, above which gradients are
+those that others are compared with."""
 DOUBT = 0.3
 MIN_PULL = 0.02
 """Gradient, as a share of the median of well seen splats, at which a splat is pulled halfway to
@@ -73,13 +71,9 @@ class SurfacePrior:
     def may_be_pulled(self) -> np.ndarray:
         """(F,) bool: triangles some of whose splats may be; of many cameras, few."""
         surface = self._surface
-        may_be = self._frames.sides.triangles | surface.lids | surface.is_flat
-        return np.asarray(may_be | (self._color_share > 0) | (surface.turned_away > 0))
-
-    @cached_property
-    def _color_share(self) -> np.ndarray:
-        """(F,) by which colors are pulled where views tell nothing of a splat; 0: not at all."""
-        return np.where(self._frames.sides.shown, self._surface.turned_from(SHOWN_COSINE), 1.0)
+        sides = self._frames.sides
+        may_be = sides.triangles | ~sides.shown | surface.lids | surface.is_flat
+        return np.asarray(may_be | (surface.turned_away > 0))
 
     def prepare(self) -> None:
         self.may_be_pulled  # noqa: B018
@@ -108,7 +102,7 @@ class SurfacePrior:
     ) -> None:
         sides = self._frames.sides
         face = columns["face"]
-        share = doubt(columns["second/color"], usual) * self._color_share[face]
+        share = doubt(columns["second/color"], usual) * ~sides.shown[face]
         is_pinned = sides.triangles[face] | self._is_under_lid(columns)
         rows = np.flatnonzero((share > MIN_PULL) & ~is_pinned)
         plausible = ((sides.color[face] - 0.5) / SH_C0).astype(np.float32)

@@ -1,6 +1,5 @@
 """Colors of what no training view shows, sides of the head and the inside of a closed mouth."""
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -44,22 +43,30 @@ MIN_SHOWN_SHARE = 0.1
 """Of the pixels that usually show as much of the surface: a folded eyelid has less."""
 SOURCE_TRIANGLES = 100
 """Of whose colors a hidden triangle has the median."""
+SHOWN_COSINE = 0.5
 ASIDE_SHARE = 0.75
-"""Of the way to their usual color on which hair, neck and clothes are at a right angle to views."""
+"""Of the angle between a triangle and the camera that it faces most, above which it looks from
+elsewhere as views show it; how far what does not is on the way to its color aside at a right angle
+to the views."""
 
 
 @dataclass(frozen=True)
 class UnseenSides:
-    """Triangles (F,) bool that no view shows; those (F,) bool that the views whose colors were
-    looked at show well; the color (F, 3) in 0…1 that each triangle plausibly has; triangles (F,)
-    bool of hair, neck and clothes, which look alike all around, and the usual color (F, 3) there.
+    """What is plausible where views tell little of a head.
+
+    triangles   (F,) bool: no view shows them
+    shown       (F,) bool: the views whose colors were looked at show them well
+    color       (F, 3) in 0…1 that a triangle plausibly has
+    changes     (F,) 0…1: how much what views show looks different from elsewhere: hair, in which
+                sheen and strands are others, and what turns away from all views
+    aside       (F, 3) in 0…1: the color that it has there
     """
 
     triangles: np.ndarray
     shown: np.ndarray
     color: np.ndarray
-    is_regular: np.ndarray
-    usual: np.ndarray
+    changes: np.ndarray
+    aside: np.ndarray
 
 
 def unseen_sides(surface: Surface) -> UnseenSides:
@@ -78,8 +85,7 @@ def unseen_sides(surface: Surface) -> UnseenSides:
     is_source = (pixels > 0) & is_outside & (cosine > SOURCE_COSINE) & ~surface.lids
     sources = np.flatnonzero(is_source)
     if not len(sources):
-        none = np.zeros_like(shown)
-        return UnseenSides(none, shown, color, none, color)
+        return UnseenSides(np.zeros_like(shown), shown, color, np.zeros(len(color)), color)
     unseen = is_outside & (cosine < surface.grazing_cosine)
     found = color.copy()
     centers = np.asarray(capture.neutral)[capture.faces].mean(1)
@@ -90,20 +96,27 @@ def unseen_sides(surface: Surface) -> UnseenSides:
         own = sources[part[sources] == number] if (part[sources] == number).any() else sources
         near = nearest_rows(centers[own], centers[rows], SOURCE_TRIANGLES)
         found[rows] = np.median(color[own[near]], axis=1)
-    usual = color.copy()
-    is_regular = np.zeros_like(shown)
-    is_fringe = is_outside & (pixels > 0) & (cosine > FRINGE_COSINE)
+    changes = np.where(is_outside, surface.turned_from(SHOWN_COSINE), 0.0)
+    aside = color.copy()
     at = head_coordinates(capture)
     if at is not None:
-        for members, own in _regular_parts(at, surface, is_source, is_fringe, color):
+        kinds = kinds_of(at, is_outside)
+        is_face = is_source & ~kinds["scalp"] & ~kinds["body"] & (at.level < BROWS_LEVEL)
+        for kind, members in kinds.items():
+            own = np.flatnonzero(members & is_source)
+            if kind == "scalp":
+                if not len(own):
+                    own = _fringe(at, is_outside & (pixels > 0) & (cosine > FRINGE_COSINE))
+                own = hairy_triangles(own, centers, color, color[is_face])
+            if kind == "scalp" and len(own):
+                near = nearest_rows(centers[own], centers[members], SOURCE_TRIANGLES)
+                aside[members] = np.median(color[own[near]], axis=1)
+                changes[members] = 1
             rows = np.flatnonzero(members & unseen)
-            if len(rows):
+            if len(own) and len(rows):
                 copied = color[sources_around_head(at, own, rows)]
                 around = nearest_rows(centers[rows], centers[rows], SMOOTHED)
                 found[rows] = np.median(copied[around], axis=1)
-            near = nearest_rows(centers[own], centers[members], SOURCE_TRIANGLES)
-            usual[members] = np.median(color[own[near]], axis=1)
-            is_regular |= members
     hidden, partner = mirror_images(capture, unseen, is_source)
     found[hidden] = color[partner]
     inside = _unseen_inside(capture, pixels > 0, is_outside)
@@ -111,37 +124,14 @@ def unseen_sides(surface: Surface) -> UnseenSides:
     within = inside | (~is_outside & ~shown)
     found[within] = inside_colors(capture, color, shown, within)
     triangles = (is_outside & (cosine < UNSEEN_COSINE)) | inside
-    usual[unseen] = found[unseen]
-    return UnseenSides(triangles, shown, found, is_regular, usual)
+    aside = np.where(unseen[:, None], found, aside)
+    return UnseenSides(triangles, shown, found, changes, aside)
 
 
 def plausible_aside(splats: Splats, along: np.ndarray, sides: UnseenSides) -> Splats:
-    """Splats that were seen along one direction (3,) only: those of hair, neck and clothes have
-    their usual color from aside, as sheen and strands are elsewhere from there."""
-    share = np.where(sides.is_regular, ASIDE_SHARE, 0.0)[splats.face]
-    return colored_aside(splats, along, share, sides.usual[splats.face])
-
-
-def _regular_parts(
-    at: HeadCoordinates,
-    surface: Surface,
-    is_source: np.ndarray,
-    is_fringe: np.ndarray,
-    color: np.ndarray,
-) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """The triangles (F,) bool of hair, and of neck with clothes, and rows of those whose colors
-    they have; no part of which none is shown."""
-    capture = surface.capture
-    centers = np.asarray(capture.neutral)[capture.faces].mean(1)
-    kinds = kinds_of(at, surface.outside)
-    is_face = is_source & ~kinds["scalp"] & ~kinds["body"] & (at.level < BROWS_LEVEL)
-    for kind, members in kinds.items():
-        own = np.flatnonzero(members & is_source)
-        if kind == "scalp":
-            own = own if len(own) else _fringe(at, is_fringe)
-            own = hairy_triangles(own, centers, color, color[is_face])
-        if len(own):
-            yield members, own
+    """Splats that views show along one direction (3,) only, with what is plausible from aside."""
+    share = ASIDE_SHARE * sides.changes[splats.face]
+    return colored_aside(splats, along, share, sides.aside[splats.face])
 
 
 def _fringe(at: HeadCoordinates, shown: np.ndarray) -> np.ndarray:
