@@ -54,12 +54,13 @@ def filmed_sides(avatar: Avatar) -> str:
 
 
 def filmed_avatar(path: Path, avatar: Avatar) -> Avatar:
-    """Without the splats on triangles that no camera saw. Raises StgaError naming `path` where the
-    avatar does not know them, or all are."""
+    """Without the splats on triangles that no camera saw, and colors as cameras saw them. Raises
+    StgaError naming `path` where the avatar does not know them, or all are."""
     unseen = avatar.regions.get(UNSEEN_REGION)
     if unseen is None:
         problem = "does not say what was filmed, as files of older versions; train it again"
         raise StgaError(f"{path}: {problem}")
+    avatar = avatar.as_trained
     kept = ~unseen[avatar.splats.face]
     if not kept.any():
         raise StgaError(f"{path}: has no splat on a triangle that was filmed")
