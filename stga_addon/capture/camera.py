@@ -5,6 +5,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from ..flame.quaternions import from_axis_angle, to_matrices, unit
+
 MAX_IMAGE_PIXELS = 1 << 26
 """Of the largest machine-vision sensors; a small file that claims more could fill the memory."""
 MAX_FOCAL_PIXELS = 1e7
@@ -90,16 +92,21 @@ class Camera:
         return Camera(width, height, *intrinsics, self.world_to_camera)
 
 
+def turn_about(axis: Sequence[float], center: np.ndarray, angle: float) -> np.ndarray:
+    """(4, 4) that turns points by `angle` radians, counterclockwise seen against the `axis` (3,),
+    about it through `center` (3,)."""
+    turn = np.eye(4)
+    turn[:3, :3] = to_matrices(from_axis_angle(angle * unit(np.asarray(axis, np.float64))))
+    turn[:3, 3] = center - turn[:3, :3] @ center
+    return turn
+
+
 def orbited(camera: Camera, center: np.ndarray, up: Sequence[float], angle: float) -> Camera:
     """The camera turned by `angle` radians, counterclockwise seen from above, about the axis `up`
     (3,) through `center` (3,) in world meters: it sees the center at the same place of the image
     from another side."""
-    x, y, z = np.asarray(up, np.float64) / np.linalg.norm(up)
-    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    turn = np.eye(4)
-    turn[:3, :3] += np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
-    turn[:3, 3] = center - turn[:3, :3] @ center
-    return replace(camera, world_to_camera=camera.world_to_camera @ np.linalg.inv(turn))
+    back = turn_about(up, center, -angle)
+    return replace(camera, world_to_camera=camera.world_to_camera @ back)
 
 
 def central_camera(cameras: Sequence[Camera]) -> int:
@@ -173,7 +180,7 @@ def covered_angles(
     """The angles about the vertical axis through `center` (3,), in radians from `start`, that the
     cameras cover. Of what no camera saw, training has nothing to show. A full turn where they leave
     no gap of MAX_GAP_RAD."""
-    axis = np.asarray(up, np.float64) / np.linalg.norm(up)
+    axis = unit(np.asarray(up, np.float64))
     arms = np.array([camera.position for camera in (start, *cameras)]) - center
     first = arms[0] - arms[0] @ axis * axis
     azimuths = np.arctan2(arms[1:] @ np.cross(axis, first), arms[1:] @ first)

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from ..capture.camera import UP, turn_about
 from ..errors import StgaError
 from ..files import read_bytes, read_toml
 from ..schema import from_json, setting
@@ -156,10 +157,6 @@ def _completed(kind: type, values: Any) -> Any:
 
 def turned(lighting: Lighting, center: np.ndarray, degrees: float) -> Lighting:
     """The lighting turned about the upward axis (+y) through center (3,)."""
-    angle = np.radians(degrees)
-    matrix = np.eye(4)
-    matrix[0, [0, 2]] = (np.cos(angle), np.sin(angle))
-    matrix[2, [0, 2]] = (-np.sin(angle), np.cos(angle))
-    matrix[:3, 3] = center - matrix[:3, :3] @ center
+    matrix = turn_about(UP, center, np.radians(degrees))
     lights = tuple(light.transformed(matrix) for light in lighting.lights)
     return replace(lighting, world=rotated(lighting.world, matrix[:3, :3]), lights=lights)
