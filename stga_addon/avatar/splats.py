@@ -88,8 +88,9 @@ def in_world(
     log_scale: np.ndarray,
     opacity: np.ndarray,
     sh: np.ndarray,
+    is_unbound: bool = False,
 ) -> Splats:
-    """World-space splats of a file's numbers, before activation. Infinite opacities and scales of
+    """World-space splats of numbers before activation. Infinite opacities and scales of
     minus infinity, as other programs write 0 and 1, get numbers that show no difference."""
     opacity = np.where(np.isinf(opacity), np.copysign(MAX_LOGIT, opacity), opacity)
     log_scale = np.where(np.isneginf(log_scale), MIN_LOG_SCALE, log_scale)
@@ -100,7 +101,7 @@ def in_world(
         opacity=np.asarray(opacity, np.float32),
         sh=np.asarray(sh, np.float32),
         face=np.zeros(len(xyz), np.int32),
-        unbound=np.zeros(len(xyz), bool),
+        unbound=np.full(len(xyz), is_unbound),
     )
 
 

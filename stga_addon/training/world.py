@@ -8,7 +8,7 @@ import numpy as np
 from scipy.ndimage import binary_dilation, gaussian_filter, zoom
 
 from ..avatar.embedding import face_frames, to_local, to_world
-from ..avatar.splats import SH_C0, Splats, joined
+from ..avatar.splats import SH_C0, Splats, in_world, joined
 from ..capture.camera import Camera
 from ..capture.images import read_view
 from ..capture.model import Capture, View, evenly_spread, views_by_camera
@@ -253,16 +253,9 @@ def first_splats(plates: Sequence[CleanPlate], center: np.ndarray) -> Splats:
             turn = from_matrices(camera.world_to_camera[None, :3, :3].transpose(0, 2, 1))
             sh = np.zeros((count, (SH_DEGREE + 1) ** 2, 3), np.float32)
             sh[:, 0] = (colors[new] - 0.5) / SH_C0
-            splats = Splats(
-                points.astype(np.float32),
-                np.repeat(turn, count, axis=0).astype(np.float32),
-                log_scale.astype(np.float32),
-                np.full(count, START_OPACITY, np.float32),
-                sh,
-                np.zeros(count, np.int32),
-                np.ones(count, bool),
-            )
-            parts.append(splats)
+            rotation = np.repeat(turn, count, axis=0)
+            opacity = np.full(count, START_OPACITY)
+            parts.append(in_world(points, rotation, log_scale, opacity, sh, is_unbound=True))
         found = joined(parts)
         if len(found) <= MAX_FIRST_SPLATS or levels >= 255:
             return found

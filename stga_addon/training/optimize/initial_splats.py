@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 
 from ...avatar.embedding import face_frames, to_local, to_world
 from ...avatar.lattice import lattice_splats, lattice_weights
-from ...avatar.splats import SH_C0, Splats, joined
+from ...avatar.splats import SH_C0, Splats, in_world, joined
 from ...capture.camera import Camera
 from ...capture.images import WHITE_LEVEL, read_image, read_mask, read_view
 from ...capture.mesh_geometry import MIN_DEPTH_M, connected_parts, rasterize, silhouette
@@ -384,14 +384,7 @@ def pixels_of(points: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarra
 def _new_splats(points: np.ndarray, voxel: float, sh_degree: int) -> Splats:
     """Gray unbound spheres of one voxel's size at world points (N, 3)."""
     n = len(points)
-    rotation = np.tile(np.array([1, 0, 0, 0], np.float32), (n, 1))
-    log_scale = np.log(voxel / 2)
-    return Splats(
-        points.astype(np.float32),
-        rotation,
-        np.full((n, 3), log_scale, np.float32),
-        np.zeros(n, np.float32),
-        np.zeros((n, (sh_degree + 1) ** 2, 3), np.float32),
-        np.zeros(n, np.int32),
-        np.ones(n, bool),
-    )
+    rotation = np.eye(1, 4).repeat(n, axis=0)
+    log_scale = np.full((n, 3), np.log(voxel / 2))
+    sh = np.zeros((n, (sh_degree + 1) ** 2, 3))
+    return in_world(points, rotation, log_scale, np.zeros(n), sh, is_unbound=True)
