@@ -1,6 +1,6 @@
 """Triangle meshes: normals, parts, rigid alignment, and which triangle a camera's pixels show."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -28,6 +28,21 @@ def vertex_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     count = len(vertices)
     total = np.stack([np.bincount(flat, np.repeat(n, 3), count) for n in normal.T], axis=-1)
     return unit(total, 1e-20)
+
+
+def facing(camera: Camera, points: np.ndarray, normals: np.ndarray) -> np.ndarray:
+    """Cosine (N,) of the angle between unit normals (N, 3) and the direction to the camera."""
+    towards = camera.position - points
+    return np.asarray((towards * normals).sum(1) / np.linalg.norm(towards, axis=1))
+
+
+def pixels_of(points: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Pixel columns (N,), rows (N,) of world points (N, 3), and (N,) bool: within the image; 0
+    where they are not."""
+    pixels, depth = camera.project(points)
+    x, y = np.floor(pixels).T
+    seen = (depth > MIN_DEPTH_M) & (x >= 0) & (x < camera.width) & (y >= 0) & (y < camera.height)
+    return np.where(seen, x, 0).astype(int), np.where(seen, y, 0).astype(int), seen
 
 
 def connected_parts(vertices: int, faces: np.ndarray) -> np.ndarray:
@@ -189,14 +204,23 @@ def rasterize(vertices: np.ndarray, faces: np.ndarray, camera: Camera) -> ArrayP
 
 def silhouette(vertices: np.ndarray, faces: np.ndarray, camera: Camera) -> np.ndarray:
     """(H, W) bool: the pixels that a mesh covers; faster than `rasterize`."""
+    pixels, depth = camera.project(vertices)
+    drawn = faces[(depth > MIN_DEPTH_M)[faces].all(1)]
+    return painted("1", camera, pixels[drawn], [1] * len(drawn))
+
+
+def painted(
+    mode: str, camera: Camera, pixels: np.ndarray, values: Sequence[int], empty: int = 0
+) -> np.ndarray:
+    """(H, W) in a mode of Pillow: triangles, at pixels (F, 3, 2), drawn whole one over the other,
+    each with its value."""
     from PIL import Image, ImageDraw  # Blender lacks it, and needs `rasterize` alone
 
-    pixels, depth = camera.project(vertices)
-    pixels -= 0.5  # Pillow's pixel centers lie at whole numbers
-    picture = Image.new("1", (camera.width, camera.height))
+    picture = Image.new(mode, (camera.width, camera.height), empty)
     draw = ImageDraw.Draw(picture)
-    for corners in pixels[faces[(depth > MIN_DEPTH_M)[faces].all(1)]].reshape(-1, 6).tolist():
-        draw.polygon(corners, fill=1)
+    corners = (pixels - 0.5).reshape(-1, 6).tolist()  # Pillow's centers lie at whole numbers
+    for polygon, value in zip(corners, values, strict=True):
+        draw.polygon(polygon, fill=value)
     return np.asarray(picture)
 
 

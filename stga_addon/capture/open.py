@@ -27,7 +27,7 @@ from ..flame.sequence import (
 )
 from . import meshes
 from .distortion import distortion
-from .mesh_geometry import without_head_motion
+from .mesh_geometry import pixels_of, without_head_motion
 from .model import Capture, Views, evenly_spread
 from .transforms import (
     DEFAULT_PRINCIPAL_POINT,
@@ -171,12 +171,8 @@ def _principal_point_warning(
             points = mesh(view.timestep)
             shares = []
             for camera in cameras:
-                pixels, depth = camera.project(points)
-                size = np.array([camera.width, camera.height])
-                pixels = np.floor(np.clip(pixels, -1, size)).astype(int)
-                visible = (depth > 0) & (pixels >= 0).all(1) & (pixels < size).all(1)
-                column, row = pixels[visible].T
-                shares.append(1 - float((mask[row, column] > 127).sum()) / len(points))
+                column, row, seen = pixels_of(points, camera)
+                shares.append(1 - float((seen & (mask[row, column] > 127)).mean()))
             outside.append(shares)
     if not outside:
         return None

@@ -7,9 +7,10 @@ import numpy as np
 from ..avatar.file import AvatarLight
 from ..capture.color import srgb_to_linear
 from ..capture.images import read_view
-from ..capture.mesh_geometry import connected_parts, triangle_normals
+from ..capture.mesh_geometry import connected_parts, facing, pixels_of, triangle_normals
 from ..capture.model import Capture, View, ViewExposure, evenly_spread, views_by_timestep
 from ..errors import StgaError
+from ..flame.quaternions import unit
 from ..progress import Progress, Report, ignore
 from .harmonics import COUNT, DARK, LAMBERT, basis, least_squares, uniform
 from .lamps import ShadowMap
@@ -66,20 +67,16 @@ def _view_colors(
         for y, x in ((0, 2), (4, 2), (2, 0), (2, 4), (1, 1), (1, 3), (3, 1), (3, 3)):
             usable &= inside[y : y + height, x : x + width]
     corners = mesh[capture.faces]
-    normal = triangle_normals(corners)
-    to_camera = view.camera.position - corners.mean(1)
-    lengths = np.linalg.norm(normal, axis=1) * np.linalg.norm(to_camera, axis=1)
-    facing = (normal * to_camera).sum(1) > MIN_FACING * lengths
+    middle = corners.mean(1)
+    seen = facing(view.camera, middle, unit(triangle_normals(corners), 1e-20)) > MIN_FACING
     depths = ShadowMap(mesh, capture.faces, Light("point", np.ones(3), view.camera.position))
-    facing &= depths.lit(corners.mean(1), HIDDEN_M, step=0) > 0.5
-    total = np.zeros((len(facing), 3))
-    count = np.zeros((len(facing), 1))
+    seen &= depths.lit(middle, HIDDEN_M, step=0) > 0.5
+    total = np.zeros((len(seen), 3))
+    count = np.zeros((len(seen), 1))
     for weights in POINTS:
-        pixels, _ = view.camera.project(np.einsum("k,fkc->fc", weights, corners))
-        places = np.floor(pixels).astype(np.int64)
-        inside = facing & ((places >= 0) & (places < level.shape[::-1])).all(1)
-        column, row = np.where(inside[:, None], places, 0).T
-        inside &= usable[row, column]
+        points = np.einsum("k,fkc->fc", weights, corners)
+        column, row, inside = pixels_of(points, view.camera)
+        inside &= seen & usable[row, column]
         color = np.clip((image[row, column] - offset) / gain, 0, 255)
         total += np.where(inside[:, None], srgb_to_linear(color / 255), 0)
         count += inside[:, None]

@@ -57,8 +57,7 @@ def shaded_image(
     axes = camera.world_to_camera[:3, :3]
     smooth = (vertex_normals(vertices, faces)[corners] * inside).sum(1) @ axes.T
     normal = unit(smooth * [1, -1, -1])
-    light = KEY_LIGHT / np.linalg.norm(KEY_LIGHT)
-    lit = (1 - AMBIENT) * np.clip(normal @ light, 0, 1)
+    lit = (1 - AMBIENT) * np.clip(normal @ unit(KEY_LIGHT), 0, 1)
     brightness = AMBIENT * (0.75 + 0.25 * normal[:, 1]) + lit
     color = SKIN_RGB if colors is None else (colors[corners] * inside).sum(1)
     image = np.full((camera.height, camera.width, 3), BACKGROUND)

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from ..capture.mesh_geometry import vertex_normals
+from ..capture.mesh_geometry import facing, vertex_normals
 from ..flame.forward import RIGID_SIZE, flame_forward, frame_of
 from ..flame.model import EYEBALL_WEIGHT, JOINTS, FlameModel
 from ..flame.quaternions import unit
@@ -18,7 +18,6 @@ from .head_model import HeadModel
 from .posed_points import PosedPoints, head_rotation, split
 from .seen_surface import (
     VisiblePoints,
-    facing,
     in_sight,
     large_parts,
     rounded_direction,

@@ -7,7 +7,14 @@ from typing import NamedTuple
 import numpy as np
 
 from ..capture.camera import Camera
-from ..capture.mesh_geometry import connected_parts, rasterize, triangle_normals, vertex_normals
+from ..capture.mesh_geometry import (
+    connected_parts,
+    facing,
+    pixels_of,
+    rasterize,
+    triangle_normals,
+    vertex_normals,
+)
 from ..flame.model import FlameModel
 from ..flame.quaternions import unit
 from .fit import HeadFit, Pictures, RecordedTake, posed_mesh
@@ -90,12 +97,6 @@ def gray_view(
     return replace(camera, width=width, height=height, **intrinsics), small
 
 
-def facing(camera: Camera, points: np.ndarray, normals: np.ndarray) -> np.ndarray:
-    """Cosine (N,) of the angle between unit normals (N, 3) and the direction to the camera."""
-    towards = camera.position - points
-    return (towards * normals).sum(1) / np.linalg.norm(towards, axis=1)
-
-
 def in_sight(
     camera: Camera, vertices: np.ndarray, faces: np.ndarray, points: np.ndarray
 ) -> np.ndarray:
@@ -106,12 +107,8 @@ def in_sight(
     closeness = np.zeros(triangle.shape)
     corners = faces[triangle[covered]]
     closeness[covered] = (inside[covered] / small.project(vertices)[1][corners]).sum(1)
-    flat, depth = small.project(points)
-    x, y = np.clip(np.nan_to_num(flat), -1, [small.width, small.height]).astype(np.int64).T
-    within = (flat >= 0).all(1) & (x < small.width) & (y < small.height) & (depth > 0)
-    seen = np.zeros(len(points), bool)
-    seen[within] = closeness[y[within], x[within]] * (depth[within] - OCCLUSION_M) < 1
-    return seen
+    x, y, seen = pixels_of(points, small)
+    return seen & (closeness[y, x] * (small.project(points)[1] - OCCLUSION_M) < 1)
 
 
 def surface_offsets(

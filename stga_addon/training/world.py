@@ -11,11 +11,11 @@ from ..avatar.embedding import face_frames, to_local, to_world
 from ..avatar.splats import SH_C0, Splats, in_world, joined
 from ..capture.camera import Camera
 from ..capture.images import read_view
+from ..capture.mesh_geometry import pixels_of
 from ..capture.model import Capture, View, evenly_spread, views_by_camera
 from ..flame.quaternions import from_matrices, unit
 from ..progress import Progress, Report, counted, ignore
 from .optimize.image_preparation import Correction, exposure_correction
-from .optimize.initial_splats import pixels_of
 from .optimize.state import new_state
 from .optimize.trainer import Start, Trainer
 from .settings import Rates, TrainingSettings

@@ -11,7 +11,7 @@ from numpy.random import default_rng
 from scipy.ndimage import binary_dilation
 
 from stga_addon.capture.camera import look_at
-from stga_addon.capture.mesh_geometry import rasterize
+from stga_addon.capture.mesh_geometry import facing, rasterize
 from stga_addon.flame.forward import flame_forward
 from stga_addon.tracking.correspondence import nearest_points, shaded_image
 from stga_addon.tracking.fit import HeadFit, RecordedTake, fit_head
@@ -20,7 +20,6 @@ from stga_addon.tracking.seen_surface import (
     PosedSurface,
     SurfaceSearch,
     Sweep,
-    facing,
     gray_view,
     in_sight,
     near_landmarks,

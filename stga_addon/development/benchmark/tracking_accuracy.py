@@ -22,7 +22,7 @@ from time import perf_counter
 
 import numpy as np
 
-from ...capture.mesh_geometry import similarity, vertex_normals
+from ...capture.mesh_geometry import facing, similarity, vertex_normals
 from ...capture.open import open_capture
 from ...files import read_npz, write_npz
 from ...flame.teeth import TEETH_VERTICES
@@ -33,7 +33,7 @@ from ...tracking.footage.sequences import FrameRange
 from ...tracking.head_model import read_head_model
 from ...tracking.landmarks import read_places
 from ...tracking.opened import TrackingOptions
-from ...tracking.seen_surface import facing, in_sight
+from ...tracking.seen_surface import in_sight
 from ...tracking.track import track
 
 SHAPES = {"brows": "brow", "lids": "eyeBlink", "lips": "mouth", "jaw": "jaw"}

@@ -4,15 +4,15 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from PIL import Image, ImageDraw
 from scipy.ndimage import binary_dilation, binary_erosion, map_coordinates, uniform_filter
 
 from ...avatar.embedding import face_frames
 from ...avatar.offsets import SIGNALS
 from ...avatar.strain import strain_basis, trained_range
-from ...capture.camera import Camera
 from ...capture.images import WHITE_LEVEL, read_view
+from ...capture.mesh_geometry import MIN_DEPTH_M, facing, painted, triangle_normals
 from ...capture.model import Capture, View, evenly_spread
+from ...flame.quaternions import unit
 
 MAX_VIEWS = 48
 MAX_TIMESTEPS = 12
@@ -20,7 +20,6 @@ MAX_FACES = 3000
 """More of each would change no decision, and take long; of more cameras, each gives one view."""
 SAMPLED_HEIGHT_PIXELS = 400
 """Images half as high again are shrunk to this: triangles are then two or three pixels wide."""
-MIN_NEAR_DEPTH_M = 0.01
 MIN_FACING_COSINE = 0.35
 """Between normal and line of sight; below it, a triangle is too oblique to have a color."""
 MASK_EDGE_PIXELS = 3
@@ -126,10 +125,13 @@ def _sample_view(capture: Capture, view: View, faces: np.ndarray) -> dict[str, n
     mesh = capture.mesh(view.timestep)
     corners, depth = camera.project(mesh)
     depths = depth[capture.faces].mean(1)
-    towards = _facing(mesh, capture.faces, camera)
-    drawn = (towards > 0) & (depth[capture.faces] > MIN_NEAR_DEPTH_M).all(1)
+    places = mesh[capture.faces]
+    towards = facing(camera, places.mean(1), unit(triangle_normals(places), 1e-20))
+    drawn = (towards > 0) & (depth[capture.faces] > MIN_DEPTH_M).all(1)
     far_first = np.flatnonzero(drawn)[np.argsort(-depths[drawn], kind="stable")]
-    nearest = _nearest(corners[capture.faces], far_first, camera)
+    # by the painter's algorithm
+    shown = corners[capture.faces[far_first]]
+    nearest = painted("I", camera, shown, far_first.tolist(), empty=-1)
     triangles = corners[capture.faces[faces]]
     center = triangles.mean(1)
     x, y = np.round(center - 0.5).astype(int).T
@@ -180,26 +182,6 @@ def _coverage(
         row["background"] = clear.mean(0)
         spread = np.sqrt(((clear - row["background"]) ** 2).mean())
     return {**row, "background_spread": np.array(spread)}
-
-
-def _facing(mesh: np.ndarray, triangles: np.ndarray, camera: Camera) -> np.ndarray:
-    """(F,) cosine between each triangle's normal and its direction to the camera."""
-    (p0, p1, p2) = mesh[triangles].swapaxes(0, 1)
-    normal = np.cross(p1 - p0, p2 - p0)
-    to_camera = camera.position - (p0 + p1 + p2) / 3
-    lengths = np.linalg.norm(normal, axis=1) * np.linalg.norm(to_camera, axis=1)
-    return np.einsum("fi,fi->f", normal, to_camera) / np.maximum(lengths, 1e-30)
-
-
-def _nearest(corners: np.ndarray, far_first: np.ndarray, camera: Camera) -> np.ndarray:
-    """(H, W) the nearest triangle in each pixel, -1 for none, by the painter's algorithm: triangles
-    of corners (F, 3, 2) are drawn whole, from far to near."""
-    picture = Image.new("I", (camera.width, camera.height), -1)
-    polygons = (corners[far_first].reshape(-1, 6) - 0.5).tolist()
-    draw = ImageDraw.Draw(picture)
-    for face, polygon in zip(far_first.tolist(), polygons, strict=True):
-        draw.polygon(polygon, fill=face)
-    return np.asarray(picture)
 
 
 def _areas(foreground: np.ndarray, covered: np.ndarray, near: np.ndarray) -> dict[str, np.ndarray]:

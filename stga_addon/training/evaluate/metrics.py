@@ -11,7 +11,6 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-from PIL import Image, ImageDraw
 from scipy.ndimage import binary_erosion, prewitt, uniform_filter
 
 from ...avatar.embedding import NO_COLUMNS
@@ -19,7 +18,7 @@ from ...avatar.file import Avatar
 from ...avatar.splats import SH_C0, Splats
 from ...capture.images import read_image, read_mask, read_view
 from ...capture.loader import Preparation
-from ...capture.mesh_geometry import MIN_DEPTH_M
+from ...capture.mesh_geometry import MIN_DEPTH_M, painted
 from ...capture.model import Capture, View, ViewExposure, evenly_spread
 from ...raster.cpu.layout import Parameters
 from ...raster.cpu.rasterize import BufferPool, frames_in_camera, render_backward, render_forward
@@ -107,15 +106,11 @@ def read_evaluation_view(
 def visible_pixels(capture: Capture, view: View, faces: np.ndarray) -> np.ndarray:
     """(H, W) bool: pixels at which the nearest triangle is one of `faces` (F,) bool."""
     corners, depth = view.camera.project(np.asarray(capture.mesh(view.timestep)))
-    picture = Image.new("1", (view.camera.width, view.camera.height))
     rows = np.flatnonzero((depth > MIN_DEPTH_M)[capture.faces].all(1))
-    # painter's algorithm: far to near; Pillow's pixel centers lie at whole numbers
+    # painter's algorithm: far to near
     rows = rows[np.argsort(-depth[capture.faces[rows]].mean(1), kind="stable")]
-    draw = ImageDraw.Draw(picture)
-    polygons = (corners[capture.faces[rows]].reshape(-1, 6) - 0.5).tolist()
-    for polygon, is_chosen in zip(polygons, faces[rows].tolist(), strict=True):
-        draw.polygon(polygon, fill=int(is_chosen))
-    return np.asarray(picture)
+    shown = corners[capture.faces[rows]]
+    return painted("1", view.camera, shown, faces[rows].astype(int).tolist())
 
 
 def known_exposure(rows: Sequence[Sequence[float]], training_views: Iterable[View]) -> ViewExposure:

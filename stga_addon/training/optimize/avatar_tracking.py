@@ -22,7 +22,7 @@ from ...avatar.file import Avatar
 from ...capture.camera import Camera
 from ...capture.images import read_view
 from ...capture.loader import Preparation
-from ...capture.mesh_geometry import ArrayPair, rasterize, silhouette, vertex_normals
+from ...capture.mesh_geometry import ArrayPair, facing, rasterize, silhouette, vertex_normals
 from ...capture.model import Capture, View, evenly_spread, views_by_timestep
 from ...capture.open import with_sequence
 from ...errors import StgaError
@@ -37,6 +37,7 @@ from ...flame.forward import (
     parameters_gradient,
 )
 from ...flame.model import JOINTS, FlameModel
+from ...flame.quaternions import unit
 from ...flame.sequence import SHIFT_SIZE, sequence_mesh, torso_offset, torso_shapes, with_identity
 from ...light.harmonics import basis
 from ...progress import Cancelled
@@ -45,7 +46,7 @@ from ...tracking import appearance, solve
 from ...tracking.appearance import NOISE_LEVELS, POINT_SHARE
 from ...tracking.head_model import HeadModel
 from ...tracking.posed_points import PosedPoints
-from ...tracking.seen_surface import facing, in_sight, surface_points
+from ...tracking.seen_surface import in_sight, surface_points
 from ..schedule import sh_degree
 from ..settings import TrainingSettings
 from .backend import RenderOptions
@@ -272,7 +273,7 @@ def normal_images(mesh: np.ndarray, faces: np.ndarray, shown: ArrayPair) -> Arra
     found = np.zeros((*triangles.shape, 3))
     corners = vertex_normals(mesh, faces)[faces[triangles[seen]]]
     own = np.einsum("nk,nkc->nc", share[seen], corners)
-    found[seen] = own / np.maximum(np.linalg.norm(own, axis=1, keepdims=True), 1e-9)
+    found[seen] = unit(own)
     return seen, found
 
 
@@ -497,8 +498,7 @@ class _Tracker:
         mesh = self._mesh(shots[0][0].timestep)
         faces = self._capture.faces
         at = self._points.on(mesh, faces)
-        normals = self._points.on(vertex_normals(mesh, faces), faces)
-        normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-9)
+        normals = unit(self._points.on(vertex_normals(mesh, faces), faces))
         curvature = np.zeros((len(at), 3, 3))
         for view, image in shots:
             camera = view.camera

@@ -13,8 +13,15 @@ from ...avatar.lattice import lattice_splats, lattice_weights
 from ...avatar.splats import SH_C0, Splats, in_world, joined
 from ...capture.camera import Camera
 from ...capture.images import WHITE_LEVEL, read_image, read_mask, read_view
-from ...capture.mesh_geometry import MIN_DEPTH_M, connected_parts, rasterize, silhouette
-from ...capture.model import Capture, View, evenly_spread
+from ...capture.mesh_geometry import (
+    MIN_DEPTH_M,
+    connected_parts,
+    pixels_of,
+    rasterize,
+    silhouette,
+    triangle_normals,
+)
+from ...capture.model import Capture, View, evenly_spread, views_by_timestep
 from ...flame.model import faces_within, torso_faces
 from ...flame.parts import PARTS
 from ...flame.sequence import below_neck
@@ -114,9 +121,7 @@ def triangle_colors(capture: Capture, views: Sequence[View]) -> np.ndarray:
     Where all connected ones are hidden too, as a back tooth, it is the nearest of those that only
     later timesteps show or, without any, of all. Gray if no view shows any.
     """
-    by_timestep: dict[int, list[View]] = {}
-    for view in views:
-        by_timestep.setdefault(view.timestep, []).append(view)
+    by_timestep = views_by_timestep(views)
     color, pixels = mean_colors(capture, by_timestep.pop(views[0].timestep))
     shown = pixels > 0
     later: list[View] = []  # a few, of timesteps that are evenly spread, by other cameras in each
@@ -130,8 +135,7 @@ def triangle_colors(capture: Capture, views: Sequence[View]) -> np.ndarray:
     if not shown.any():
         return np.full(color.shape, MIDDLE_GRAY)
     hidden, mirrored = mirror_images(capture, ~shown, shown)
-    a, b, c = capture.neutral[capture.faces].swapaxes(0, 1)
-    area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
+    area = np.linalg.norm(triangle_normals(capture.neutral[capture.faces]), axis=1)
     if area[hidden].sum() >= MIN_ONE_SIDED_SHARE * area.sum():
         color[hidden] = color[mirrored]
         shown[hidden] = True
@@ -371,14 +375,6 @@ def _foreground(view: View) -> np.ndarray:
     if mask is not None:
         return np.asarray(mask > 127)
     return np.asarray((read_image(view) < WHITE_LEVEL).any(axis=2))
-
-
-def pixels_of(points: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Pixel columns (N,), rows (N,) of world points (N, 3), and (N,) bool: within the image."""
-    pixels, depth = camera.project(points)
-    x, y = np.floor(pixels).T
-    seen = (depth > MIN_DEPTH_M) & (x >= 0) & (x < camera.width) & (y >= 0) & (y < camera.height)
-    return np.where(seen, x, 0).astype(int), np.where(seen, y, 0).astype(int), seen
 
 
 def _new_splats(points: np.ndarray, voxel: float, sh_degree: int) -> Splats:
