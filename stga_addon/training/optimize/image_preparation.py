@@ -9,6 +9,7 @@ import numpy as np
 from ...capture.loader import Preparation
 from ...capture.mesh_geometry import silhouette
 from ...capture.model import Capture, View, ViewExposure
+from ...tracking.appearance import box_of
 from ..settings import TrainingSettings
 
 Correction = Callable[[View, np.ndarray, np.ndarray | None], np.ndarray]
@@ -81,8 +82,7 @@ def over_color(image: np.ndarray, mask: np.ndarray, color: Sequence[float]) -> n
         import cv2
 
         margin = round(3 * BLUR_SHARES[1] * len(image))
-        spans = [np.flatnonzero(edge.any(axis=axis)) for axis in (1, 0)]
-        box = tuple(slice(max(0, int(s[0]) - margin), int(s[-1]) + margin + 1) for s in spans)
+        box = box_of(edge, margin)
         part = image[box].astype(np.float32)
         share = cover[box]
         clear = mask[box] == 0
