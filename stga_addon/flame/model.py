@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from ..errors import StgaError
-from ..files import npz_outlines, read_npz
+from ..files import converted, npz_outlines, read_npz
 from .unpickle import read_pickled_arrays
 
 Arrays = Mapping[str, np.ndarray]
@@ -78,18 +78,18 @@ def read_flame(path: Path) -> FlameModel:
     finite, and any class in a pickle that is not an array.
     """
     arrays = _model_arrays(path)
-    template = _floats(path, arrays, "v_template", (None, 3))
+    template = finite(path, arrays, "v_template", (None, 3))
     vertices = len(template)
-    shapedirs = _floats(path, arrays, "shapedirs", (vertices, 3, None))
+    shapedirs = finite(path, arrays, "shapedirs", (vertices, 3, None))
     n_identity = _identity_count(path, arrays, shapedirs.shape[2])
     return FlameModel(
         v_template=template,
         shapedirs=shapedirs,
         n_identity=n_identity,
-        posedirs=_floats(path, arrays, "posedirs", (vertices, 3, POSE_FEATURES)),
-        j_regressor=_floats(path, arrays, "J_regressor", (len(JOINTS), vertices)),
+        posedirs=finite(path, arrays, "posedirs", (vertices, 3, POSE_FEATURES)),
+        j_regressor=finite(path, arrays, "J_regressor", (len(JOINTS), vertices)),
         parents=_parents(path, arrays),
-        weights=_floats(path, arrays, "weights", (vertices, len(JOINTS))),
+        weights=finite(path, arrays, "weights", (vertices, len(JOINTS))),
         faces=_faces(path, arrays, vertices),
         expression_names=_expression_names(path, arrays, shapedirs.shape[2] - n_identity),
         masks=_masks(path, arrays, vertices),
@@ -103,7 +103,7 @@ def _model_arrays(path: Path) -> Arrays:
         stored = npz_outlines(path)
         arrays = read_npz(path, [n for n in stored if n in own or n.startswith(MASK_PREFIX)])
         if "shape_steps" in arrays and "v_template" in arrays:
-            steps = _floats(path, arrays, "shape_steps", (None, len(arrays["v_template"]), 3))
+            steps = finite(path, arrays, "shape_steps", (None, len(arrays["v_template"]), 3))
             arrays["shapedirs"] = np.moveaxis(SHAPE_STEP_M * steps, 0, -1)
         if "v_template" in arrays:
             arrays.setdefault("posedirs", np.zeros((len(arrays["v_template"]), 3, POSE_FEATURES)))
@@ -112,6 +112,8 @@ def _model_arrays(path: Path) -> Arrays:
     for key in MODEL_KEYS:
         if key not in arrays:
             raise StgaError(f"{path}: has no {key}, which a FLAME model needs")
+        if not arrays[key].size:
+            raise StgaError(f"{path}: {key} is empty")
     return arrays
 
 
@@ -157,22 +159,37 @@ def _expression_names(path: Path, arrays: Arrays, count: int) -> tuple[str, ...]
 
 
 def _check_shape(path: Path, key: str, array: np.ndarray, expected: Shape) -> None:
-    found = array.shape
-    sizes = zip(found, expected, strict=False)
-    fits = len(found) == len(expected) and all(want in (None, size) for size, want in sizes)
-    if not fits or 0 in found:
+    sizes = zip(expected, array.shape, strict=False)
+    if array.ndim != len(expected) or any(want not in (None, size) for want, size in sizes):
         wanted = ", ".join("any" if size is None else str(size) for size in expected)
         raise StgaError(f"{path}: {key} has shape {array.shape}, expected ({wanted})")
 
 
-def _floats(path: Path, arrays: Arrays, key: str, expected: Shape) -> np.ndarray:
+def floats(
+    path: Path,
+    arrays: Arrays,
+    key: str,
+    expected: Shape,
+    kinds: str = "iuf",
+    numbers: str = "numbers",
+) -> np.ndarray:
+    """An array of a file as float64, finite or not. Raises StgaError where it is missing, has not
+    the expected shape, or is of no dtype of these kinds, which are `numbers`."""
+    if key not in arrays:
+        raise StgaError(f"{path}: has no {key}")
     array = arrays[key]
     _check_shape(path, key, array, expected)
-    if array.dtype.kind not in "iuf":
-        raise StgaError(f"{path}: {key} holds {array.dtype}, expected numbers")
-    if not np.isfinite(array).all():
+    if array.dtype.kind not in kinds:
+        raise StgaError(f"{path}: {key} holds {array.dtype}, expected {numbers}")
+    return np.ascontiguousarray(converted(array, np.float64))
+
+
+def finite(path: Path, arrays: Arrays, key: str, expected: Shape) -> np.ndarray:
+    """`floats` that are finite. Raises StgaError where one is not."""
+    values = floats(path, arrays, key, expected)
+    if not np.isfinite(values).all():
         raise StgaError(f"{path}: {key} holds values that are not finite")
-    return np.ascontiguousarray(array, np.float64)
+    return values
 
 
 def _integers(path: Path, key: str, array: np.ndarray) -> np.ndarray:

@@ -1,7 +1,7 @@
 """Head models that can be tracked: FLAME, any linear model in an npz, or a GLB with morph
 targets."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -9,8 +9,8 @@ import numpy as np
 
 from ..capture.camera import MAX_COORDINATE_M
 from ..errors import StgaError
-from ..files import converted, read_npz, write_npz
-from ..flame.model import JOINTS, POSE_FEATURES, FlameModel
+from ..files import read_npz, write_npz
+from ..flame.model import JOINTS, POSE_FEATURES, FlameModel, finite
 from ..flame.parts import flame_model
 from .glb import read_glb
 
@@ -97,10 +97,10 @@ def linear_model(path: Path, arrays: dict[str, np.ndarray]) -> FlameModel:
     for key in LINEAR_KEYS:
         if key not in arrays:
             raise StgaError(f"{path}: has no {key}, which a linear head model needs")
-    mean = _finite(path, arrays, "mean", (None, 3))
+    mean = finite(path, arrays, "mean", (None, 3))
     count = len(mean)
     none = dict.fromkeys(("identity", "expression"), np.zeros((count, 3, 0)))
-    bases = [_finite(path, {**none, **arrays}, key, (count, 3, None)) for key in none]
+    bases = [finite(path, {**none, **arrays}, key, (count, 3, None)) for key in none]
     if not sum(base.shape[2] for base in bases):
         raise StgaError(
             f"{path}: has neither identity nor expression, components that a head is fitted with"
@@ -118,8 +118,8 @@ def linear_model(path: Path, arrays: dict[str, np.ndarray]) -> FlameModel:
     weights = np.eye(len(JOINTS))[np.zeros(count, int)]
     regressor = np.full((len(JOINTS), count), 1 / count)
     if given:
-        regressor = _finite(path, arrays, "J_regressor", (len(JOINTS), count))
-        weights = _finite(path, arrays, "weights", (count, len(JOINTS)))
+        regressor = finite(path, arrays, "J_regressor", (len(JOINTS), count))
+        weights = finite(path, arrays, "weights", (count, len(JOINTS)))
     return FlameModel(
         v_template=mean,
         shapedirs=np.concatenate(bases, axis=2),
@@ -160,34 +160,3 @@ def checked(path: Path, head: HeadModel) -> HeadModel:
             f"{MAX_EXTENT_M} meters"
         )
     return head
-
-
-def floats(
-    path: Path,
-    arrays: Mapping[str, np.ndarray],
-    key: str,
-    expected: tuple[int | None, ...],
-    kinds: str = "iuf",
-    numbers: str = "numbers",
-) -> np.ndarray:
-    """An array of a file as float64, finite or not. Raises StgaError where it is missing, has not
-    the expected shape (None: any size), or is of no dtype of these kinds, which are `numbers`."""
-    if key not in arrays:
-        raise StgaError(f"{path}: has no {key}")
-    array = arrays[key]
-    sizes = zip(expected, arrays[key].shape, strict=False)
-    if array.ndim != len(expected) or any(want not in (None, size) for want, size in sizes):
-        wanted = ", ".join("any" if size is None else str(size) for size in expected)
-        raise StgaError(f"{path}: {key} has shape {array.shape}, expected ({wanted})")
-    if array.dtype.kind not in kinds:
-        raise StgaError(f"{path}: {key} holds {array.dtype}, expected {numbers}")
-    return np.ascontiguousarray(converted(array, np.float64))
-
-
-def _finite(
-    path: Path, arrays: Mapping[str, np.ndarray], key: str, expected: tuple[int | None, ...]
-) -> np.ndarray:
-    values = floats(path, arrays, key, expected)
-    if not np.isfinite(values).all():
-        raise StgaError(f"{path}: {key} holds values that are not finite")
-    return values

@@ -10,12 +10,12 @@ import numpy as np
 from ..capture.model import parts_of
 from ..errors import StgaError
 from ..files import read_npz, write_npz
+from ..flame.model import floats
 from ..worker.helpers import MAX_HELPERS, Step
 from .face_networks import FaceNetworks
 from .fit import MIN_LANDMARKS
 from .folder import PLACES_FILE
 from .footage.model import Footage, FootageCamera
-from .head_model import floats
 from .posed_points import SurfacePoints
 from .stages import Crew, Stage
 
