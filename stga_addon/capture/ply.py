@@ -2,8 +2,9 @@
 
 import re
 import struct
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
+from itertools import repeat
 from pathlib import Path
 
 import numpy as np
@@ -31,9 +32,9 @@ _TYPES = {
     "float32": "f4",
     "float64": "f8",
 }
-_CODES = {"i1": "b", "u1": "B", "i2": "h", "u2": "H", "i4": "i", "u4": "I", "f4": "f", "f8": "d"}
-"""Type of numpy -> that of `struct`."""
 _BYTE_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": "="}
+Take = Callable[[str, int], Sequence[float]]
+"""Type of numpy, count -> so many numbers of a row, behind those that were taken before."""
 
 
 @dataclass(frozen=True)
@@ -152,40 +153,23 @@ def _require(path: Path, element: Element, most: int) -> None:
 
 def _binary_rows(element: Element, order: str, data: bytes, position: int) -> tuple[Rows, int]:
     """The rows that begin at a position, and where they end. Raises ValueError, struct.error."""
-    if not element.lists:
-        dtype = np.dtype(list(element.scalars.items()))
-        end = position + element.count * dtype.itemsize
-        if not dtype.itemsize:
-            return Rows(np.zeros(element.count, dtype)), end
-        return Rows(np.frombuffer(data, dtype, element.count, position)), end
     even = _even_rows(element, data, position)
     if even is not None:
         return even
-    readers = []
-    for name in element.order:
-        kinds = element.lists.get(name, (element.scalars.get(name, ""),))
-        readers.append([(struct.Struct(order + _CODES[kind[1:]]), kind[1:]) for kind in kinds])
-    values = [list[float]() for _ in readers]
-    lengths = [list[int]() for _ in readers]
-    for _ in range(element.count):
-        for column, (first, *more) in enumerate(readers):
-            (number,) = first[0].unpack_from(data, position)
-            position += first[0].size
-            if not more:
-                values[column].append(number)
-                continue
-            length = int(number)
-            kind = more[0][1]
-            if length < 0:
-                raise ValueError("a list of negative length")
-            values[column] += struct.unpack_from(f"{order}{length}{_CODES[kind]}", data, position)
-            position += length * more[0][0].size
-            lengths[column].append(length)
-    return _as_rows(element, values, lengths), position
+
+    def take(kind: str, count: int) -> Sequence[float]:
+        nonlocal position
+        layout = f"{order}{count}{np.dtype(kind).char}"
+        start = position
+        position += struct.calcsize(layout)
+        return struct.unpack_from(layout, data, start)
+
+    return _uneven_rows(element, repeat(take, element.count)), position
 
 
 def _even_rows(element: Element, data: bytes, position: int) -> tuple[Rows, int] | None:
-    """The rows where all lists are as long as those of the first row; None where they are not."""
+    """The rows where all lists, if any, are as long as those of the first row; None where they are
+    not."""
     dtype = list[tuple[str, str, int]]()
     row = position
     for name in element.order:
@@ -201,7 +185,7 @@ def _even_rows(element: Element, data: bytes, position: int) -> tuple[Rows, int]
         row += np.dtype(length).itemsize + int(start[0]) * np.dtype(kind).itemsize
     whole = np.dtype([(n, k) if size == 1 else (n, k, (size,)) for n, k, size in dtype])
     end = position + element.count * whole.itemsize
-    if end > len(data):
+    if end > len(data) or not whole.itemsize:
         return None
     table = np.frombuffer(data, whole, element.count, position)
     lists = {}
@@ -220,26 +204,43 @@ def _ascii_rows(element: Element, lines: Sequence[bytes]) -> Rows:
         if table.shape[1] != len(element.scalars):
             raise ValueError(f"has {table.shape[1]} numbers a row, expected {len(element.scalars)}")
         return _as_rows(element, list(table.T), [[]] * len(element.order))
+
+    def rows() -> Iterator[Take]:
+        words: list[bytes] = []
+        place = 0
+
+        def take(kind: str, count: int) -> Sequence[float]:
+            nonlocal place
+            start = place
+            place += count
+            return [float(word) for word in words[start:place]]
+
+        for line in lines:
+            words, place = line.split(), 0
+            yield take
+            if place != len(words):
+                raise ValueError(
+                    f"a row of {shorten(element.name)} has {len(words)} numbers, expected {place}"
+                )
+
+    return _uneven_rows(element, rows())
+
+
+def _uneven_rows(element: Element, rows: Iterable[Take]) -> Rows:
+    """The rows whose lists are of any length. Raises ValueError, and what taking them raises."""
     values = [list[float]() for _ in element.order]
     lengths = [list[int]() for _ in element.order]
-    for line in lines:
-        words = line.split()
-        place = 0
+    for take in rows:
         for column, name in enumerate(element.order):
             if name in element.scalars:
-                values[column] += map(float, words[place : place + 1])
-                place += 1
+                values[column] += take(element.scalars[name], 1)
                 continue
-            length = int(words[place]) if place < len(words) else 0
+            kinds = element.lists[name]
+            length = int(sum(take(kinds[0], 1)))
             if length < 0:
                 raise ValueError("a list of negative length")
-            values[column] += map(float, words[place + 1 : place + 1 + length])
+            values[column] += take(kinds[1], length)
             lengths[column].append(length)
-            place += 1 + length
-        if place != len(words):
-            raise ValueError(
-                f"a row of {shorten(element.name)} has {len(words)} numbers, expected {place}"
-            )
     return _as_rows(element, values, lengths)
 
 
