@@ -227,8 +227,8 @@ FORECAST = {"seconds": 1.0, "psnr": 30.0, "error": 0.1, "ahead": 5.0, "gain": 0.
         (line(10, psnr="high"), "psnr is 'high'"),
         (line(10, loss=10**400), "loss is 1000"),
         (line(10, psnr=30.0), "psnr has no ssim"),
-        (line(10, forecast=5), "forecast is 5"),
-        (line(10, psnr=3.0, ssim=1.0, forecast={**FORECAST, "gain": None}), "forecast is"),
+        (line(10, forecast=5), "forecast: fields"),
+        (line(10, psnr=3.0, ssim=1.0, forecast={**FORECAST, "gain": None}), "forecast: setting"),
         (line(10, forecast=FORECAST), "forecast has no psnr"),
     ],
 )

@@ -8,14 +8,14 @@ from typing import Any
 
 from ...errors import StgaError, shorten
 from ...files import file_size, naming, replacing
+from ...schema import from_json
+from ..evaluate.forecast import Forecast
 
 METRICS = "metrics.jsonl"
 REQUIRED = ("iteration", "seconds", "splats", "evaluation_s", "wall_s")
 """Fields of every line."""
 TRACKING_GAIN = "tracking_gain_db"
 """Field of PSNR that views left out of tracking by the avatar gained by it; NaN where none was."""
-FORECAST = ("seconds", "psnr", "error", "ahead", "gain")
-"""Fields of a line's forecast, where it has one."""
 
 
 def read_metrics(folder: Path) -> list[dict[str, Any]]:
@@ -71,12 +71,10 @@ def _fault(line: Any) -> str | None:
         return "psnr has no ssim beside it"
     if "forecast" not in line:
         return None
-    found = line["forecast"]
-    numbers: list[Any] = [None]
-    if isinstance(found, dict):
-        numbers = [found.get(name) for name in FORECAST]
-    if not all(_is_number(each) and math.isfinite(each) for each in numbers):
-        return f"forecast is {shorten(found)}, expected numbers named {', '.join(FORECAST)}"
+    try:
+        from_json(Forecast, line["forecast"], "forecast")
+    except StgaError as error:
+        return str(error)
     if "psnr" not in line or not math.isfinite(line["psnr"]):
         return "forecast has no psnr beside it"
     return None
