@@ -83,21 +83,6 @@ class Video:
         )
 
 
-@dataclass(frozen=True)
-class Beginning:
-    """The first frames of a video.
-
-    times     when they are shown, in the order shown
-    others    as of `Video`
-    """
-
-    times: tuple[int | None, ...]
-    size: tuple[int, int]
-    stored: tuple[int, int]
-    aspect: Fraction
-    warnings: tuple[str, ...]
-
-
 def read_video(path: Path) -> Video:
     """Index a video. Raises StgaError where it cannot be read, or without PyAV. Where the container
     says when packets are shown, only the first frames are decoded; otherwise, all are."""
@@ -115,11 +100,10 @@ def read_video(path: Path) -> Video:
         seekable = _ascending(times) and exact
         rates = [float(rate) for rate in (stream.average_rate, stream.guessed_rate) if rate]
         time_base = float(stream.time_base)
-    looks = begin.size, begin.stored, begin.aspect
     if not seekable:
         numbers = tuple(range(len(times)))
         fps = next(iter(rates), 0.0)
-        return Video(path, numbers, numbers, fps, *looks, False, begin.warnings)
+        return replace(begin, times=numbers, timesteps=numbers, fps=fps, seekable=False)
     shown = tuple(times[left_out:])
     timesteps, fps, warnings = _timed(path, shown, time_base, rates)
     warnings = (*begin.warnings, *warnings)
@@ -128,7 +112,7 @@ def read_video(path: Path) -> Video:
         warnings += (f"{path}: its first {left_out} frames {fate}",)
     if is_cut_off:
         warnings += (f"{path}: is cut off; it ends after {len(shown)} frames",)
-    return Video(path, shown, timesteps, fps, *looks, warnings=warnings)
+    return replace(begin, times=shown, timesteps=timesteps, fps=fps, warnings=warnings)
 
 
 class VideoFrames:
@@ -254,8 +238,9 @@ class VideoFrames:
             self._container.streams.video[0].thread_type = "AUTO"
 
 
-def first_frames(path: Path) -> Beginning:
-    """Look at the beginning. Raises StgaError as `read_video` does."""
+def first_frames(path: Path) -> Video:
+    """Look at the beginning: `times` are those of the first frames, None where one has none, in the
+    order shown; without `timesteps` and `fps`. Raises StgaError as `read_video` does."""
     with opened_video(path) as container:
         aspect = container.streams.video[0].sample_aspect_ratio
         aspect = Fraction(aspect) if aspect and aspect > 0 else Fraction(1)
@@ -271,7 +256,8 @@ def first_frames(path: Path) -> Beginning:
     for width, height in (stored, size):
         if not is_image_size(width, height):
             raise StgaError(f"{path}: has {width} x {height} pixels, more than are read")
-    return Beginning(times, size, stored, aspect, tuple(f"{path}: {text}" for text in problems))
+    warnings = tuple(f"{path}: {text}" for text in problems)
+    return Video(path, times, (), 0.0, size, stored, aspect, warnings=warnings)
 
 
 def _shown_size(frame: Any, aspect: Fraction) -> tuple[int, int]:
