@@ -7,7 +7,7 @@ Work is recorded as commands, which are submitted at once; nothing waits for the
 import logging
 import re
 import weakref
-from collections.abc import Hashable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache
@@ -211,7 +211,7 @@ class Device:
                 if compute is not None:
                     compute.end()
                     compute = None
-                command.encode(encoder)
+                command(encoder)
             if compute is not None:
                 compute.end()
             self.gpu.queue.submit([encoder.finish()])
@@ -267,29 +267,8 @@ class _Dispatch(NamedTuple):
             lib.wgpuComputePassEncoderDispatchWorkgroups(compute, *self.groups)
 
 
-class _Copy(NamedTuple):
-    """The first words of a buffer to another, from its word `to` on."""
-
-    source: Any
-    target: Any
-    words: int
-    to: int
-
-    def encode(self, encoder: Any) -> None:
-        encoder.copy_buffer_to_buffer(self.source, 0, self.target, 4 * self.to, 4 * self.words)
-
-
-class _Clear(NamedTuple):
-    """Zeros for the first words of a buffer, or for all of it."""
-
-    buffer: Any
-    words: int | None
-
-    def encode(self, encoder: Any) -> None:
-        encoder.clear_buffer(self.buffer, 0, None if self.words is None else 4 * self.words)
-
-
-_Command = _Dispatch | _Copy | _Clear
+_Command = _Dispatch | Callable[[Any], None]
+"""Or what an encoder is told between dispatches."""
 
 
 class Recording:
@@ -321,11 +300,13 @@ class Recording:
 
     def copy(self, source: Any, target: Any, words: int, to: int = 0) -> None:
         """Copy the first words of a buffer to another, from its word `to` on."""
-        self.commands.append(_Copy(source, target, words, to))
+        part = 0, target, 4 * to, 4 * words
+        self.commands.append(lambda encoder: encoder.copy_buffer_to_buffer(source, *part))
 
     def clear(self, buffer: Any, words: int | None = None) -> None:
         """Fill the beginning of a buffer, or all of it, with zeros."""
-        self.commands.append(_Clear(buffer, words))
+        size = None if words is None else 4 * words
+        self.commands.append(lambda encoder: encoder.clear_buffer(buffer, 0, size))
 
     def __enter__(self) -> "Recording":
         return self

@@ -17,28 +17,6 @@ SIGNALS = "smoothed_strain", "normal"
 """Of `avatar.offsets.SIGNALS`, those that are computed on the device."""
 
 
-class SmoothedStrain:
-    """Computes the signal of one mesh, whose neighborhood is uploaded once."""
-
-    def __init__(self, device: Device, basis: StrainBasis) -> None:
-        self._count = len(basis.faces)
-        self._neighbors = device.upload("neighbors", list_words(basis.neighbors))
-        self._rounds = [
-            device.buffer(f"smoothed strain {n}", self._count * STRAIN_COMPONENTS) for n in range(2)
-        ]
-
-    def record(self, work: Recording, strain_from_rest: Any) -> Any:
-        """Record the signal of the uploaded pose, whose strain (F, 3), less that at rest, is given;
-        returns its table (F, 3)."""
-        averaged = strain_from_rest
-        for n in range(AVERAGING_ROUNDS):
-            smoothed = averaged
-            averaged = self._rounds[n % 2]
-            tables = {"neighbors": self._neighbors, "smoothed": smoothed, "averaged": averaged}
-            work.dispatch("frames.smooth_strain", self._count, tables)
-        return averaged
-
-
 class Embedding:
     """A mesh's topology and neutral form on the device, uploaded once.
 
@@ -58,7 +36,7 @@ class Embedding:
         if convention not in embedding.CONVENTIONS:
             known = embedding.CONVENTIONS
             raise ValueError(f"embedding convention {convention!r} is not one of {known}")
-        self._smoothed = None if basis is None else SmoothedStrain(device, basis)
+        self._follows = basis is not None
         self._device = device
         self._count = len(faces)
         self._area_scales = convention == "stga"
@@ -72,6 +50,7 @@ class Embedding:
             flat = [part.reshape(len(faces), -1) for part in parts]
             rows = np.concatenate(flat, axis=1, dtype=np.float32)
             touching = list_words(basis.vertex_faces)
+            device.upload("neighbors", list_words(basis.neighbors))
         self._tables = {
             "faces": device.upload("faces", faces.astype(np.uint32)),
             "neutral_area": device.upload("neutral_area", area.astype(np.float32)),
@@ -105,7 +84,7 @@ class Embedding:
             "Pose",
             rows=np.c_[turn, turn @ center + shift],
             triangles=self._count,
-            follows=self._smoothed is not None,
+            follows=self._follows,
             area_scales=self._area_scales,
         )
 
@@ -118,10 +97,16 @@ class Embedding:
         tables = self._tables
         frames = tables["frames"] = self._device.buffer("frames", self._count * FRAME_STRIDE)
         work.dispatch("frames.compose", self._count, tables)
-        if self._smoothed is not None:
+        if self._follows:
             work.dispatch("frames.average_strain", self._count, tables)
             strain = tables["strain_from_rest"]
-            found = self._smoothed.record(work, strain), tables["normal_change"]
+            for n in range(AVERAGING_ROUNDS):
+                words = self._count * STRAIN_COMPONENTS
+                averaged = self._device.buffer(f"smoothed strain {n % 2}", words)
+                given = {"smoothed": strain, "averaged": averaged}
+                work.dispatch("frames.smooth_strain", self._count, given)
+                strain = averaged
+            found = strain, tables["normal_change"]
             self.signals = dict(zip(SIGNALS, found, strict=True))
         for name in sorted(coefficients, key=list(OFFSETS).index):  # scale after position
             driving = self.signals[OFFSETS[name].signal]

@@ -9,7 +9,7 @@ import numpy as np
 
 from ...avatar.offsets import COLOR, OFFSETS, SCALE
 from ...avatar.splats import SH_C0
-from ..cpu.layout import Parameters, rows_by_triangle
+from ..cpu.layout import Parameters
 from ..cpu.optimizer import AdamOptions
 from ..cpu.rasterize import tile_grid
 from .device import Device, Recording, entry_points
@@ -137,7 +137,7 @@ class OffsetTables(NamedTuple):
     coefficients, first, second, average  (F, 3, 3) float32, with Adam's moments and the exponential
                                           moving average
     steps      (F,) uint32
-    splats_of  of `splats_by_triangle`
+    splats_of  `list_words` of the splats on each triangle
     """
 
     coefficients: Any
@@ -146,16 +146,6 @@ class OffsetTables(NamedTuple):
     average: Any
     steps: Any
     splats_of: Any
-
-
-def splats_by_triangle(face: np.ndarray, triangles: int) -> np.ndarray:
-    """(triangles + 1 + N,) the splats on each triangle, in order, behind where each one's begin in
-    this same array.
-
-    face (N,): the triangle of each splat.
-    """
-    starts, rows = rows_by_triangle(face, triangles)
-    return np.asarray(np.concatenate([starts + triangles + 1, rows]), np.uint32)
 
 
 def step_offsets(

@@ -7,9 +7,10 @@ from typing import Any
 
 import numpy as np
 
+from ...avatar.strain import IndexLists
 from ...capture.model import View
 from ...raster.cpu.image_loss import LOSS_REACH_PX
-from ...raster.cpu.layout import Parameters
+from ...raster.cpu.layout import Parameters, rows_by_triangle
 from ...raster.gpu import optimizer, rasterize
 from ...raster.gpu.device import Device, Readback, Recording
 from ...raster.gpu.frames import Embedding
@@ -22,6 +23,7 @@ from ...raster.gpu.layout import (
     ROTATION,
     SH,
     XYZ,
+    list_words,
     splat_rows,
 )
 from ...raster.gpu.optimizer import OffsetTables, OptimizerTables, image_loss, upload_target
@@ -143,8 +145,8 @@ class GpuBackend:
         )
 
     def _splats_by_triangle(self) -> Any:
-        by_triangle = optimizer.splats_by_triangle(self._fixed["face"], self._triangles)
-        return self.device.upload("splats by triangle", by_triangle)
+        lists = IndexLists(*rows_by_triangle(self._fixed["face"], self._triangles))
+        return self.device.upload("splats by triangle", list_words(lists))
 
     def blend_weights(self, view: View) -> np.ndarray:
         self._finish_all()
