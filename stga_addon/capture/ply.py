@@ -216,7 +216,8 @@ def _ascii_rows(element: Element, lines: Sequence[bytes]) -> Rows:
             return [float(word) for word in words[start:place]]
 
         for line in lines:
-            words, place = line.split(), 0
+            words = line.split()
+            place = 0
             yield take
             if place != len(words):
                 raise ValueError(
