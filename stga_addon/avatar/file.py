@@ -100,9 +100,9 @@ class Avatar:
     driven_offsets  name -> (F, 3, 3) float32 of `offsets.OFFSETS`: change of a triangle's splats by
                     each of three components of a signal
     light       what relighting needs, None where it was not estimated
-    filmed_along  (3,) float32: unit direction in which the only cameras look, world axes; what
-                  harmonics add from aside is plausible only (`colored_aside`). None: of several, or
-                  all that harmonics add is trained
+    filmed_along  (F, 3) float32: unit direction in which the only camera sees each triangle, world
+                  axes; what harmonics add from aside is plausible only (`colored_aside`). None: of
+                  several cameras, or of trained harmonics
     linear_base  (N, 4) float32: constant coefficients and logit of each splat with which renderers
                  that blend in linear light come nearest to it (`render.linear_fit`); None: those
                  of `splats`
@@ -125,10 +125,10 @@ class Avatar:
 
     @property
     def as_trained(self) -> "Avatar":
-        """With the colors that cameras saw in all directions."""
+        """With the colors that the camera saw in all directions."""
         if self.filmed_along is None:
             return self
-        color = sh_color(self.splats.sh, self.filmed_along[None])
+        color = sh_color(self.splats.sh, self.filmed_along[self.splats.face])
         sh = ((color - 0.5) / SH_C0)[:, None].astype(np.float32)
         splats = replace(self.splats, sh=sh)
         return replace(self, splats=splats, filmed_along=None, linear_base=None)
@@ -315,7 +315,7 @@ def _check_shapes(path: Path, avatar: Avatar) -> None:
         "faces": ("int32", (-1, 3)),
         "strain_range": ("float32", (faces, *TRAINED_RANGE.shape)),
         "linear_base": ("float32", (count, 4)),
-        "filmed_along": ("float32", (3,)),
+        "filmed_along": ("float32", (faces, 3)),
     }
     for name, array in avatar.arrays.items():
         _check_shape(path, name, array, *kinds[name])

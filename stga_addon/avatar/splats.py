@@ -194,12 +194,12 @@ def sh_color(sh: np.ndarray, direction: np.ndarray) -> np.ndarray:
 def colored_aside(
     splats: Splats, direction: np.ndarray, share: np.ndarray, color: np.ndarray
 ) -> Splats:
-    """Splats of degree 0 that look as they do along one unit direction (3,) from the eye, and the
+    """Splats of degree 0 that look as they do along a unit direction (N, 3) from the eye, and the
     more it turns from there, as a color (N, 3), sRGB: by a share (N,) of the way times the squared
     sine of the angle. Of degree 2, which holds just that."""
     directions = unit(np.random.default_rng(0).normal(size=(64, 3)))
-    sine = 1 - (directions @ direction) ** 2
-    terms = np.linalg.lstsq(_basis(directions, 9), sine, rcond=None)[0]
-    change = share[:, None] * (color - sh_color(splats.sh, direction[None]))
-    sh = at_degree(splats, 2).sh + terms[:, None] * change[:, None]
+    squared_sine = 1 - (directions @ direction.T) ** 2
+    terms = np.linalg.lstsq(_basis(directions, 9), squared_sine, rcond=None)[0]
+    change = share[:, None] * (color - sh_color(splats.sh, direction))
+    sh = at_degree(splats, 2).sh + terms.T[:, :, None] * change[:, None]
     return replace(splats, sh=sh.astype(np.float32))

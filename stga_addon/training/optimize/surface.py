@@ -48,7 +48,7 @@ LID_STRETCH = 1.8
 MIN_SQUARED_AREA = 1e-28
 """Expressions that pull lids out of their folds, and how much longer they make them; squared
 meters, of triangles without area."""
-MAX_APART_DEG = 12.0
+MAX_APART_DEG = 8.0
 MAX_BESIDE_SHARE = 0.1
 """Share of the masks in whose image a triangle lies, that it may lie outside of."""
 MAX_STICKING_SHARE = 0.05
@@ -99,14 +99,16 @@ class Surface:
 
     @cached_property
     def filmed_along(self) -> np.ndarray | None:
-        """(3,) float32: unit direction in which all training views look at the head, world axes;
-        None where they differ by more than MAX_APART_DEG."""
-        views = evenly_spread(self.capture.views["train"], OUTLINE_VIEWS)
-        away = [self.capture.mesh(view.timestep).mean(0) - view.camera.position for view in views]
-        directions = unit(np.array(away))
-        along = unit(directions.mean(0))
-        apart = np.degrees(np.arccos(np.clip(directions @ along, -1, 1)))
-        return along.astype(np.float32) if apart.max() < MAX_APART_DEG else None
+        """(F, 3) float32: mean unit direction, world axes, in which training views see each
+        triangle; None where most of them differ from it by more than MAX_APART_DEG."""
+        directions = []
+        for view in evenly_spread(self.capture.views["train"], OUTLINE_VIEWS):
+            center, _ = _centers_and_normals(self.capture, view.timestep)
+            directions.append(unit(center - view.camera.position, 1e-20))
+        mean = unit(np.mean(directions, axis=0), 1e-20)
+        cosine = (np.array(directions) * mean).sum(2)
+        apart = np.degrees(np.arccos(np.clip(cosine, -1, 1))).max(0)
+        return mean.astype(np.float32) if np.median(apart) < MAX_APART_DEG else None
 
     @cached_property
     def has_few_cameras(self) -> bool:

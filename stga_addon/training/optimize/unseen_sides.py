@@ -129,9 +129,11 @@ def unseen_sides(surface: Surface) -> UnseenSides:
 
 
 def plausible_aside(splats: Splats, along: np.ndarray, sides: UnseenSides) -> Splats:
-    """Splats that views show along one direction (3,) only, with what is plausible from aside."""
-    share = ASIDE_SHARE * sides.changes[splats.face]
-    return colored_aside(splats, along, share, sides.aside[splats.face])
+    """Splats that views show along one direction only, that of their triangle (F, 3), with what is
+    plausible from aside."""
+    face = splats.face
+    share = ASIDE_SHARE * sides.changes
+    return colored_aside(splats, along[face], share[face], sides.aside[face])
 
 
 def _fringe(at: HeadCoordinates, shown: np.ndarray) -> np.ndarray:
