@@ -1,7 +1,6 @@
 """Tracked meshes (OBJ, PLY, GLB, STL) in the file's order; regions of triangles."""
 
 import io
-import struct
 from collections.abc import Callable, Mapping, Sequence
 from functools import lru_cache
 from pathlib import Path
@@ -10,24 +9,15 @@ from typing import Any
 import numpy as np
 
 from ..errors import StgaError
-from ..files import converted, parse_json, read_bytes, read_json, read_npz
+from ..files import converted, read_bytes, read_json, read_npz
 from ..flame.model import faces_within
 from .camera import MAX_COORDINATE_M
+from .glb import WIDTHS, allowed_numbers, glb_chunks
 from .model import Capture
 from .ply import ply_rows
 
 Mesh = tuple[np.ndarray, np.ndarray]  # Vertices (V, 3) and triangles (F, 3)
-MAGIC = b"glTF"
-VERSION = 2
-JSON_KIND = b"JSON"
-HEADER_BYTES = 20
-CHUNK_HEADER_BYTES = 8
-"""The file's header and that of its first chunk; and that of any later chunk."""
 MESH_SUFFIXES = (".obj", ".ply", ".glb", ".stl")
-WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
-"""Type of a GLB's accessor -> numbers of an element."""
-MIN_NUMBERS_ALLOWANCE = 1 << 20
-MAX_NUMBERS_PER_BYTE = 8
 PRIMITIVE_NUMBERS = (
     1000  # That each primitive counts for: trimesh takes time even where it is small
 )
@@ -37,24 +27,6 @@ MIN_EXTENT_M = 1e-9
 """A smaller mesh is a point: no shape to train on, and no scale to compare motion with."""
 PLY_CORNERS = ("vertex_indices", "vertex_index")  # The names that writers give a face's list
 SELECTED_WEIGHT = 0.5  # Least weight of a triangle that belongs to the region
-
-
-def glb_chunks(data: bytes) -> tuple[dict[str, Any], bytes]:
-    """The document and the binary chunk of a .glb file; the chunk is empty where there is none.
-    Raises ValueError where it is not binary glTF 2.0. Source: Khronos, glTF 2.0, section 4.4."""
-    if len(data) < HEADER_BYTES:
-        raise ValueError("ends within its header")
-    magic, version, _, length, kind = struct.unpack_from("<4sIII4s", data)
-    if (magic, version, kind) != (MAGIC, VERSION, JSON_KIND):
-        raise ValueError("expected binary glTF 2.0, with a JSON chunk at its beginning")
-    if length > len(data) - HEADER_BYTES:
-        raise ValueError("its JSON chunk reaches beyond the file")
-    document = parse_json(data[HEADER_BYTES : HEADER_BYTES + length])
-    if not isinstance(document, dict):
-        raise ValueError("its JSON chunk holds no object")
-    rest = data[HEADER_BYTES + length :]
-    size = struct.unpack_from("<I", rest)[0] if len(rest) >= CHUNK_HEADER_BYTES else 0
-    return document, rest[CHUNK_HEADER_BYTES : CHUNK_HEADER_BYTES + size]
 
 
 def read_mesh(path: Path) -> Mesh:
@@ -185,13 +157,6 @@ def _parse_with_trimesh(path: Path, data: bytes, file_type: str) -> Mesh:
             return np.asarray(mesh.vertices), np.asarray(mesh.faces)
     except Exception as error:  # trimesh's parsers raise any kind of error for a bad file
         raise StgaError(f"{path}: is not a readable {file_type.upper()} mesh ({error})") from error
-
-
-def allowed_numbers(size: int) -> int:
-    """Numbers that the joined mesh of a GLB of `size` bytes may hold. Accessors without data may
-    promise any number of zeros, and nodes repeat meshes; sparse morph targets of a real head reach
-    4 a byte."""
-    return MIN_NUMBERS_ALLOWANCE + MAX_NUMBERS_PER_BYTE * size
 
 
 def _check_glb(data: bytes) -> None:

@@ -10,7 +10,7 @@ import numpy as np
 
 from ..avatar.splats import SH_C0, Splats
 from ..capture.color import srgb_to_linear
-from ..capture.meshes import JSON_KIND, MAGIC, VERSION
+from ..capture.glb import DTYPES, JSON_KIND, MAGIC, VERSION
 from ..files import replacing
 
 EXTENSION = "KHR_gaussian_splatting"
@@ -20,8 +20,6 @@ _BINARY_CHUNK = b"BIN\0"
 _POINTS = 0
 VERTICES = 34962
 TYPES = {1: "SCALAR", 3: "VEC3", 4: "VEC4", 16: "MAT4"}
-DTYPES = {5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
-"""Component types of accessors."""
 COMPONENTS = {np.dtype(kind).name: number for number, kind in DTYPES.items()}
 
 

@@ -12,11 +12,11 @@ from ..avatar.embedding import face_frames
 from ..avatar.file import Avatar
 from ..avatar.offsets import OFFSETS, POSITION
 from ..avatar.splats import Splats
-from ..capture.meshes import WIDTHS, glb_chunks
+from ..capture.glb import DTYPES, WIDTHS, glb_chunks
 from ..errors import StgaError
 from ..files import replacing
 from ..light.relight import Relighter
-from .gltf import DTYPES, GENERATOR, glb_bytes
+from .gltf import GENERATOR, glb_bytes
 from .playback import Playback
 from .rig import Rig, RiggedAvatar, ShapeControls
 from .skinned_mesh import BASE_STEP_M, SHAPE_STEP_M, skinned_mesh

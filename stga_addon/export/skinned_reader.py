@@ -3,6 +3,7 @@
 import struct
 import zlib
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -11,12 +12,11 @@ import numpy as np
 from ..avatar.file import Avatar, AvatarLight, write_avatar
 from ..avatar.offsets import OFFSETS
 from ..avatar.splats import Splats
-from ..capture.meshes import WIDTHS, glb_chunks
+from ..capture.glb import UNREADABLE, accessor_values, glb_chunks
 from ..errors import StgaError
 from ..files import read_bytes, write_npz
 from ..flame.model import JOINTS
 from ..flame.quaternions import to_axis_angle
-from .gltf import DTYPES
 from .rig import Rig
 from .skinned_gltf import AXES, EXTRA, VERSION
 
@@ -52,7 +52,7 @@ def read_skinned_splats(path: Path) -> SkinnedSplats:
         arrays = _arrays(header["arrays"], binary[slice(*place)])
         rig, faces = _rig(document, binary, arrays, header)
         return SkinnedSplats(_avatar(header, arrays, rig, faces), rig, float(header["fps"]))
-    except (ValueError, LookupError, TypeError, AttributeError, struct.error, zlib.error) as error:
+    except (*UNREADABLE, struct.error, zlib.error) as error:
         raise StgaError(f"{path}: is no file of skinned splats ({error})") from error
 
 
@@ -148,60 +148,24 @@ def _arrays(entries: dict[str, Any], packed: bytes) -> dict[str, np.ndarray]:
     return arrays
 
 
-class _Chunk:
-    """Values of the document's accessors."""
-
-    def __init__(self, document: dict[str, Any], binary: bytes) -> None:
-        self.document = document
-        self.binary = binary
-
-    def values(self, index: int) -> np.ndarray:
-        """(count, width), as numbers."""
-        accessor = self.document["accessors"][index]
-        kind = np.dtype(DTYPES[accessor["componentType"]])
-        width = WIDTHS[accessor["type"]]
-        count = int(accessor["count"])
-        if not 0 <= width * count <= MAX_VALUES:
-            raise ValueError("an accessor is larger than any avatar's")
-        if "bufferView" in accessor:
-            values = self._block(kind, count, width, accessor)
-        else:
-            values = np.zeros((count, width), kind)
-        if "sparse" in accessor:
-            indices = accessor["sparse"]["indices"]
-            number = int(accessor["sparse"]["count"])
-            moved = self._block(np.dtype(DTYPES[indices["componentType"]]), number, 1, indices)
-            by = self._block(kind, number, width, accessor["sparse"]["values"])
-            values = values.copy()
-            values[moved[:, 0]] = by
-        if accessor.get("normalized"):
-            return values / float(np.iinfo(kind).max)
-        return values.astype(np.float64) if kind.kind == "f" else values.astype(np.int64)
-
-    def _block(self, kind: np.dtype[Any], count: int, width: int, place: Any) -> np.ndarray:
-        view = self.document["bufferViews"][place["bufferView"]]
-        at = view.get("byteOffset", 0) + place.get("byteOffset", 0)
-        return np.frombuffer(self.binary, kind, count * width, at).reshape(count, width)
-
-
 def _rig(
     document: dict[str, Any], binary: bytes, arrays: dict[str, np.ndarray], header: dict[str, Any]
 ) -> tuple[Rig, np.ndarray]:
     """The rig, and the mesh's triangles (F, 3)."""
-    chunk = _Chunk(document, binary)
+    values = partial(accessor_values, document, binary)
     skin = document["skins"][0]
     joints = skin["joints"]
-    bind = chunk.values(skin["inverseBindMatrices"]).reshape(-1, 4, 4)
+    bind = values(skin["inverseBindMatrices"]).reshape(-1, 4, 4)
     unit = bind[0, 0, 0]
     mesh = document["meshes"][0]
     primitive = mesh["primitives"][0]
     attributes = primitive["attributes"]
-    base = unit * chunk.values(attributes["POSITION"])
-    targets = [unit * chunk.values(each["POSITION"]) for each in primitive.get("targets", [])]
+    base = unit * values(attributes["POSITION"])
+    targets = [unit * values(each["POSITION"]) for each in primitive.get("targets", [])]
     weights = np.zeros((len(base), len(joints)))
     for number in range(sum(name.startswith("JOINTS") for name in attributes)):
-        shares = chunk.values(attributes[f"WEIGHTS_{number}"])
-        own = chunk.values(attributes[f"JOINTS_{number}"])
+        shares = values(attributes[f"WEIGHTS_{number}"])
+        own = values(attributes[f"JOINTS_{number}"]).astype(int)
         for column in range(4):
             np.add.at(weights, (np.arange(len(base)), own[:, column]), shares[:, column])
     rest = -bind[:, 3, :3]
@@ -210,12 +174,12 @@ def _rig(
     for channel in motion["channels"]:
         target = channel["target"]
         sampler = motion["samplers"][channel["sampler"]]
-        outputs[target["path"], target["node"]] = chunk.values(sampler["output"])
+        outputs[target["path"], target["node"]] = values(sampler["output"])
     turns = np.stack([outputs["rotation", joint] for joint in joints], axis=1)
     coefficients = np.zeros((len(turns), 0))
-    for (path, _), values in outputs.items():
+    for (path, _), output in outputs.items():
         if path == "weights":
-            coefficients = values.reshape(len(turns), -1)
+            coefficients = output.reshape(len(turns), -1)
     nodes = document["nodes"]
     parents = [
         [p for p, j in enumerate(joints) if joint in nodes[j].get("children", [])]
@@ -239,7 +203,7 @@ def _rig(
         expressions=expressions,
         expression_names=tuple(str(name) for name in names[:named]),
     )
-    return rig, chunk.values(primitive["indices"]).reshape(-1, 3).astype(np.int32)
+    return rig, values(primitive["indices"]).reshape(-1, 3).astype(np.int32)
 
 
 def _avatar(

@@ -3,22 +3,24 @@
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from ..capture.meshes import WIDTHS, allowed_numbers, glb_chunks
-from ..errors import StgaError, shorten
+from ..capture.glb import (
+    UNREADABLE,
+    Json,
+    accessor_values,
+    allowed_numbers,
+    count_of,
+    glb_chunks,
+)
+from ..errors import StgaError
 from ..files import read_bytes
 from ..flame.quaternions import to_matrices
 
-COMPONENTS = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 TRIANGLES = 4
 PRIMITIVE_NUMBERS = 100
 """That each primitive counts for besides its own: it takes time even where it is small."""
-UNREADABLE = LookupError, TypeError, ValueError, AttributeError, ArithmeticError, RecursionError
-"""What a damaged document leads to."""
-Json = dict[str, Any]
 Placed = tuple[Json, list[tuple[str, Json]], np.ndarray]
 """A primitive, its morph targets with their names, and the transform (4, 4) of its node."""
 READABLE_EXTENSIONS = {"KHR_mesh_quantization", "KHR_materials_unlit", "KHR_texture_transform"}
@@ -84,9 +86,9 @@ def _placed_primitives(path: Path, document: Json, size: int) -> list[Placed]:
             if len(own) != len(targets):
                 own = [f"target {number}" for number in range(len(targets))]
             named = [(str(own[k]), target) for k, target in enumerate(targets)]
-            vertices += _count(accessors[primitive["attributes"]["POSITION"]])
+            vertices += count_of(accessors[primitive["attributes"]["POSITION"]])
             corners += PRIMITIVE_NUMBERS
-            corners += _count(accessors[primitive["indices"]]) if "indices" in primitive else 0
+            corners += count_of(accessors[primitive["indices"]]) if "indices" in primitive else 0
             names.update(name for name, _ in named)
             numbers = 3 * vertices * (1 + len(names)) + corners
             if numbers > allowed:
@@ -125,15 +127,15 @@ def _part(
     document: Json, data: bytes, primitive: Json, morphs: list[tuple[str, Json]], matrix: np.ndarray
 ) -> MorphMesh:
     """The mesh of a primitive, in the scene's axes."""
-    positions = _accessor(document, data, primitive["attributes"]["POSITION"])
+    positions = accessor_values(document, data, primitive["attributes"]["POSITION"], width=3)
     count = len(positions)
     targets = np.zeros((count, 3, len(morphs)))
     for column, (_, morph) in enumerate(morphs):
         if "POSITION" in morph:
-            targets[:, :, column] = _accessor(document, data, morph["POSITION"], count)
+            targets[:, :, column] = accessor_values(document, data, morph["POSITION"], count, 3)
     corners = np.arange(count)
     if "indices" in primitive:
-        values = _accessor(document, data, primitive["indices"], width=1)[:, 0]
+        values = accessor_values(document, data, primitive["indices"], width=1)[:, 0]
         corners = values.astype(np.int64)
     if corners.min(initial=0) < 0 or corners.max(initial=0) >= count:
         raise ValueError("a primitive's indices do not fit its vertices")
@@ -142,53 +144,6 @@ def _part(
     names = tuple(name for name, _ in morphs)
     moved = np.einsum("ab,vbk->vak", turn, targets)
     return MorphMesh(positions @ turn.T + matrix[:3, 3], faces, names, moved)
-
-
-def _count(accessor: Json) -> int:
-    count = accessor["count"]
-    if type(count) is not int or count < 1:
-        raise ValueError(f"an accessor of {shorten(count)} elements")
-    return count
-
-
-def _accessor(
-    document: Json, data: bytes, number: int, expected: int | None = None, width: int = 3
-) -> np.ndarray:
-    """Values (N, width) of an accessor, sparse ones applied; N is `expected` where given."""
-    accessor = document["accessors"][number]
-    count = _count(accessor)
-    if WIDTHS[accessor["type"]] != width or count != (expected or count):
-        raise ValueError("an accessor is of another type or length than its use")
-    component = accessor["componentType"]
-    values = np.zeros((count, width))
-    if "bufferView" in accessor:
-        values = _view(document, data, accessor, component, (count, width))
-    sparse = accessor.get("sparse")
-    if sparse:
-        changed = _count(sparse)
-        indices = sparse["indices"]
-        rows = _view(document, data, indices, indices["componentType"], (changed, 1))[:, 0]
-        found = _view(document, data, sparse["values"], component, (changed, width))
-        values[rows.astype(np.int64)] = found
-    if accessor.get("normalized"):
-        values = np.maximum(values / np.iinfo(COMPONENTS[component]).max, -1)
-    return values
-
-
-def _view(
-    document: Json, data: bytes, source: Json, component: int, shape: tuple[int, int]
-) -> np.ndarray:
-    """A buffer view's values, as float64 copies of this shape."""
-    view = document["bufferViews"][source["bufferView"]]
-    dtype = np.dtype(COMPONENTS[component])
-    if view.get("buffer", 0) != 0:
-        raise ValueError("expected one buffer")
-    start = int(view.get("byteOffset", 0)) + int(source.get("byteOffset", 0))
-    size = dtype.itemsize * shape[1]
-    stride = int(view.get("byteStride", size))
-    if start < 0 or stride < size or start + stride * (shape[0] - 1) + size > len(data):
-        raise ValueError("an accessor reaches beyond the file")
-    return np.ndarray(shape, dtype, data, start, (stride, dtype.itemsize)).astype(np.float64)
 
 
 def _joined(parts: list[MorphMesh]) -> MorphMesh:
