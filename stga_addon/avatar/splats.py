@@ -72,6 +72,13 @@ class Splats:
         return replace(self, **{f.name: getattr(self, f.name)[index] for f in fields(self)})
 
 
+def logits(opacity: np.ndarray) -> np.ndarray:
+    """`Splats.opacity`, float32, of opacities 0 to 1: of these two −∞ and ∞."""
+    share = opacity.astype(np.float64)
+    with np.errstate(divide="ignore"):
+        return np.asarray(np.log(share / (1 - share)), np.float32)
+
+
 @dataclass(frozen=True)
 class SplatArray:
     """A row of ARRAYS: type of a field of `Splats`, and its shape after N; sizes: those allowed

@@ -11,7 +11,7 @@ import numpy as np
 
 from ..avatar.file import Avatar, AvatarLight, write_avatar
 from ..avatar.offsets import OFFSETS
-from ..avatar.splats import Splats
+from ..avatar.splats import Splats, logits
 from ..capture.glb import UNREADABLE, accessor_values, glb_chunks
 from ..errors import StgaError
 from ..files import read_bytes, write_npz
@@ -19,6 +19,7 @@ from ..flame.model import JOINTS
 from ..flame.quaternions import to_axis_angle
 from .rig import Rig
 from .skinned_gltf import AXES, EXTRA, VERSION
+from .spz import of_smallest_three
 
 AVATAR_FILE = "avatar.npz"
 MODEL_FILE = "flame_model.npz"
@@ -210,13 +211,7 @@ def _avatar(
     header: dict[str, Any], arrays: dict[str, np.ndarray], rig: Rig, faces: np.ndarray
 ) -> Avatar:
     per_face = arrays["splats_per_face"]
-    rotation = np.zeros((len(arrays["xyz"]), 4))
-    smaller = arrays["rotation"]
-    largest = arrays["rotation_largest"]
-    for part in range(4):
-        own = largest == part
-        rotation[np.ix_(own, [k for k in range(4) if k != part])] = smaller[own]
-        rotation[own, part] = np.sqrt(np.maximum(0, 1 - (smaller[own] ** 2).sum(axis=1)))
+    rotation = of_smallest_three(arrays["rotation_largest"], arrays["rotation"])
     opacity = np.clip(arrays["opacity"], 1 - MAX_OPACITY, MAX_OPACITY)
     rest = arrays.get("sh", np.zeros((len(rotation), 0))).reshape(len(rotation), -1, 3)
     sh = np.concatenate([arrays["color"][:, None], rest], axis=1)
@@ -224,7 +219,7 @@ def _avatar(
         xyz=arrays["xyz"].astype(np.float32),
         rotation=rotation.astype(np.float32),
         log_scale=arrays["log_scale"].astype(np.float32),
-        opacity=np.log(opacity / (1 - opacity)).astype(np.float32),
+        opacity=logits(opacity),
         sh=sh.astype(np.float32),
         face=np.repeat(np.arange(len(per_face), dtype=np.int32), per_face),
         unbound=arrays["unbound"].astype(bool),

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ..avatar.splats import MAX_SH_DEGREE, Splats, in_world
+from ..avatar.splats import MAX_SH_DEGREE, Splats, in_world, logits
 from ..errors import StgaError
 from ..files import CHANGED_LINE_ENDS, line_ends_changed, read_bytes, replacing
 from ..flame.quaternions import normalized
@@ -30,6 +30,8 @@ MAX_FRACTION_BITS = 16
 """Resolution of positions: 2⁻¹⁶ m = 15 µm, within ±128 m; coarser where splats are farther away."""
 COORDINATE_BITS = 24
 COLOR_SCALE = 0.15
+OTHERS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
+"""Part of a quaternion -> the other three."""
 
 
 def write_spz(path: Path, world: Splats, antialiased: bool = False) -> None:
@@ -109,15 +111,14 @@ def _unpacked(path: Path, data: bytes, say: Say) -> Splats:
         say(f"{path}: is marked as antialiased; splats of files are drawn without")
     if degree > MAX_SH_DEGREE:
         say(f"{path}: harmonics of degree {degree} are cut at {MAX_SH_DEGREE}")
-    share = alpha[:, 0] / 255
-    with np.errstate(divide="ignore"):
-        opacity = np.log(share / (1 - share))
     harmonics = (rest.reshape(count, others, 3).astype(np.float32) - 128) / 128
     base = (color.astype(np.float32) / 255 - 0.5) / COLOR_SCALE
     sh = np.concatenate([base[:, None], harmonics[:, : (MAX_SH_DEGREE + 1) ** 2 - 1]], axis=1)
     rotation = _smallest_three(turn) if version == 3 else _three(turn)
     xyz = places.view("<f2") if version == 1 else _fixed(places) / 2.0**bits
-    return in_world(xyz, rotation, scale.astype(np.float32) / 16 - 10, opacity, sh)
+    return in_world(
+        xyz, rotation, scale.astype(np.float32) / 16 - 10, logits(alpha[:, 0] / 255), sh
+    )
 
 
 def _fixed(places: np.ndarray) -> np.ndarray:
@@ -136,17 +137,10 @@ def _three(turn: np.ndarray) -> np.ndarray:
 
 def _smallest_three(turn: np.ndarray) -> np.ndarray:
     """Quaternions (N, 4) wxyz of what `write_spz` packs into 4 bytes."""
-    packed = turn.copy().view("<u4")[:, 0]
-    largest = packed >> 30
-    found = np.zeros((len(packed), 4))
-    for part in range(3, -1, -1):
-        own = largest != part
-        magnitude = (packed & 511) * np.where(packed & 512, -1, 1) / (511 * math.sqrt(2))
-        found[own, part] = magnitude[own]
-        packed = np.where(own, packed >> 10, packed)
-    rows = np.arange(len(packed))
-    found[rows, largest] = np.sqrt(np.maximum(0, 1 - (found**2).sum(axis=1)))
-    return found[:, [3, 0, 1, 2]]
+    packed = turn.copy().view("<u4")
+    parts = packed >> np.array([20, 10, 0], "<u4")
+    others = (parts & 511) * np.where(parts & 512, -1, 1) / (511 * math.sqrt(2))
+    return of_smallest_three(packed[:, 0] >> 30, others)[:, [3, 0, 1, 2]]
 
 
 def _byte(values: np.ndarray) -> np.ndarray:
@@ -160,5 +154,12 @@ def smallest_three(rotation: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     q = normalized(rotation)
     largest = np.abs(q).argmax(1)
     q *= np.where(np.take_along_axis(q, largest[:, None], 1) < 0, -1, 1)
-    others = np.array([[k for k in range(4) if k != left_out] for left_out in range(4)])[largest]
-    return largest.astype(np.uint8), np.take_along_axis(q, others, 1)
+    return largest.astype(np.uint8), np.take_along_axis(q, OTHERS[largest], 1)
+
+
+def of_smallest_three(largest: np.ndarray, others: np.ndarray) -> np.ndarray:
+    """The unit quaternions (N, 4) of what `smallest_three` gives."""
+    found = np.zeros((len(others), 4))
+    np.put_along_axis(found, OTHERS[largest], others, 1)
+    found[np.arange(len(found)), largest] = np.sqrt(np.maximum(0, 1 - (found**2).sum(axis=1)))
+    return found

@@ -11,7 +11,7 @@ import numpy as np
 from ...avatar.embedding import face_areas
 from ...avatar.file import UNSEEN_REGION, Avatar, AvatarLight
 from ...avatar.offsets import OFFSETS
-from ...avatar.splats import SH_C0, Splats, in_world
+from ...avatar.splats import SH_C0, Splats, in_world, logits
 from ...avatar.strain import STRAIN_COMPONENTS, strain_basis
 from ...capture.color import srgb_to_linear
 from ...flame.quaternions import normalized
@@ -143,7 +143,7 @@ def splat_attributes(splats: Splats) -> Attributes:
         XYZ: _vector(splats.xyz),
         ROTATION: ("QUATERNION", "value", flat_floats(normalized(splats.rotation))),
         SCALE: _vector(np.exp(splats.log_scale.astype(np.float64))),
-        OPACITY: _number(1 / (1 + np.exp(-splats.opacity.astype(np.float64)))),
+        OPACITY: _number(splats.opacities()),
         COLOR: ("FLOAT_COLOR", "color", flat_floats(with_alpha(linear))),
     }
     for index in range(splats.sh.shape[1]):
@@ -190,25 +190,18 @@ def read_splats(mesh: Any) -> Splats:
             xyz=read_attribute(mesh, XYZ),
             rotation=read_attribute(mesh, ROTATION),
             log_scale=np.log(read_attribute(mesh, SCALE).astype(np.float64)).astype(np.float32),
-            opacity=_logit(read_attribute(mesh, OPACITY)),
+            opacity=logits(read_attribute(mesh, OPACITY)),
             sh=np.stack(sh, 1),
             face=read_attribute(mesh, FACE) if face else np.zeros(count, np.int32),
             unbound=np.zeros(count, bool),
         )
 
 
-def _logit(opacity: np.ndarray) -> np.ndarray:
-    """float32; of 0 and 1 −∞ and ∞, which the kernels accept."""
-    share = opacity.astype(np.float64)
-    with np.errstate(divide="ignore"):
-        return np.asarray(np.log(share / (1 - share)), np.float32)
-
-
 def read_linear_base(mesh: Any) -> np.ndarray | None:
     """`Avatar.linear_base` as stored in a splat object's mesh."""
     if LINEAR_SH not in mesh.attributes:
         return None
-    opacity = _logit(read_attribute(mesh, LINEAR_OPACITY))
+    opacity = logits(read_attribute(mesh, LINEAR_OPACITY))
     return np.column_stack([read_attribute(mesh, LINEAR_SH), opacity])
 
 
@@ -239,7 +232,7 @@ def read_native_splats(cloud: Any) -> Splats | None:
         read_attribute(cloud, "position"),
         rotation,
         log_scale,
-        _logit(opacity),
+        logits(opacity),
         np.stack([base[:, :3], *rest], 1),
     )
 

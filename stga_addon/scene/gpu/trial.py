@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from ...avatar.embedding import WORLD
-from ...avatar.splats import SH_C0, Splats
+from ...avatar.splats import SH_C0, Splats, logits
 from ...capture.camera import Camera
 from ...flame.quaternions import to_matrices
 from ...raster.posed_splats import ComposedImage
@@ -53,7 +53,7 @@ def _layer(hidden: int) -> SceneLayer:
         xyz=xyz.astype(np.float32),
         rotation=rotation.astype(np.float32),
         log_scale=np.log(deviation).astype(np.float32),
-        opacity=np.log(opacity / (1 - opacity)).astype(np.float32),
+        opacity=logits(opacity),
         sh=((color - 0.5) / SH_C0)[:, None].astype(np.float32),
         face=np.zeros(count, np.int32),
         unbound=np.zeros(count, bool),
