@@ -63,16 +63,7 @@ def _words(name: str) -> list[str]:
     """Words of a heading such as timestampMs, time (ms) or blendShapes.timeCode."""
     apart = re.sub(r"(?<=[a-z])(?=[A-Z])", " ", name.rsplit(".", 1)[-1])
     words = re.findall(r"[^\W\d_]+", apart.lower())
-    return ["timecode" if pair == ["time", "code"] else pair[0] for pair in _pairs(words)]
-
-
-def _pairs(words: list[str]) -> Iterable[list[str]]:
-    """Each word with the one behind it; a second word of "time code" is not one of its own."""
-    place = 0
-    while place < len(words):
-        pair = words[place : place + 2]
-        yield pair
-        place += 2 if pair == ["time", "code"] else 1
+    return re.sub(r"\btime code\b", "timecode", " ".join(words)).split()
 
 
 def seconds_of_numbers(
