@@ -9,6 +9,7 @@ import numpy as np
 
 from ...avatar.embedding import FaceFrames
 from ...capture.camera import Camera
+from ...capture.mesh_geometry import vertex_normals
 from ...errors import StgaError
 from ...flame.quaternions import normalized, to_matrices
 from ...light.harmonics import GLOSSY
@@ -256,7 +257,7 @@ def relit_scene(layers: Sequence[SceneLayer]) -> RelitScene:
         distant, kept = relighter.distant_in_head(mesh, lighting)
         texels = np.zeros((len(mesh), VERTEX_TEXELS, 4), np.float32)
         texels[:, 0, :3] = mesh
-        texels[:, 1, :3] = _normals(mesh, relighter.avatar.faces)
+        texels[:, 1, :3] = vertex_normals(mesh, relighter.avatar.faces)
         arriving = np.maximum(relighter.light.transfer @ distant, 0)
         texels[:, 2, :3] = arriving[:, :3] + relighter.bounce.light(arriving[:, 3:])
         vertices.append(texels.reshape(-1, 4))
@@ -298,14 +299,3 @@ def with_eye(scene: RelitScene, layers: Sequence[SceneLayer], eye: np.ndarray) -
     for index, layer in enumerate(layers):
         lights[RELIT_TEXELS * index + 2, :3] = layer.eye_in_avatar(eye)
     return lights
-
-
-def _normals(mesh: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """(V, 3) as `mesh_geometry.vertex_normals`, in half the time: row by row."""
-    rows = [np.ascontiguousarray(row, np.float32) for row in mesh.T]
-    a, b, c = ([row[corner] for row in rows] for corner in np.ascontiguousarray(faces.T))
-    u, v = ([q - p for p, q in zip(a, end, strict=True)] for end in (b, c))
-    crosses = (u[k - 2] * v[k - 1] - u[k - 1] * v[k - 2] for k in range(3))
-    total = [np.bincount(faces.ravel(), np.repeat(cross, 3), len(mesh)) for cross in crosses]
-    scale = 1 / np.maximum(np.sqrt(sum(row * row for row in total)), 1e-20)
-    return np.stack([row * scale for row in total], axis=-1)
