@@ -20,20 +20,14 @@ DEFAULT = re.compile(r" \(default:? ([^)]*)\)")
 stands."""
 
 
-def boolean(name: str, description: str, **more: Any) -> Any:
-    return bpy.props.BoolProperty(name=name, description=description, **more)
+def _maker(make: Any) -> Any:
+    return lambda name, description, **more: make(name=name, description=description, **more)
 
 
-def integer(name: str, description: str, **more: Any) -> Any:
-    return bpy.props.IntProperty(name=name, description=description, **more)
-
-
-def number(name: str, description: str, **more: Any) -> Any:
-    return bpy.props.FloatProperty(name=name, description=description, **more)
-
-
-def text(name: str, description: str, **more: Any) -> Any:
-    return bpy.props.StringProperty(name=name, description=description, **more)
+boolean = _maker(bpy.props.BoolProperty)
+integer = _maker(bpy.props.IntProperty)
+number = _maker(bpy.props.FloatProperty)
+text = _maker(bpy.props.StringProperty)
 
 
 def choice(name: str, description: str, *items: tuple[str, str, str], **more: Any) -> Any:
