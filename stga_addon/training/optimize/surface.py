@@ -7,9 +7,16 @@ import numpy as np
 from scipy.ndimage import binary_dilation
 from scipy.spatial import cKDTree
 
-from ...capture.camera import Camera, look_at
+from ...capture.camera import look_at
 from ...capture.images import read_view
-from ...capture.mesh_geometry import connected_parts, rasterize, silhouette, triangle_normals
+from ...capture.mesh_geometry import (
+    connected_parts,
+    facing,
+    pixels_of,
+    rasterize,
+    silhouette,
+    triangle_normals,
+)
 from ...capture.model import Capture, View, evenly_spread, views_by_timestep
 from ...flame.model import torso_faces
 from ...flame.quaternions import unit
@@ -75,7 +82,7 @@ class Surface:
         for timestep in evenly_spread(list(by_timestep), limit):
             center, normal = _centers_and_normals(capture, timestep)
             for view in by_timestep[timestep]:
-                np.maximum(cosine, _cosine(center, normal, view), out=cosine)
+                np.maximum(cosine, facing(view.camera, center, normal), out=cosine)
         return cosine
 
     @cached_property
@@ -152,7 +159,7 @@ class Surface:
         seen, beside = np.zeros((2, len(self.outside)), int)
         for view, mask in self._masks:
             center, _ = _centers_and_normals(self.capture, view.timestep)
-            row, column, within = _pixels(view.camera, center)
+            column, row, within = pixels_of(center, view.camera)
             seen += within
             beside += within & clear_of(mask > 127)[row, column]
         touched = np.zeros(len(self.capture.neutral), bool)
@@ -273,14 +280,14 @@ class Surface:
         capture = self.capture
         voxel = voxel_size(np.asarray(capture.neutral))
         center, normal = _centers_and_normals(capture, view.timestep)
-        cosine = _cosine(center, normal, view)
+        cosine = facing(view.camera, center, normal)
         rows = np.flatnonzero(self.outside & (np.abs(cosine) < OUTLINE_COSINE))
         if not len(rows):
             return np.zeros(0, int), np.zeros(0)
         heights = np.arange(MAX_HEIGHT_VOXELS * STEPS_PER_VOXEL + 1) * voxel / STEPS_PER_VOXEL
         points = center[rows, None] + heights[:, None] * normal[rows, None]
         camera = view.camera
-        row, column, within = _pixels(camera, points.reshape(-1, 3))
+        column, row, within = pixels_of(points.reshape(-1, 3), camera)
         shape = len(rows), len(heights)
         covered = silhouette(capture.mesh(view.timestep), capture.faces[cosine > 0], camera)
         beside = (within & ~binary_dilation(covered)[row, column]).reshape(shape)
@@ -294,19 +301,6 @@ class Surface:
 def _centers_and_normals(capture: Capture, timestep: int) -> tuple[np.ndarray, np.ndarray]:
     corners = np.asarray(capture.mesh(timestep), np.float64)[capture.faces]
     return corners.mean(1), unit(triangle_normals(corners), 1e-20)
-
-
-def _pixels(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Row and column of each point's (N, 3) pixel, and whether it lies in the image; the first
-    pixel where it does not."""
-    places, _ = camera.project(points)
-    x, y = np.floor(places).T.astype(int)
-    within = (x >= 0) & (x < camera.width) & (y >= 0) & (y < camera.height)
-    return np.where(within, y, 0), np.where(within, x, 0), within
-
-
-def _cosine(center: np.ndarray, normal: np.ndarray, view: View) -> np.ndarray:
-    return np.asarray((normal * unit(view.camera.position - center, 1e-20)).sum(1))
 
 
 def _largest_stretch(rest: np.ndarray, posed: np.ndarray) -> np.ndarray:
