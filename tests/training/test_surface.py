@@ -23,7 +23,12 @@ from stga_addon.training.optimize.change import Turn
 from stga_addon.training.optimize.frames import FrameStore
 from stga_addon.training.optimize.initial_splats import voxel_size
 from stga_addon.training.optimize.surface import GRAZING_COSINE, Surface
-from stga_addon.training.optimize.surface_prior import SurfacePrior, flattened, hidden_splats
+from stga_addon.training.optimize.surface_prior import (
+    SurfacePrior,
+    flattened,
+    hidden_splats,
+    thickness,
+)
 from stga_addon.training.optimize.trainer import Trainer
 from stga_addon.training.optimize.unseen_sides import unseen_sides
 
@@ -140,18 +145,23 @@ def test_hidden_sides_are_closed(filmed, convention):
 
 @pytest.mark.parametrize("axis", [1, 2])
 def test_flat_splats_look_the_same_from_the_front(axis):
-    """Catches splats that change in the image of the camera that trains them, and a limit in
-    another unit: covariances in float64."""
+    """Catches splats that change in the image of the camera that trains them, a limit in another
+    unit, and a layer whose splats stay too small: covariances in float64."""
     rng = np.random.default_rng(0)
     rotation = rng.normal(size=(500, 4)).astype(np.float32)
     log_scale = rng.uniform(-8, -3, (500, 3)).astype(np.float32)
     limit = rng.uniform(1e-4, 1e-3, 500)
+    least = np.where(np.arange(500) < 250, 0, 0.02)
     before = covariances(rotation, log_scale)
-    after = covariances(*flattened(rotation, log_scale, axis, limit))
+    after = covariances(*flattened(rotation, log_scale, axis, limit, least))
     others = [n for n in range(3) if n != axis]
-    rows = np.ix_(range(500), others, others)
-    assert_allclose(after[rows], before[rows], rtol=1e-4, atol=1e-9)
-    assert_allclose(np.sqrt(after[:, axis, axis]), limit, rtol=1e-3, atol=1e-6)
+    before, after = (both[np.ix_(range(500), others, others)] for both in (before, after))
+    wider = np.maximum(least**2 / np.sqrt(np.linalg.det(before)), 1)[:, None, None]
+    assert (wider[250:] > 1).sum() > 100
+    assert_allclose(after, wider * before, rtol=1e-4, atol=1e-9)
+    thick = thickness(*flattened(rotation, log_scale, axis, limit, least), axis)
+    was = thickness(rotation, log_scale, axis) * np.sqrt(wider[:, 0, 0])
+    assert_allclose(thick, np.minimum(was, limit), rtol=1e-3, atol=1e-6)
 
 
 def covariances(rotation, log_scale):

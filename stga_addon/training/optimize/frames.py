@@ -89,9 +89,7 @@ class FrameStore:
         limits = np.stack([settings.scale_limit * self.units, unbound])
         limits *= 1 - (1 - UNSEEN_LIMIT_SHARE) * self.surface.turned_away
         limits[0, self.surface.border] *= BORDER_LIMIT_SHARE  # a torso's unbound splats follow it
-        layer = SCALE * self.units * self.hair_widening  # smaller, it has gaps: the inside shows
-        is_hair = self.surface.hidden & (self.surface.hair_height > 0)
-        limits[0, is_hair] = np.maximum(limits[0, is_hair], layer[is_hair])
+        limits[0] = np.maximum(limits[0], self.hair_layer_scale)
         return np.asarray(limits, np.float32)
 
     def stray_limits(self, settings: TrainingSettings) -> np.ndarray:
@@ -112,6 +110,13 @@ class FrameStore:
         inner = LAYER_HEIGHT_SHARE * self.surface.hair_height - LAYER_VOXELS * self.voxel
         skin = -SKIN_DEPTH * self.units
         return np.asarray(np.where(inner > 0, inner / self.unit_lengths, skin), np.float32)
+
+    @cached_property
+    def hair_layer_scale(self) -> np.ndarray:
+        """(F,) of hair's outer layer where it faces away from all cameras, in local units: smaller,
+        it has gaps, through which the head's inside shows. 0 elsewhere."""
+        is_hair = self.surface.hidden & (self.surface.hair_height > 0)
+        return np.asarray(np.where(is_hair, SCALE * self.units * self.hair_widening, 0))
 
     @cached_property
     def hair_widening(self) -> np.ndarray:

@@ -38,6 +38,7 @@ FLAT_TOLERANCE = 1.02
 """Largest standard deviation of splats on skin and clothes along the normal; how much more is worth
 a change. Views of a narrow cone do not tell it."""
 MIN_VARIANCE = 1e-14
+MIN_WIDTH = 1e-7
 PULLED_COLUMNS = (
     "face",
     "parameters/color",
@@ -146,11 +147,15 @@ class SurfacePrior:
         rotation = columns["parameters/rotation"][rows]
         log_scale = columns["parameters/log_scale"][rows]
         limits = limit / self._frames.unit_lengths[face[rows]]
-        thick = np.flatnonzero(thickness(rotation, log_scale, axis) > FLAT_TOLERANCE * limits)
-        flat = flattened(rotation[thick], log_scale[thick], axis, limits[thick])
+        is_layer = self._surface.closed & (self._surface.turned_away == 1)
+        least = np.where(is_layer, self._frames.hair_layer_scale, 0.0)[face[rows]]
+        off = thickness(rotation, log_scale, axis) > FLAT_TOLERANCE * limits
+        off |= width(rotation, log_scale, axis) * FLAT_TOLERANCE < least
+        off = np.flatnonzero(off)
+        flat = flattened(rotation[off], log_scale[off], axis, limits[off], least[off])
         values = parameters_and_average(dict(zip(("rotation", "log_scale"), flat, strict=True)))
         moments = dict.fromkeys(("first/rotation", "first/log_scale"), 0.0)
-        backend.assign(bound[rows[thick]], {**values, **moments})
+        backend.assign(bound[rows[off]], {**values, **moments})
 
     def _keep_layer(
         self, backend: Backend, bound: np.ndarray, columns: Mapping[str, np.ndarray]
@@ -191,13 +196,22 @@ def thickness(rotation: np.ndarray, log_scale: np.ndarray, axis: int) -> np.ndar
     return np.asarray(np.sqrt(((across * np.exp(log_scale)) ** 2).sum(1)))
 
 
+def width(rotation: np.ndarray, log_scale: np.ndarray, axis: int) -> np.ndarray:
+    """Standard deviation (N,) of splats across a local axis, geometric mean of both directions."""
+    across = np.delete(to_matrices(rotation) * np.exp(log_scale)[:, None], axis, axis=1)
+    return np.asarray(np.linalg.det(across @ across.swapaxes(1, 2)) ** 0.25)
+
+
 def flattened(
-    rotation: np.ndarray, log_scale: np.ndarray, axis: int, limit: np.ndarray
+    rotation: np.ndarray, log_scale: np.ndarray, axis: int, limit: np.ndarray, least: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Splats compressed along a local axis to the standard deviation `limit` (N,): rotation (N, 4)
-    wxyz and log_scale (N, 3), float32. What is seen along that axis stays as it is."""
-    sides = to_matrices(rotation) * np.exp(log_scale)[:, None]
-    sides[:, axis] *= (limit / np.linalg.norm(sides[:, axis], axis=1))[:, None]
+    """Splats compressed along a local axis to the standard deviation `limit` (N,), at most, and
+    widened across it to a `width` of `least` (N,): rotation (N, 4) wxyz and log_scale (N, 3),
+    float32. What is seen along that axis of those wide enough stays as it is."""
+    wider = np.maximum(least / np.maximum(width(rotation, log_scale, axis), MIN_WIDTH), 1)
+    sides = to_matrices(rotation) * np.exp(log_scale)[:, None] * wider[:, None, None]
+    thick = np.linalg.norm(sides[:, axis], axis=1)
+    sides[:, axis] *= np.minimum(limit / thick, 1)[:, None]
     variance, axes = np.linalg.eigh(sides @ sides.swapaxes(1, 2))
     axes[np.linalg.det(axes) < 0] *= -1
     turned = from_matrices(axes)

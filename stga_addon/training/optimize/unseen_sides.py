@@ -57,6 +57,7 @@ class UnseenSides:
     triangles   (F,) bool: no view shows them
     shown       (F,) bool: the views whose colors were looked at show them well
     color       (F, 3) in 0…1 that a triangle plausibly has
+    is_hair     (F,) bool: hair's triangles, where any is shown
     changes     (F,) 0…1: how much what views show looks different from elsewhere: hair, in which
                 sheen and strands are others, and what turns away from all views
     aside       (F, 3) in 0…1: the color that it has there
@@ -65,6 +66,7 @@ class UnseenSides:
     triangles: np.ndarray
     shown: np.ndarray
     color: np.ndarray
+    is_hair: np.ndarray
     changes: np.ndarray
     aside: np.ndarray
 
@@ -85,7 +87,8 @@ def unseen_sides(surface: Surface) -> UnseenSides:
     is_source = (pixels > 0) & is_outside & (cosine > SOURCE_COSINE) & ~surface.lids
     sources = np.flatnonzero(is_source)
     if not len(sources):
-        return UnseenSides(np.zeros_like(shown), shown, color, np.zeros(len(color)), color)
+        none = np.zeros_like(shown)
+        return UnseenSides(none, shown, color, none, none.astype(float), color)
     unseen = is_outside & (cosine < surface.grazing_cosine)
     found = color.copy()
     centers = np.asarray(capture.neutral)[capture.faces].mean(1)
@@ -98,6 +101,7 @@ def unseen_sides(surface: Surface) -> UnseenSides:
         found[rows] = np.median(color[own[near]], axis=1)
     changes = np.where(is_outside, surface.turned_from(SHOWN_COSINE), 0.0)
     aside = color.copy()
+    is_hair = np.zeros_like(shown)
     at = head_coordinates(capture)
     if at is not None:
         kinds = kinds_of(at, is_outside)
@@ -111,7 +115,7 @@ def unseen_sides(surface: Surface) -> UnseenSides:
             if kind == "scalp" and len(own):
                 near = nearest_rows(centers[own], centers[members], SOURCE_TRIANGLES)
                 aside[members] = np.median(color[own[near]], axis=1)
-                changes[members] = 1
+                is_hair |= members
             rows = np.flatnonzero(members & unseen)
             if len(own) and len(rows):
                 copied = color[sources_around_head(at, own, rows)]
@@ -125,15 +129,15 @@ def unseen_sides(surface: Surface) -> UnseenSides:
     found[within] = inside_colors(capture, color, shown, within)
     triangles = (is_outside & (cosine < UNSEEN_COSINE)) | inside
     aside = np.where(unseen[:, None], found, aside)
-    return UnseenSides(triangles, shown, found, changes, aside)
+    return UnseenSides(triangles, shown, found, is_hair, np.where(is_hair, 1.0, changes), aside)
 
 
 def plausible_aside(splats: Splats, along: np.ndarray, sides: UnseenSides) -> Splats:
     """Splats that views show along one direction only, that of their triangle (F, 3), with what is
-    plausible from aside."""
+    plausible from aside: hair, and of the rest what lies on it, not what hangs before it."""
     face = splats.face
-    share = ASIDE_SHARE * sides.changes
-    return colored_aside(splats, along[face], share[face], sides.aside[face])
+    changes = np.where(splats.unbound & ~sides.is_hair[face], 0.0, sides.changes[face])
+    return colored_aside(splats, along[face], ASIDE_SHARE * changes, sides.aside[face])
 
 
 def _fringe(at: HeadCoordinates, shown: np.ndarray) -> np.ndarray:
