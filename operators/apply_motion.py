@@ -7,6 +7,7 @@ from typing import Any
 import bpy
 import numpy as np
 
+from ..stga_addon.capture.open import open_capture
 from ..stga_addon.driving import open_motion
 from ..stga_addon.driving.head_map import head_turns
 from ..stga_addon.driving.open_motion import MotionOptions, TrainedRange
@@ -217,7 +218,7 @@ class ApplyMotion(Edit, bpy.types.Operator, FileImport):
         if path is not None:
             model = common.flame_model_path(context, head.get(tags.FLAME_MODEL, ""))
             name = path.stem
-            motion = common.flame_motion(str(path), path, model)
+            motion = open_capture(path, model).flame_motion()
             for sentence in motion.warnings:
                 self.warn(sentence)
         elif not is_head(other):

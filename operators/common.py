@@ -269,17 +269,9 @@ def capture_source(head: Any) -> tuple[Path, Path | None, str]:
 
 
 def own_motion(head: Any) -> FlameSequence:
-    """`flame_motion` of the capture that a head was imported from."""
-    return flame_motion(head.name, *capture_source(head))
-
-
-def flame_motion(name: str, source: Path, flame: Path | None, *point: str) -> FlameSequence:
-    """The FLAME parameters of a capture. Raises StgaError where it has none; `name` says whose."""
-    found = open_capture(source, flame, *point).flame
-    if found is None:
-        lacks = "so it has no parameters of expression and pose"
-        raise StgaError(f"{name}: was not tracked with FLAME, {lacks}")
-    return found
+    """FLAME parameters of the capture that a head was imported from. Raises StgaError where it has
+    none."""
+    return open_capture(*capture_source(head)).flame_motion(head.name)
 
 
 # Polls

@@ -7,6 +7,7 @@ from typing import Any
 import bpy
 from bpy.app.handlers import persistent
 
+from ..stga_addon.capture.open import open_capture
 from ..stga_addon.driving.head_map import head_map
 from ..stga_addon.errors import StgaError
 from ..stga_addon.scene import tags
@@ -99,7 +100,7 @@ class AddArkitControls(Edit, bpy.types.Operator):
 def _compute_shapes(source: tuple[Any, ...], name: str) -> tuple[Any, ...]:
     """What `add_shapes` takes: seconds of work. Raises StgaError for a head whose face ARKit's
     shapes do not fit."""
-    sequence = common.flame_motion(name, *source)
+    sequence = open_capture(*source).flame_motion(name)
     found = head_map(sequence, name)
     return found, *keyframes.head_shapes(sequence, found)
 
@@ -139,7 +140,8 @@ class _Sliders:
             if has_none:
                 self._made.append(_compute_shapes(source, self._head.name))
             else:
-                head_map(common.flame_motion(self._head.name, *source), self._head.name)
+                name = self._head.name
+                head_map(open_capture(*source).flame_motion(name), name)
 
     def tick(self) -> float | None:
         if self._thread.is_alive() or bpy.app.is_job_running("RENDER"):

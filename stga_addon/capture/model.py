@@ -81,6 +81,13 @@ class Capture:
         """Of every split, in their order."""
         return [view for views in self.views.values() for view in views]
 
+    def flame_motion(self, name: str = "") -> FlameSequence:
+        """`flame`. Raises StgaError, beginning with `name` or the folder's, where there is none."""
+        if self.flame is None:
+            lacks = "so it has no parameters of identity, expression and pose"
+            raise StgaError(f"{name or self.root}: was not tracked with FLAME, {lacks}")
+        return self.flame
+
 
 def views_by_timestep(views: Iterable[View]) -> dict[int, list[View]]:
     """The views of each timestep, in the order of the views."""

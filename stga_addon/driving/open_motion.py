@@ -14,7 +14,6 @@ from ..errors import StgaError
 from ..export.playback import playback_fps
 from ..files import is_file
 from ..flame.forward import FlameFrame
-from ..flame.model import FlameModel
 from ..flame.parts import flame_model
 from ..flame.sequence import FlameSequence, strengthened, transferred_motion
 from ..options import option
@@ -282,20 +281,18 @@ def open_motion(
         if flame is None and len(model.faces) != len(faces):
             problem = "needs the FLAME model file (.pkl or .npz) of the head that it moves"
             raise StgaError(f"{path}: {problem}; give it with --flame")
-        _check_faces(path, model, faces)
+        check_faces(path, model.faces, faces)
         person = person_of(model, neutral)
         name = str(flame or path)
         return performed(read_performance(path), person, name, options, trained, fps)
     capture = open_capture(path, flame)
-    if capture.flame is None:
-        problem = "was not tracked with FLAME, so it has no parameters of expression and pose"
-        raise StgaError(f"{path}: {problem}")
-    _check_faces(path, capture.flame.model, faces)
-    sequence = transferred_motion(capture.flame, neutral)
+    recorded = capture.flame_motion()
+    check_faces(path, recorded.model.faces, faces)
+    sequence = transferred_motion(recorded, neutral)
     own = sequence.frames()
     frames, beyond = adapted(own, options, trained)
     moved = _with_frames(sequence, sequence.timesteps, frames)
-    return Motion(moved, playback_fps(capture), 0, beyond, capture.flame.warnings)
+    return Motion(moved, playback_fps(capture), 0, beyond, recorded.warnings)
 
 
 def performed(
@@ -390,8 +387,9 @@ def _with_frames(
     return replace(person, timesteps=timesteps, frame=known.__getitem__)
 
 
-def _check_faces(path: Path, model: FlameModel, faces: np.ndarray) -> None:
-    if not np.array_equal(model.faces, faces):
+def check_faces(path: Path, found: np.ndarray, faces: np.ndarray) -> None:
+    """Raise StgaError where the triangles of a file are not the avatar's."""
+    if not np.array_equal(found, faces):
         raise StgaError(
             f"{path}: its mesh has other triangles than the one this avatar was trained on"
         )

@@ -11,7 +11,7 @@ from ..avatar.file import Avatar, read_avatar
 from ..capture.model import Capture
 from ..capture.open import open_capture, sequence_capture
 from ..capture.transforms import PRINCIPAL_POINTS
-from ..driving.open_motion import Motion, MotionOptions, open_motion, trained_range
+from ..driving.open_motion import Motion, MotionOptions, check_faces, open_motion, trained_range
 from ..errors import StgaError
 from ..export.ply import READ_FILES
 from ..files import read_json, read_npz, write_json, write_npz
@@ -87,10 +87,7 @@ def open_avatar(request: Posed) -> tuple[Avatar, Capture | None]:
             warn(f"{source}: was trained on refined meshes, which only its run's folder has")
     if capture is None:
         return avatar, None
-    if not np.array_equal(capture.faces, avatar.faces):
-        raise StgaError(
-            f"{capture.root}: its mesh has other triangles than the one this avatar was trained on"
-        )
+    check_faces(capture.root, capture.faces, avatar.faces)
     return avatar, capture if request.played is None else _as_played(capture, request.played)
 
 

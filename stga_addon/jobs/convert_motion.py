@@ -125,9 +125,9 @@ def convert_motion(request: ConvertMotion, report: Report, say: Say) -> Written:
 
 def _person(request: ConvertMotion) -> FlameSequence:
     if request.head is not None:
-        return _flame_motion(open_capture(request.head, request.flame), "identity")
+        return open_capture(request.head, request.flame).flame_motion()
     if request.avatar is not None:
-        return _flame_motion(open_refined(request.avatar), "identity")
+        return open_refined(request.avatar).flame_motion()
     model = flame_model(request.flame)
     return person_of(model, model.v_template)
 
@@ -169,7 +169,7 @@ def _tracked_by_avatar(
 
 def _performance_of_head(tracked: Capture) -> Performance:
     """ARKit's shapes of a tracked capture, with the head's turns from its first timestep on."""
-    sequence = _flame_motion(tracked, "parameters of expression and pose")
+    sequence = tracked.flame_motion()
     fps = playback_fps(tracked, numbered=True)
     performance = captured_performance(sequence, str(tracked.root), fps)
     poses = np.stack([sequence.frame(timestep).pose for timestep in sequence.timesteps])
@@ -183,7 +183,7 @@ def _performance_of_head(tracked: Capture) -> Performance:
 
 def _resampled(tracked: Capture, request: ConvertMotion) -> Motion:
     """The parameters of a tracked capture, a timestep per 1/fps seconds, with the options."""
-    sequence = _flame_motion(tracked, "parameters of expression and pose")
+    sequence = tracked.flame_motion()
     rate = playback_fps(tracked, numbered=True)
     fps = request.fps or rate
     frames, _ = adapted(retimed(sequence, rate / fps), request.options)
@@ -203,7 +203,7 @@ def _shapes_of_motion(request: ConvertMotion) -> Performance:
     if request.head is not None:
         raise StgaError(f"--head: has no effect on {source}, which has its own identity")
     capture = open_capture(source, request.flame)
-    sequence = _flame_motion(capture, "parameters of expression and pose")
+    sequence = capture.flame_motion()
     # of the parameters: what leaks into them are no weights from 0 to 1
     if neutral != "none":
         frames = sequence.frames()
@@ -211,12 +211,6 @@ def _shapes_of_motion(request: ConvertMotion) -> Performance:
         known = dict(zip(sequence.timesteps, frames, strict=True))
         sequence = replace(sequence, frame=known.__getitem__)
     return captured_performance(sequence, str(source), playback_fps(capture, numbered=True))
-
-
-def _flame_motion(capture: Capture, lacking: str) -> FlameSequence:
-    if capture.flame is None:
-        raise StgaError(f"{capture.root}: was not tracked with FLAME, so it has no {lacking}")
-    return capture.flame
 
 
 def write_motion(path: Path, sequence: FlameSequence) -> None:

@@ -46,9 +46,8 @@ def correct_capture(
     written then.
     """
     capture = open_capture(out, model)
-    if capture.flame is None:
-        raise StgaError(f"{out}: was not tracked with FLAME; only FLAME's pose can be corrected")
-    timesteps, solved = _solved(out, capture.flame)
+    tracked = capture.flame_motion()
+    timesteps, solved = _solved(out, tracked)
     unknown = sorted(set(keys) - set(timesteps))
     if unknown:
         raise StgaError(f"{out}: has no timestep {unknown[0]}, which a key is of")
@@ -60,7 +59,7 @@ def correct_capture(
     trust = _trust(out / REPORT_FILE, read_json(out / REPORT_FILE), timesteps)
     places, used, _, _ = _landmarks(out, capture)
     report(Stage.CORRECTION, 0, 1)
-    person = with_identity(capture.flame).model
+    person = with_identity(tracked).model
     heads = corrected(person, places[used], solved, trust, rows, span)
     write_npz(out / SOLVED_FILE, {"timesteps": np.array(timesteps), "parameters": solved})
     for number, (timestep, values) in enumerate(zip(timesteps, heads, strict=True)):
