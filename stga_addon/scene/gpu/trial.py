@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from ...avatar.embedding import WORLD
-from ...avatar.splats import SH_C0, Splats, logits
+from ...avatar.splats import SH_C0, in_world, logits
 from ...capture.camera import Camera
 from ...flame.quaternions import to_matrices
 from ...raster.posed_splats import ComposedImage
@@ -49,15 +49,8 @@ def _layer(hidden: int) -> SceneLayer:
     values = (xyz, POSITIONS_M), (rotation, ROTATIONS), (deviation, DEVIATIONS_M)
     for whole, three in (*values, (opacity, OPACITIES), (color, COLORS)):
         whole[: len(three)] = three
-    splats = Splats(
-        xyz=xyz.astype(np.float32),
-        rotation=rotation.astype(np.float32),
-        log_scale=np.log(deviation).astype(np.float32),
-        opacity=logits(opacity),
-        sh=((color - 0.5) / SH_C0)[:, None].astype(np.float32),
-        face=np.zeros(count, np.int32),
-        unbound=np.zeros(count, bool),
-    )
+    sh = ((color - 0.5) / SH_C0)[:, None]
+    splats = in_world(xyz, rotation, np.log(deviation), logits(opacity), sh)
     return SceneLayer(splats, WORLD, np.eye(4))
 
 
