@@ -12,6 +12,8 @@ from stga_addon.capture.model import Capture
 from stga_addon.flame.sequence import FlameSequence, expression_mesh, neutral_mesh, sequence_mesh
 from stga_addon.scene.arrays import evaluated_vertices
 
+from .session import ops
+
 
 def at_frame(head, frame):
     """(V, 3) of an object's evaluated mesh."""
@@ -93,6 +95,6 @@ def import_small_head(folder, **motion):
     write_flame(model, folder / "flame.npz")
     shape = np.linspace(-0.5, 0.5, model.n_identity)
     np.savez(folder / "own.npz", shape=shape, **motion)
-    files = {"filepath": str(folder / "own.npz"), "flame": str(folder / "flame.npz")}
-    bpy.ops.stga.import_motion(**files)
+    files = {"filepath": folder / "own.npz", "flame": folder / "flame.npz"}
+    ops.import_motion(**files)
     return FlameSequence(model, shape, None, (), {}.__getitem__)

@@ -16,6 +16,8 @@ from stga_addon.jobs.table import Kind
 from stga_addon.progress import Progress
 from stga_addon.worker.training_python import missing_packages
 
+from .session import ops, panel
+
 collect_ignore_glob = [] if importlib.util.find_spec("bpy") else ["test_*.py"]
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -76,10 +78,9 @@ def extension():
 @pytest.fixture
 def head(extension, tmp_path):
     """The head of a mesh capture, in the folder `capture`."""
-    import bpy
 
-    bpy.ops.stga.import_capture(directory=str(write_mesh_capture(tmp_path / "capture")))
-    return bpy.context.scene.stga.head
+    ops.import_capture(directory=write_mesh_capture(tmp_path / "capture"))
+    return panel().head
 
 
 @pytest.fixture

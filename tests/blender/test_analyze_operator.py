@@ -12,11 +12,13 @@ from stga_addon.jobs.table import Kind
 from stga_addon.training.run.folder import read_run
 from stga_addon.training.settings import PRESETS
 
+from .session import failure, ops, panel
+
 
 @pytest.fixture
 def chosen(head):
     """The settings of a scene with a head."""
-    return bpy.context.scene.stga
+    return panel()
 
 
 def test_effect_choices(chosen, extension, tmp_path):
@@ -24,8 +26,8 @@ def test_effect_choices(chosen, extension, tmp_path):
     row = chosen.effects.add()
     row.name = "jaw"
     row.choice = "on"
-    with pytest.raises(RuntimeError, match=r"jaw=on: .* no parameters of FLAME"):
-        bpy.ops.stga.analyze_capture()
+    with failure(r"jaw=on: .* no parameters of FLAME"):
+        ops.analyze_capture()
     assert error_of(extension, Kind.ANALYSIS).startswith("jaw=on: ")
     assert "Traceback" not in error_of(extension, Kind.ANALYSIS)
     chosen.preset_timing = '{"draft": 1}'
@@ -35,7 +37,7 @@ def test_effect_choices(chosen, extension, tmp_path):
     row = chosen.effects.add()  # as an earlier analysis leaves it
     row.name = "strain-color"
     row.choice = "on"
-    bpy.ops.stga.analyze_capture()
+    ops.analyze_capture()
     rows = {row.name: row for row in chosen.effects}
     assert len(rows) == len(chosen.effects) > 2
     assert (rows["exposure"].on, rows["exposure"].choice) == (False, "auto")
@@ -48,7 +50,7 @@ def test_effect_choices(chosen, extension, tmp_path):
     chosen.preset = "draft"
     assert chosen.minutes == pytest.approx(seconds["draft"] / 60)
     out = tmp_path / "run"
-    bpy.ops.stga.train(directory=str(out), iterations=3, effects=effects, preset=chosen.preset)
+    ops.train(directory=out, iterations=3, effects=effects, preset=chosen.preset)
     run = read_run(out)
     assert "strain_color" in run.settings.driven_offsets
     assert run.settings.preset == "draft"
@@ -83,7 +85,7 @@ def analyze(extension, monkeypatch, tmp_path):
     def start(body):
         python = write_interpreter(tmp_path / "python", body)
         monkeypatch.setattr(extension.operators.train, "training_python", lambda context: python)
-        bpy.ops.stga.analyze_capture()
+        ops.analyze_capture()
 
     monkeypatch.setattr(extension.operators.timers, "has_timer", lambda: True)
     yield start
@@ -124,19 +126,19 @@ def test_failed_analysis_is_a_sentence(chosen, extension, analyze, body, sentenc
 
 def test_analysis_can_be_cancelled(chosen, extension, analyze, monkeypatch, tmp_path):
     """Catches an analysis that nobody can stop, and a folder left for each attempt that fails."""
-    assert not bpy.ops.stga.cancel.poll()
+    assert not ops.cancel.poll()
     analyze("time.sleep(600)")
-    assert not bpy.ops.stga.analyze_capture.poll()
+    assert not ops.analyze_capture.poll()
     begin = time.monotonic()
-    bpy.ops.stga.cancel(request="analysis")
+    ops.cancel(request="analysis")
     assert time.monotonic() - begin < 60
-    assert bpy.ops.stga.analyze_capture.poll()
+    assert ops.analyze_capture.poll()
     assert extension.operators.monitor.tick() is None
     assert error_of(extension, Kind.ANALYSIS) == ""
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
     python = str(tmp_path / "none")
     monkeypatch.setattr(extension.operators.train, "training_python", lambda context: python)
     before = set(tmp_path.iterdir())
-    with pytest.raises(RuntimeError, match="cannot be started as a Python interpreter"):
-        bpy.ops.stga.analyze_capture()
+    with failure("cannot be started as a Python interpreter"):
+        ops.analyze_capture()
     assert set(tmp_path.iterdir()) == before

@@ -16,6 +16,8 @@ from stga_addon.scene.rig.head import rig_of
 from stga_addon.training.optimize.avatar_tracking import RefinedTracking
 from stga_addon.training.run.folder import with_refined_tracking, write_tracking
 
+from .session import failure, ops, panel
+
 pytestmark = pytest.mark.usefixtures("extension")
 TOLERANCE = 2e-6
 UNDRAWN = {"filepath", "source", "filter_glob", "is_open"}
@@ -28,7 +30,7 @@ class Reenacted:
         capture_folder, self.model_file = write_flame_capture(folder / "own")
         self.folder = capture_folder
         self.own = open_capture(capture_folder, self.model_file).flame
-        bpy.ops.stga.import_capture(directory=str(capture_folder), flame=str(self.model_file))
+        ops.import_capture(directory=capture_folder, flame=self.model_file)
         rng = np.random.default_rng(5)
         self.other = {
             "expr": rng.normal(size=(5, 2)),
@@ -57,7 +59,7 @@ def scene(tmp_path):
 
 
 def the_head():
-    return bpy.context.scene.stga.head
+    return panel().head
 
 
 def at(frame):
@@ -81,17 +83,17 @@ def test_refined_tracking_keeps_the_offsets_of_each_frame(tmp_path, place):
     for path in (folder / "flame_param").glob("*.npz"):
         offset = rng.normal(0, 0.004, (1, len(ball()[0]), 3)).astype(np.float32)
         np.savez(path, **np.load(path), dynamic_offset=offset)
-    bpy.ops.stga.import_capture(directory=str(folder), flame=str(model))
+    ops.import_capture(directory=folder, flame=model)
     own = open_capture(folder, model)
     write_refined(tmp_path, own, rng)
     shown = with_refined_tracking(own, tmp_path)
     path = str(tmp_path / "tracking.npz")
-    bpy.ops.stga.apply_motion(filepath=path, start=0, place=place)
+    ops.apply_motion(filepath=path, start=0, place=place)
     assert np.abs(at(3) - shown.mesh(3)).max() > 1e-3  # as anybody's motion: without
-    bpy.ops.stga.apply_motion(filepath=path, start=0, place=place, own_offsets=True)
+    ops.apply_motion(filepath=path, start=0, place=place, own_offsets=True)
     for timestep in own.timesteps:
         assert_allclose(at(timestep), shown.mesh(timestep), atol=2 * TOLERANCE)
-    bpy.ops.stga.apply_motion(filepath=path, start=10, speed=0.5, place=place, own_offsets=True)
+    ops.apply_motion(filepath=path, start=10, speed=0.5, place=place, own_offsets=True)
     for timestep in own.timesteps:
         assert_allclose(at(10 + 2 * timestep), shown.mesh(timestep), atol=2 * TOLERANCE)
 
@@ -101,7 +103,7 @@ def test_undo(scene):
     actions = sorted(bpy.data.actions.keys())
     before = at(1)
     bpy.ops.ed.undo_push(message="before")
-    bpy.ops.stga.apply_motion(filepath=str(scene.file), start=1, place="strip")
+    ops.apply_motion(filepath=scene.file, start=1, place="strip")
     bpy.ops.ed.undo_push(message="after")
     assert np.abs(at(1) - before).max() > 1e-3
     bpy.ops.ed.undo()
@@ -113,20 +115,20 @@ def test_undo(scene):
 def test_a_file_its_parts_and_its_frames(scene):
     """Catches switches without effect, the other's identity, a shifted frame, and another speed."""
     chosen = {"jaw": False, "eyes": False, "neck": False, "head": False, "strength": 0.5}
-    bpy.ops.stga.apply_motion(filepath=str(scene.file), start=0, **chosen)
+    ops.apply_motion(filepath=scene.file, start=0, **chosen)
     own = vars(scene.own.frame(1)) | {"expr": scene.other["expr"][1] / 2}
     assert_allclose(at(1), scene.mesh(**own), atol=TOLERANCE)
-    with pytest.raises(RuntimeError, match="no part is chosen"):
-        bpy.ops.stga.apply_motion(filepath=str(scene.file), **chosen, expression=False)
-    bpy.ops.stga.apply_motion(filepath=str(scene.file), start=10)
+    with failure("no part is chosen"):
+        ops.apply_motion(filepath=scene.file, **chosen, expression=False)
+    ops.apply_motion(filepath=scene.file, start=10)
     for row in range(5):
         assert_allclose(at(10 + row), scene.mesh(**scene.theirs(row)), atol=TOLERANCE)
     assert bpy.context.scene.frame_end == 14
     bpy.context.scene.render.fps = 24
-    bpy.ops.stga.apply_motion(filepath=str(scene.file), start=1, fps=48)
+    ops.apply_motion(filepath=scene.file, start=1, fps=48)
     for frame, row in ((1, 0), (2, 2), (3, 4)):
         assert_allclose(at(frame), scene.mesh(**scene.theirs(row)), atol=TOLERANCE)
-    bpy.ops.stga.apply_motion(filepath=str(scene.file), start=1, fps=48, speed=0.5)
+    ops.apply_motion(filepath=scene.file, start=1, fps=48, speed=0.5)
     assert_allclose(at(4), scene.mesh(**scene.theirs(3)), atol=TOLERANCE)
 
 
@@ -134,16 +136,16 @@ def test_a_capture_and_another_head(scene, tmp_path):
     """Catches a folder not taken as a motion, and a hand-made animation that is not applied."""
     folder, model = write_flame_capture(tmp_path / "second", timesteps=(0, 1, 2))
     name = the_head().name
-    bpy.ops.stga.apply_motion(filepath=str(folder), start=20)
+    ops.apply_motion(filepath=folder, start=20)
     expected = {**vars(scene.own.frame(1)), **read_row(2)}
     assert_allclose(at(22), scene.mesh(**expected), atol=TOLERANCE)
-    bpy.ops.stga.import_capture(directory=str(folder), flame=str(model))
+    ops.import_capture(directory=folder, flame=model)
     second = the_head()
     rig_of(second).animation_data.action = None
     rig_of(second).pose.bones["neck"].rotation_quaternion = (np.cos(0.2), 0, np.sin(0.2), 0)
     rig_of(second).pose.bones["neck"].keyframe_insert("rotation_quaternion", frame=0)
-    bpy.context.scene.stga.head = bpy.data.objects[name]
-    bpy.ops.stga.apply_motion(source=second.name, start=40, head=False, jaw=False, eyes=False)
+    panel().head = bpy.data.objects[name]
+    ops.apply_motion(source=second.name, start=40, head=False, jaw=False, eyes=False)
     # What is not taken stays: frame 42 lies behind the last keyframe of before, which holds.
     own = expected | {"expr": read_row(2)["expr"], "neck_pose": np.array([0, 0.4, 0])}
     assert_allclose(at(42), scene.mesh(**own), atol=TOLERANCE)
@@ -164,27 +166,27 @@ def test_wrong_sources_change_nothing(scene, tmp_path):
     (tmp_path / "take.bvh").write_text("HIERARCHY\n")
     meshes = write_mesh_capture(tmp_path / "meshes")
     for arguments, message in (
-        ({"filepath": str(tmp_path / "gone.npz")}, "gone.npz: does not exist"),
-        ({"filepath": str(tmp_path / "take.bvh")}, "take.bvh: is no motion; expected .csv"),
-        ({"filepath": str(scene.model_file)}, "has none of expr"),
-        ({"filepath": str(tmp_path / "wide.npz")}, "expr has shape"),
-        ({"filepath": str(meshes)}, "was not tracked with FLAME"),
+        ({"filepath": tmp_path / "gone.npz"}, "gone.npz: does not exist"),
+        ({"filepath": tmp_path / "take.bvh"}, "take.bvh: is no motion; expected .csv"),
+        ({"filepath": scene.model_file}, "has none of expr"),
+        ({"filepath": tmp_path / "wide.npz"}, "expr has shape"),
+        ({"filepath": meshes}, "was not tracked with FLAME"),
         ({}, "no path given"),
         ({"source": "nobody"}, "nobody: is not an imported head"),
         ({"source": the_head().name}, "is this head itself"),
-        ({"filepath": str(tmp_path / "long.npz"), "start": 1_048_573}, "Blender's last frame is"),
+        ({"filepath": tmp_path / "long.npz", "start": 1_048_573}, "Blender's last frame is"),
     ):
-        with pytest.raises(RuntimeError, match=message):
-            bpy.ops.stga.apply_motion(**arguments)
+        with failure(message):
+            ops.apply_motion(**arguments)
     assert sorted(bpy.data.actions.keys()) == actions
     assert_array_equal(at(1), before)
     scene.model_file.rename(tmp_path / "elsewhere.npz")
-    with pytest.raises(RuntimeError, match=r"model\.npz: cannot be read"):
-        bpy.ops.stga.apply_motion(filepath=str(scene.file))
-    bpy.ops.stga.import_capture(directory=str(meshes))
+    with failure(r"model\.npz: cannot be read"):
+        ops.apply_motion(filepath=scene.file)
+    ops.import_capture(directory=meshes)
     needed = r"has no FLAME rig.*splats follow whatever moves its mesh"
-    with pytest.raises(RuntimeError, match=needed):
-        bpy.ops.stga.apply_motion(filepath=str(scene.file))
+    with failure(needed):
+        ops.apply_motion(filepath=scene.file)
 
 
 def test_the_dialog_shows_what_people_need(extension):

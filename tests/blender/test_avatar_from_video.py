@@ -14,6 +14,8 @@ from tracking.head_video import write_head_video
 
 from stga_addon.scene import tags
 
+from .session import failure, ops, panel, save
+
 
 @pytest.fixture
 def video(tmp_path):
@@ -48,7 +50,7 @@ def test_it_is_the_request_of_the_command_line(extension, asked, video, tmp_path
     opened = list[bool]()
     show_panel = lambda: opened.append(True)  # noqa: E731
     monkeypatch.setattr(extension.operators.track, "show_panel", show_panel)
-    bpy.ops.stga.avatar_from_video(filepath=str(video), folder=str(out), minutes=0.05, focal=2308.3)
+    ops.avatar_from_video(filepath=video, folder=out, minutes=0.05, focal=2308.3)
     main, commands = (
         import_module(f"{extension.__name__}.stga_addon.cli.{name}")
         for name in ("main", "commands")
@@ -59,12 +61,12 @@ def test_it_is_the_request_of_the_command_line(extension, asked, video, tmp_path
     assert main.main(["avatar", str(video), *options]) == 0
     assert asked == made
     look = tmp_path / "look"
-    bpy.ops.stga.avatar_from_video(filepath=str(video), folder=str(look), quick=True)
+    ops.avatar_from_video(filepath=video, folder=look, quick=True)
     assert main.main(["avatar", str(video), "--out", str(look), "--quick", "--no-blend"]) == 0
     assert asked == made
     assert (made[1].track.step, made[1].track.size) == (3, 0.5)
     begin(asked)
-    bpy.ops.stga.avatar_from_video(folder=str(look))  # continues
+    ops.avatar_from_video(folder=look)  # continues
     assert asked[2] == asked[1]
     assert opened == [True] * 3
 
@@ -73,7 +75,7 @@ def test_the_folder_is_proposed_beside_the_file(asked, video, tmp_path):
     """Catches an avatar continued with another video or begun anew, and a folder far away."""
 
     def make(path):
-        bpy.ops.stga.avatar_from_video(filepath=str(path))
+        ops.avatar_from_video(filepath=path)
         return asked[-1].out
 
     assert make(video) == tmp_path / "anna avatar"
@@ -84,31 +86,29 @@ def test_the_folder_is_proposed_beside_the_file(asked, video, tmp_path):
     other = tmp_path / "shots/anna.mp4"
     other.parent.mkdir()
     other.touch()
-    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "head.blend"))
+    save(tmp_path / "head.blend")
     assert make(other) == tmp_path / "anna avatar 3"
 
 
 def test_what_was_begun_is_continued_by_its_folder(asked, video, tmp_path):
     """Catches a Continue that asks for the video again, or has other options or time."""
-    bpy.ops.stga.avatar_from_video(filepath=str(video), focal=900.0, minutes=20)
+    ops.avatar_from_video(filepath=video, focal=900.0, minutes=20)
     begin(asked)
     folder = str(tmp_path / "anna avatar")
-    bpy.ops.stga.avatar_from_video("INVOKE_DEFAULT", folder=folder)
+    ops.avatar_from_video("INVOKE_DEFAULT", folder=folder)
     assert asked[1] == asked[0]
-    bpy.ops.stga.avatar_from_video(folder=folder, minutes=2)
+    ops.avatar_from_video(folder=folder, minutes=2)
     assert asked[2].train.settings.seconds == 120
 
 
 def test_mistakes_are_sentences(extension, video, tmp_path, monkeypatch):
     """Catches a worker started for nothing, and another video's request in a folder."""
-    with pytest.raises(RuntimeError, match=r"gone\.mp4: is not a file; expected a video"):
-        bpy.ops.stga.avatar_from_video(filepath=str(tmp_path / "gone.mp4"))
+    with failure(r"gone\.mp4: is not a file; expected a video"):
+        ops.avatar_from_video(filepath=tmp_path / "gone.mp4")
     (tmp_path / "out/capture").mkdir(parents=True)
     (tmp_path / "out/inputs.json").write_text('{"footage": "/shots/ben.mp4", "model": null}')
-    with pytest.raises(RuntimeError, match=r"footage: .*out began with .*ben\.mp4"):
-        bpy.ops.stga.avatar_from_video(
-            filepath=str(video), folder=str(tmp_path / "out"), python=sys.executable
-        )
+    with failure(r"footage: .*out began with .*ben\.mp4"):
+        ops.avatar_from_video(filepath=video, folder=tmp_path / "out", python=sys.executable)
 
 
 @pytest.mark.slow
@@ -117,8 +117,8 @@ def test_from_a_video_to_splats_on_the_head(extension, tmp_path):
     pytest.importorskip("torch")
     video = tmp_path / "head.mp4"
     write_head_video(video, 3)
-    bpy.ops.stga.avatar_from_video(filepath=str(video), minutes=0.05, python=sys.executable)
-    settings = bpy.context.scene.stga
+    ops.avatar_from_video(filepath=video, minutes=0.05, python=sys.executable)
+    settings = panel()
     out = tmp_path / "head avatar"
     assert settings.head[tags.CAPTURE] == str(out / "capture")
     assert settings.splats[tags.RUN] == settings.run_folder == str(out / "run")
@@ -129,6 +129,6 @@ def test_from_a_video_to_splats_on_the_head(extension, tmp_path):
     pixels, *_ = extension.operators.monitor.curves[out / "run"]
     assert pixels.shape == (256, 256, 4)
     # Again: nothing is left to do but to show it
-    bpy.ops.stga.avatar_from_video(filepath=str(video), minutes=0.05, python=sys.executable)
+    ops.avatar_from_video(filepath=video, minutes=0.05, python=sys.executable)
     heads = [thing for thing in bpy.data.objects if thing.get(tags.KIND) == tags.HEAD]
     assert heads == [settings.head]

@@ -25,6 +25,7 @@ from stga_addon.scene.rig.head import import_head
 from stga_addon.tracking.footage.open import open_footage
 
 from .captures import mesh_capture
+from .session import failure, ops, viewport
 
 
 def pose(seed):
@@ -185,13 +186,12 @@ def test_looking_through_cameras_gives_the_resolution_back(extension, head):
     """Catches renders at a camera's size after it was looked through, and a size of the user's own
     that was chosen meanwhile, or after orbiting away, replaced."""
     render = bpy.context.scene.render
-    window = bpy.context.window_manager.windows[0]
-    area = next(area for area in window.screen.areas if area.type == "VIEW_3D")
+    window, area = viewport()
     view = area.spaces.active.region_3d
 
     def press(step=0):
         with bpy.context.temp_override(window=window, area=area, region=area.regions[-1]):
-            bpy.ops.stga.view_footage(step=step)
+            ops.view_footage(step=step)
         return render.resolution_x, render.resolution_y
 
     render.resolution_x = 1920
@@ -270,7 +270,7 @@ def scene_with_cameras():
 def test_exported_cameras(tmp_path):
     """Catches shift, sensor fit, resolution or scale lost, and a camera written as another."""
     scene_with_cameras()
-    assert bpy.ops.stga.export_cameras(filepath=str(tmp_path / "transforms.json")) == {"FINISHED"}
+    assert ops.export_cameras(filepath=tmp_path / "transforms.json") == {"FINISHED"}
     for name in ("left", "Camera.001", "on rail"):
         for number in (1, 2):
             path = tmp_path / "images" / name / f"{number}.png"
@@ -293,18 +293,18 @@ def test_exported_cameras(tmp_path):
     left = bpy.data.objects["left"]
     path = tmp_path / "cameras.json"
     left.select_set(True)
-    bpy.ops.stga.export_cameras(filepath=str(path), selected_only=True)
+    ops.export_cameras(filepath=path, selected_only=True)
     (frame,) = json.loads(path.read_text(encoding="utf-8"))["frames"]
     assert frame["camera_id"] == "left"
     left.select_set(False)
-    none = {"filepath": str(tmp_path / "none.json"), "selected_only": True}
-    with pytest.raises(RuntimeError, match="No cameras to export"):
-        bpy.ops.stga.export_cameras(**none)
+    none = {"filepath": tmp_path / "none.json", "selected_only": True}
+    with failure("No cameras to export"):
+        ops.export_cameras(**none)
     assert not (tmp_path / "none.json").exists()
     left.scale = -1, 1, 1
-    with pytest.raises(RuntimeError, match="left: is mirrored by a negative scale"):
-        bpy.ops.stga.export_cameras(filepath=str(path))
+    with failure("left: is mirrored by a negative scale"):
+        ops.export_cameras(filepath=path)
     left.scale = (1, 1, 1)
     left.data.type = "ORTHO"
-    with pytest.raises(RuntimeError, match="left: is not a perspective camera"):
-        bpy.ops.stga.export_cameras(filepath=str(path))
+    with failure("left: is not a perspective camera"):
+        ops.export_cameras(filepath=path)

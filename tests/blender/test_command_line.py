@@ -16,7 +16,8 @@ from stga_addon.export.ply import read_ply
 from stga_addon.scene.arrays import evaluated_vertices
 from stga_addon.scene.vertex_groups import read_selection
 
-from .test_operators import write_ball_avatar
+from .session import open_file, ops, panel, save
+from .test_operators import show_ball
 
 
 @pytest.fixture
@@ -28,9 +29,9 @@ def stga(extension):
 
 
 def save_and_open(path):
-    bpy.ops.wm.save_as_mainfile(filepath=str(path))
+    save(path)
     bpy.ops.wm.read_factory_settings(use_empty=True)
-    bpy.ops.wm.open_mainfile(filepath=str(path))
+    open_file(path)
 
 
 def test_the_open_head_stands_in_for_the_capture(stga, tmp_path, capfd):
@@ -39,7 +40,7 @@ def test_the_open_head_stands_in_for_the_capture(stga, tmp_path, capfd):
         stga("info")
     assert "CAPTURE" in capfd.readouterr().err
     folder = write_mesh_capture(tmp_path / "capture")
-    bpy.ops.stga.import_capture(directory=str(folder))
+    ops.import_capture(directory=folder)
     save_and_open(tmp_path / "head.blend")
     assert stga("select", "--threshold", 0.0005) == 0
     assert "320 triangles" in capfd.readouterr().out
@@ -65,10 +66,9 @@ def test_what_the_open_head_plays(stga, here, tmp_path):
     """Catches an export or rendering that misses avatar or capture, or has the tracked motion where
     the head in the file is animated otherwise."""
     folder, model = write_flame_capture(tmp_path / "capture")
-    bpy.ops.stga.import_capture(directory=str(folder), flame=str(model))
-    avatar = write_ball_avatar(tmp_path / "a.npz", open_capture(folder, model).neutral, order=0)
-    bpy.ops.stga.show_avatar(filepath=str(tmp_path / "a.npz"))
-    keys = bpy.context.scene.stga.head.data.shape_keys
+    ops.import_capture(directory=folder, flame=model)
+    avatar = show_ball(tmp_path / "a.npz", open_capture(folder, model).neutral, order=0)
+    keys = panel().head.data.shape_keys
     keys.animation_data.action = None
     keys.key_blocks["expr_001"].value = 2.5
     save_and_open(tmp_path / "head.blend")
@@ -78,7 +78,7 @@ def test_what_the_open_head_plays(stga, here, tmp_path):
     written = sorted(path.name for path in (tmp_path / "plys").glob("*.ply"))
     assert written == [f"{timestep:05d}.ply" for timestep in range(4)]
     bpy.context.scene.frame_set(2)  # not among the tracked timesteps
-    frames = avatar.frames(evaluated_vertices(bpy.context.scene.stga.head))
+    frames = avatar.frames(evaluated_vertices(panel().head))
     expected = to_world(avatar.splats, frames).xyz
     assert_allclose(read_ply(tmp_path / "plys/00002.ply").xyz, expected, atol=1e-6)
     with np.load(tmp_path / "pair/flame_param.npz") as pair:
@@ -130,14 +130,14 @@ def test_the_chosen_python_carries_commands_out(stga, extension, tmp_path, monke
 def test_training_is_the_panels(stga, here, head, tmp_path):
     """Catches a headless run or worker that ignores painted groups or settings."""
     pytest.importorskip("torch")
-    bpy.ops.stga.select(threshold=0.0005)
+    ops.select(threshold=0.0005)
     head.vertex_groups["stga_3"].remove(list(range(60)))
     head.vertex_groups.new(name="stga_0").add(list(range(40)), 1.0, "REPLACE")
     painted = read_selection(head)
     save_and_open(tmp_path / "head.blend")
     options = {"iterations": 8, "strategy": "selective", "seed": 3}
     by_worker = {"wait": True, "python": sys.executable}
-    bpy.ops.stga.train(directory=str(tmp_path / "panel"), **by_worker, **options)
+    ops.train(directory=tmp_path / "panel", **by_worker, **options)
     arguments = [item for name, value in options.items() for item in (f"--{name}", value)]
     assert here("train", "--out", tmp_path / "headless", *arguments) == 0
     assert stga("train", "--out", tmp_path / "delegated", *arguments) == 0
@@ -159,7 +159,7 @@ def test_an_avatar_from_footage(stga, take, tmp_path, capfd):
     more = ["--iterations", "4", "--effect", "tracking=on"]
     assert stga("avatar", *given, "--out", tmp_path / "out", *more) == 0
     assert capfd.readouterr().out.splitlines()[-1] == f"blender: {tmp_path / 'out/avatar.blend'}"
-    bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "out/avatar.blend"))
+    open_file(tmp_path / "out/avatar.blend")
     (splats,) = [thing for thing in bpy.data.objects if thing.get("stga_kind") == "splats"]
     assert splats["stga_avatar"] == "//run/avatar.npz"
     assert any("tracking" in action.name for action in bpy.data.actions)  # the refined motion

@@ -12,6 +12,7 @@ from stga_addon.jobs.monitor_state import RequestState
 from stga_addon.jobs.table import Kind
 from stga_addon.training.run.folder import read_run
 
+from .session import failure, ops, panel
 from .test_analyze_operator import error_of, tick_until_done, write_interpreter
 from .test_operators import write_ball_avatar
 from .test_train_operators import ask_only
@@ -44,14 +45,14 @@ def run(tmp_path):
 def test_what_is_painted_or_selected_becomes_the_region(head, asked, run, extension):
     """Catches another region or selection, and lost settings."""
     chosen = {"device": "gpu", "adapter": "Card (Vulkan)", "seconds": 7, "growth": 0.5}
-    bpy.ops.stga.refine(directory=str(run), group="cheek", first=1, last=3, **chosen)
+    ops.refine(directory=run, group="cheek", first=1, last=3, **chosen)
     new = run.with_name("run_2")
     (wanted,) = asked
     assert (wanted.run, wanted.parent, wanted.device) == (new, run, "gpu:Card (Vulkan)")
     assert (wanted.frames, wanted.seconds, wanted.growth) == ((1, 3), 7, 0.5)
     assert wanted.weights[:40] == pytest.approx(0.8)
     assert (wanted.weights >= 0.5).sum() < 80
-    bpy.ops.stga.refine(directory=str(run), region="mouth", seconds=3)
+    ops.refine(directory=run, region="mouth", seconds=3)
     assert (asked[-1].region, asked[-1].weights) == ("mouth", None)
     head.hide_set(False)
     bpy.context.view_layer.objects.active = head
@@ -59,7 +60,7 @@ def test_what_is_painted_or_selected_becomes_the_region(head, asked, run, extens
         polygon.select = polygon.index in (3, 5, 8)
     bpy.context.tool_settings.mesh_select_mode = (False, False, True)
     bpy.ops.object.mode_set(mode="EDIT")
-    bpy.ops.stga.refine(directory=str(run), seconds=3)
+    ops.refine(directory=run, seconds=3)
     assert np.flatnonzero(asked[-1].weights).tolist() == [3, 5, 8]
     bpy.ops.object.mode_set(mode="OBJECT")
 
@@ -70,7 +71,7 @@ def test_the_panel_stays_at_the_run_until_another_continues_it(
     """Catches a panel at an empty run after a failure, which refuses the next attempt; and one that
     does not go on to the run that was trained."""
     monitor = extension.operators.monitor
-    settings = bpy.context.scene.stga
+    settings = panel()
     monkeypatch.setattr(extension.operators.timers, "has_timer", lambda: True)
     settings.run_folder = str(run)
     settings.avatar = str(run / "avatar.npz")
@@ -80,7 +81,7 @@ def test_the_panel_stays_at_the_run_until_another_continues_it(
     }
     for state, body in ends.items():
         python = write_interpreter(tmp_path / "python", body)
-        bpy.ops.stga.refine(directory=settings.run_folder, group="cheek", python=python)
+        ops.refine(directory=settings.run_folder, group="cheek", python=python)
         monitor._processes[monitor.state_of(bpy.context.scene, Kind.TRAINING).folder].wait(60)
         tick_until_done(extension, Kind.TRAINING)
         assert monitor.state_of(bpy.context.scene, Kind.TRAINING).snapshot.state == state
@@ -93,14 +94,14 @@ def test_mistakes_are_sentences(head, asked, run, tmp_path):
     few = "no triangle has all its corners in the vertex group 'faint'"
     none = str(tmp_path / "none")
     for operator, arguments, sentence in (
-        (bpy.ops.stga.refine, {"group": "chin"}, "has no vertex group 'chin'"),
-        (bpy.ops.stga.refine, {"group": "faint"}, few),
-        (bpy.ops.stga.refine, {"directory": none, "group": "cheek"}, "holds no trained avatar"),
-        (bpy.ops.stga.extend, {"take": none}, "is not a folder"),
-        (bpy.ops.stga.extend, {"take": ""}, "take: no path given"),
+        (ops.refine, {"group": "chin"}, "has no vertex group 'chin'"),
+        (ops.refine, {"group": "faint"}, few),
+        (ops.refine, {"directory": none, "group": "cheek"}, "holds no trained avatar"),
+        (ops.extend, {"take": none}, "is not a folder"),
+        (ops.extend, {"take": ""}, "take: no path given"),
     ):
-        with pytest.raises(RuntimeError, match=f"^Error: .*{sentence}"):
-            operator(**{"directory": str(run), **arguments})
+        with failure(f"^Error: .*{sentence}"):
+            operator(**{"directory": run, **arguments})
     assert not run.with_name("run_2").exists()
 
 
@@ -110,17 +111,17 @@ def test_residuals_are_shown_on_the_head(head, run, extension):
     residual[7] = 0.2
     residual[9] = np.nan
     extension.stga_addon.training.run.folder.write_residuals(run, residual)
-    bpy.ops.stga.heat_map(of="RESIDUAL", directory=str(run))
+    ops.heat_map(of="RESIDUAL", directory=run)
     shown = np.array([item.value for item in head.data.attributes["stga_residual"].data])
     assert shown.argmax() == 7
     assert shown[9] == 0
     red = np.array([item.color[0] for item in head.data.attributes["stga_heat"].data])
     red = red.reshape(-1, 3)
     assert red[7] == pytest.approx(0.9, abs=0.01)
-    bpy.ops.stga.heat_map(show=False)
+    ops.heat_map(show=False)
     assert not {"stga_residual", "stga_heat"} & set(head.data.attributes.keys())
-    with pytest.raises(RuntimeError, match=r"^Error: .*residuals\.npz"):
-        bpy.ops.stga.heat_map(of="RESIDUAL", directory=str(run.parent))
+    with failure(r"^Error: .*residuals\.npz"):
+        ops.heat_map(of="RESIDUAL", directory=run.parent)
 
 
 def answer(extension, tmp_path, selection):
@@ -148,17 +149,17 @@ def test_what_an_extension_would_train_is_selected(head, run, extension, worker,
     selection = {timestep: np.arange(len(head.data.polygons)) < 40 for timestep in (0, 3)}
     selection[3] = ~selection[3]
     worker(answer(extension, tmp_path, selection))
-    bpy.ops.stga.select_extension(directory=str(run))
+    ops.select_extension(directory=run)
     shown = extension.stga_addon.scene.vertex_groups.read_selection(head)
     for timestep, faces in selection.items():
         assert shown[timestep][faces].all()
         assert shown[timestep].mean() < 0.9 or timestep
     assert not shown[1].any()
-    rows = bpy.context.scene.stga.selected_frames
+    rows = panel().selected_frames
     assert [row.frame for row in rows if row.triangles] == [0, 3]
     worker("end('failed', 'no such run')")
-    with pytest.raises(RuntimeError, match="no such run"):
-        bpy.ops.stga.select_extension(directory=str(run))
+    with failure("no such run"):
+        ops.select_extension(directory=run)
     assert error_of(extension, Kind.SELECTION) == "no such run"
 
 
@@ -172,15 +173,15 @@ def test_selection_of_another_head_or_cancelled_changes_nothing(
     given = answer(extension, tmp_path, {0: np.ones(len(head.data.polygons), bool)})
     wait = f"while not pathlib.Path({str(tmp_path / 'go')!r}).exists(): time.sleep(0.02)\n"
     worker(wait + given)
-    settings = bpy.context.scene.stga
+    settings = panel()
     monkeypatch.setattr(extension.operators.timers, "has_timer", lambda: True)
-    bpy.ops.stga.select_extension(directory=str(run))
+    ops.select_extension(directory=run)
     assert any(temporary.iterdir())
-    assert not bpy.ops.stga.select_extension.poll()
-    bpy.ops.stga.cancel(request="selection")
+    assert not ops.select_extension.poll()
+    ops.cancel(request="selection")
     assert not any(temporary.iterdir())
-    bpy.ops.stga.select_extension(directory=str(run))
-    bpy.ops.stga.import_capture(directory=str(write_mesh_capture(tmp_path / "other")))
+    ops.select_extension(directory=run)
+    ops.import_capture(directory=write_mesh_capture(tmp_path / "other"))
     (tmp_path / "go").touch()
     tick_until_done(extension, Kind.SELECTION)
     assert error_of(extension, Kind.SELECTION).endswith("its head is no longer that of the scene")
@@ -200,7 +201,7 @@ def test_selection_waits_for_the_end_of_edit_mode(
     bpy.ops.object.mode_set(mode="EDIT")
     state = RequestState(Kind.SELECTION, error="of last time")
     monitor._states[bpy.context.scene.session_uid, Kind.SELECTION] = state
-    bpy.ops.stga.select_extension(directory=str(run))
+    ops.select_extension(directory=run)
     assert error_of(extension, Kind.SELECTION) == ""
     state = monitor.state_of(bpy.context.scene, Kind.SELECTION)
     monitor._processes[state.folder].wait(60)
@@ -213,7 +214,7 @@ def test_selection_waits_for_the_end_of_edit_mode(
     assert extension.stga_addon.scene.vertex_groups.read_selection(head)[0].all()
     bpy.ops.object.mode_set(mode="EDIT")
     worker("end('failed', 'no such run')")
-    bpy.ops.stga.select_extension(directory=str(run))
+    ops.select_extension(directory=run)
     tick_until_done(extension, Kind.SELECTION)
     assert error_of(extension, Kind.SELECTION) == "no such run"
     bpy.ops.object.mode_set(mode="OBJECT")
@@ -224,16 +225,16 @@ def test_refine_and_extend_end_to_end(head, tmp_path):
     """Catches a job that the worker does not understand, and an avatar of another run."""
     pytest.importorskip("torch")
     run = tmp_path / "run"
-    bpy.ops.stga.train(directory=str(run), iterations=6, device="cpu")
-    bpy.ops.stga.refine(directory=str(run), group="cheek", iterations=4)
+    ops.train(directory=run, iterations=6, device="cpu")
+    ops.refine(directory=run, group="cheek", iterations=4)
     runs = ("run", "run_2")
     before, after = (read_avatar(tmp_path / name / "avatar.npz").splats for name in runs)
     same = (before.sh == after.sh).all((1, 2))
     assert not same.all()
     assert same[before.face >= 80].all()
     take = write_mesh_capture(tmp_path / "take")
-    bpy.ops.stga.import_capture(directory=str(take))
-    bpy.ops.stga.select_extension(directory=str(tmp_path / "run_2"))
-    bpy.ops.stga.extend(directory=str(tmp_path / "run_2"), take=str(take), iterations=4)
+    ops.import_capture(directory=take)
+    ops.select_extension(directory=tmp_path / "run_2")
+    ops.extend(directory=tmp_path / "run_2", take=take, iterations=4)
     assert len(read_run(tmp_path / "run_3").takes) == 1
-    assert bpy.context.scene.stga.avatar == str(tmp_path / "run_3" / "avatar.npz")
+    assert panel().avatar == str(tmp_path / "run_3" / "avatar.npz")

@@ -5,6 +5,7 @@ from dataclasses import replace
 import bpy
 import numpy as np
 import pytest
+from avatar.conftest import splats_of
 from mathutils import Matrix, Vector
 from numpy.testing import assert_allclose, assert_array_equal
 from refusal import refusal
@@ -24,17 +25,18 @@ from stga_addon.scene import compat
 from stga_addon.scene.arrays import evaluated_vertices
 from stga_addon.scene.compat import enable_nodes
 from stga_addon.scene.display import splat_nodes
-from stga_addon.scene.display.splat_object import set_input, show_avatar, show_world_splats
+from stga_addon.scene.display.splat_object import set_input, show_world_splats
 from stga_addon.scene.render import engine
-from stga_addon.scene.render.scene_splats import SplatCache, native_layers, visible_layers
+from stga_addon.scene.render.scene_splats import SplatCache, native_layers
 
 from .exr import read_exr
+from .session import failure, placed, shown_layers
 from .test_splat_object import (
     active_camera,
-    animated_head,
     avatar_of,
     driven_avatar,
     random_splats,
+    show_on_head,
 )
 
 WIDTH = 96
@@ -79,10 +81,9 @@ def camera_at(lens=60.0, **data):
 
 
 def add_sun(energy=1.0):
-    sun = bpy.data.objects.new("sun", bpy.data.lights.new("sun", "SUN"))
+    sun = placed("sun", bpy.data.lights.new("sun", "SUN"))
     sun.data.energy = energy
     sun.rotation_euler = (1.2, 0.0, 0.4)
-    bpy.context.scene.collection.objects.link(sun)
     return sun
 
 
@@ -96,9 +97,8 @@ def textured(avatar, scale=-6.0):
 
 
 def show(avatar):
-    head = animated_head(avatar.neutral, avatar.faces)
+    shown, head = show_on_head(avatar)
     head.hide_render = True
-    shown = show_avatar(avatar, head)
     bpy.context.scene.frame_set(5)
     return shown, head
 
@@ -286,14 +286,8 @@ def test_world_color_is_the_background(tmp_path, is_linked):
 
 def test_depth_in_meters(tmp_path):
     """Catches distances instead of depth, and anything but Blender's 1e10 where nothing is."""
-    one = random_splats(1, 2, degree=0)
-    flat = replace(
-        one,
-        xyz=np.array([[-0.2, 0, 0], [0.3, 0, -1]], np.float32),
-        log_scale=np.full((2, 3), np.log(0.03), np.float32),
-        opacity=np.full(2, 9, np.float32),
-    )
-    show_world_splats(flat, "two")
+    two = splats_of([[-0.2, 0, 0], [0.3, 0, -1]], log_scale=np.log(0.03), opacity=9)
+    show_world_splats(two, "two")
     active_camera((0, 0, 2))
     depth = render(tmp_path)["Depth"]
     assert (depth[:5] == 1e10).all()
@@ -339,10 +333,7 @@ def test_display_settings_apply_to_renders(tmp_path):
 
 def test_only_visible_objects_are_rendered(tmp_path):
     """Catches hidden objects in the image, and missing collection instances."""
-    xyz = np.zeros((50, 3), np.float32)
-    log_scale = np.full((50, 3), -4, np.float32)
-    splats = replace(random_splats(1, 50), xyz=xyz, log_scale=log_scale)
-    shown = show_world_splats(splats, "scan")
+    shown = show_world_splats(splats_of(np.zeros((50, 3))), "scan")
     active_camera((0, 0, 1))
     assert render(tmp_path)["A"].max() > 0.5
     shown.hide_render = True
@@ -352,11 +343,10 @@ def test_only_visible_objects_are_rendered(tmp_path):
     bpy.context.scene.collection.objects.unlink(shown)
     collection.objects.link(shown)
     assert render(tmp_path)["A"].max() == 0
-    instance = bpy.data.objects.new("instance", None)
+    instance = placed("instance", None)
     instance.instance_type = "COLLECTION"
     instance.instance_collection = collection
     instance.location = (0.2, 0, 0)
-    bpy.context.scene.collection.objects.link(instance)
     alpha = render(tmp_path)["A"]
     assert alpha[:, : WIDTH // 2].max() == 0
     assert alpha[:, WIDTH // 2 :].max() > 0.5
@@ -408,32 +398,32 @@ def test_webgpu_renders_where_blender_has_no_gpu_context(tmp_path, monkeypatch):
         raise DeviceError("Card 9000 was lost", "try again")
 
     monkeypatch.setattr(on_gpu, "compose", lost)
-    with pytest.raises(RuntimeError, match="Card 9000 was lost; try again"):
+    with failure("Card 9000 was lost; try again"):
         render(tmp_path)
 
 
 def test_what_cannot_be_rendered_is_named():
     """Catches an image of another camera, splats scattered over an edited mesh, and a traceback."""
     shown, head = show(avatar_of("stga", 10))
-    with pytest.raises(RuntimeError, match="no camera"):
+    with failure("no camera"):
         bpy.ops.render.render()
     camera = camera_at()
     for kind in ("ORTHO", "PANO"):
         camera.data.type = kind
-        with pytest.raises(RuntimeError, match="camera: is not a perspective camera"):
+        with failure("camera: is not a perspective camera"):
             bpy.ops.render.render()
     camera.data.type = "PERSP"
     bpy.context.view_layer.objects.active = head
     bpy.ops.object.mode_set(mode="EDIT")
     with refusal("head: is in Edit Mode; head splats is drawn again when you leave it"):
-        visible_layers(bpy.context.evaluated_depsgraph_get(), SplatCache())
+        shown_layers()
     bpy.ops.object.mode_set(mode="OBJECT")
-    assert len(visible_layers(bpy.context.evaluated_depsgraph_get(), SplatCache())) == 1
+    assert len(shown_layers()) == 1
     head.modifiers.new("finer", "SUBSURF")
-    with pytest.raises(RuntimeError, match="head: has other triangles than head splats"):
+    with failure("head: has other triangles than head splats"):
         bpy.ops.render.render()
     set_input(shown, splat_nodes.HEAD, None)
-    with pytest.raises(RuntimeError, match="has no head to follow"):
+    with failure("has no head to follow"):
         bpy.ops.render.render()
 
 
@@ -452,7 +442,7 @@ def test_failed_render_is_an_error_and_an_empty_image(stage, raised, tmp_path, m
     message = "^Error: head: is broken$"
     if isinstance(raised, MemoryError):
         message = r"Unexpected error \(MemoryError: of pixels\); see the console"
-    with pytest.raises(RuntimeError, match=message) as reported:
+    with failure(message) as reported:
         bpy.ops.render.render(write_still=True)
     assert str(reported.value).count(str(raised)) == 1
     assert not any(tmp_path.iterdir())
@@ -509,13 +499,7 @@ def test_stereo(tmp_path, mode):
 def veil_before(camera):
     """World splats, half transparent, nearer to the camera than a head, which cover it in part."""
     xyz = [camera.matrix_world @ Vector((x, 0.0, -0.3)) for x in (-0.03, 0.0, 0.03)]
-    splats = replace(
-        random_splats(1, 3),
-        xyz=np.array(xyz, np.float32),
-        log_scale=np.full((3, 3), np.log(0.01), np.float32),
-        opacity=np.zeros(3, np.float32),
-    )
-    return show_world_splats(splats, "veil")
+    return show_world_splats(splats_of(xyz, log_scale=np.log(0.01)), "veil")
 
 
 @pytest.mark.parametrize("transparent", [True, False])

@@ -20,7 +20,8 @@ from stga_addon.export.ply import read_ply, write_ply
 from stga_addon.scene import compat
 from stga_addon.scene.display.node_builder import Nodes, new_socket, new_tree
 
-from .test_operators import expected_world, write_ball_avatar
+from .session import failure, ops, panel, placed
+from .test_operators import expected_world, show_ball, write_ball_avatar
 
 needs_native = pytest.mark.skipif(
     not compat.NATIVE_SPLATS, reason="Blender before 5.3 has no native splats"
@@ -116,8 +117,7 @@ def some_splats(degree=3):
 
 def place(thing, linear):
     """By a parent, without which nothing shears."""
-    thing.parent = bpy.data.objects.new("parent", None)
-    bpy.context.scene.collection.objects.link(thing.parent)
+    thing.parent = placed("parent", None)
     thing.matrix_parent_inverse = Matrix(linear.tolist()).to_4x4()
 
 
@@ -128,18 +128,16 @@ def native_cloud(folder, splats):
 
 
 def instanced(collection):
-    empty = bpy.data.objects.new("instance", None)
+    empty = placed("instance", None)
     empty.instance_type = "COLLECTION"
     empty.instance_collection = collection
-    bpy.context.scene.collection.objects.link(empty)
     return empty
 
 
 def instanced_by_nodes(thing, place):
     mesh = bpy.data.meshes.new("points")
     mesh.from_pydata([place], [], [])
-    points = bpy.data.objects.new("points", mesh)
-    bpy.context.scene.collection.objects.link(points)
+    points = placed("points", mesh)
     tree = points.modifiers.new("points", "NODES").node_group = new_tree("points")
     new_socket(tree, "Geometry", "INPUT", "Geometry")
     new_socket(tree, "Geometry", "OUTPUT", "Geometry")
@@ -162,7 +160,7 @@ def test_blender_reads_what_it_exports(extension, tmp_path, name, standing):
     linear = PLACES[standing]
     place(native_cloud(tmp_path, splats), linear)
     format, importer = IMPORTS[name]
-    bpy.ops.stga.export_splats(filepath=str(tmp_path / name), format=format)
+    ops.export_splats(filepath=tmp_path / name, format=format)
     bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
     importer()(filepath=str(tmp_path / name))
     if standing == "sheared" and name == "a.spz":  # whose scales have steps of 6 %
@@ -198,8 +196,8 @@ def test_instances_and_frames_of_others_are_exported(extension, tmp_path):
         first.keyframe_insert("location", frame=frame)
     scene.frame_set(4)
     many = tmp_path / "many"
-    bpy.ops.stga.export_splats(filepath=str(many), format="ply-sequence", up="Y")
-    bpy.ops.stga.export_splats(filepath=str(tmp_path / "one.ply"), format="ply")
+    ops.export_splats(filepath=many, format="ply-sequence", up="Y")
+    ops.export_splats(filepath=tmp_path / "one.ply", format="ply")
     assert scene.frame_current == 4
     files = sorted(path.name for path in many.glob("*.ply"))
     assert files == [f"{frame:05d}.ply" for frame in (2, 3, 4, 5)]
@@ -215,7 +213,7 @@ def test_instances_and_frames_of_others_are_exported(extension, tmp_path):
     for index, part in enumerate(expected):
         found = one.rows(np.arange(300 * index, 300 * index + 300))
         seen(found, np.eye(3)).check(part)
-    bpy.ops.stga.export_splats(filepath=str(tmp_path / "a.usdc"), format="usd")
+    ops.export_splats(filepath=tmp_path / "a.usdc", format="usd")
     stage = usd.Stage.Open(str(tmp_path / "a.usdc"))
     prim = stage.GetPrimAtPath("/Avatar/Splats")
     positions = prim.GetAttribute("positions")
@@ -236,13 +234,13 @@ def test_avatars_are_exported_as_they_are_posed(extension, head, tmp_path, displ
     sh = default_rng(0).normal(0, 0.3, avatar.splats.sh.shape).astype(np.float32)
     avatar = replace(avatar, splats=replace(avatar.splats, sh=sh))
     write_avatar(tmp_path / "avatar.npz", avatar)
-    bpy.ops.stga.show_avatar(filepath=str(tmp_path / "avatar.npz"))
+    ops.show_avatar(filepath=tmp_path / "avatar.npz")
     capture = open_capture(tmp_path / "capture")
     bpy.context.scene.frame_set(3)
-    splats = bpy.context.scene.stga.splats
-    bpy.ops.stga.choose_display(display=display)
+    splats = panel().splats
+    ops.choose_display(display=display)
     extension.stga_addon.scene.display.splat_object.set_input(splats, "Size", 1.5)
-    bpy.ops.stga.export_splats(filepath=str(tmp_path / "a.ply"), format="ply", up="Y")
+    ops.export_splats(filepath=tmp_path / "a.ply", format="ply", up="Y")
     expected = expected_world(avatar, capture.mesh(3))
     found = read_ply(tmp_path / "a.ply")
     assert_allclose(found.xyz, expected.xyz, atol=1e-5)
@@ -252,16 +250,16 @@ def test_avatars_are_exported_as_they_are_posed(extension, head, tmp_path, displ
     base = np.column_stack([avatar.splats.sh[:, 0] * 0.5, avatar.splats.opacity - 1])
     fitted = replace(avatar, linear_base=base.astype(np.float32))
     extension.stga_addon.scene.display.splat_object.store_linear_base(splats, fitted)
-    bpy.ops.stga.export_splats(filepath=str(tmp_path / "b.ply"), format="ply", up="Y")
+    ops.export_splats(filepath=tmp_path / "b.ply", format="ply", up="Y")
     assert_array_equal(read_ply(tmp_path / "b.ply").sh, found.sh)
     splats.hide_render = True
-    with pytest.raises(RuntimeError, match="shows no splats in frame 3"):
-        bpy.ops.stga.export_splats(filepath=str(tmp_path / "c.ply"), format="ply")
+    with failure("shows no splats in frame 3"):
+        ops.export_splats(filepath=tmp_path / "c.ply", format="ply")
     assert not (tmp_path / "c.ply").exists()
     usd = pytest.importorskip("pxr.Usd", reason="the package usd-core is not installed")
     splats.hide_render = False
     bpy.context.scene.frame_start = bpy.context.scene.frame_end = 3
-    bpy.ops.stga.export_splats(filepath=str(tmp_path / "a.usdc"), format="usd")
+    ops.export_splats(filepath=tmp_path / "a.usdc", format="usd")
     stage = usd.Stage.Open(str(tmp_path / "a.usdc"))
     opacity = stage.GetPrimAtPath("/Avatar/Splats").GetAttribute("opacities").Get(3)
     assert_allclose(opacity, 1 / (1 + np.exp(1 - expected.opacity)), atol=1e-5)
@@ -289,13 +287,13 @@ def test_what_cannot_be_written_is_one_sentence(extension, tmp_path, case):
     place = f"{tmp_path / name}/" if name.endswith("/") else str(tmp_path / name)
 
     def export():
-        bpy.ops.stga.export_splats(filepath=place if name else "", format=format)
+        ops.export_splats(filepath=place if name else "", format=format)
 
     if not sentence:
         export()
         assert (tmp_path / "a.ply").is_file()
         return
-    with pytest.raises(RuntimeError, match=sentence) as error:
+    with failure(sentence) as error:
         export()
     assert "Traceback" not in str(error.value)
     assert len(str(error.value).strip().splitlines()) == 1
@@ -306,11 +304,10 @@ def test_what_cannot_be_written_is_one_sentence(extension, tmp_path, case):
 def test_modifiers_after_ours_count(extension, head, tmp_path):
     """Catches an avatar that is exported without what other modifiers make of its native splats,
     or twice, and no sentence where it is not shown as native splats."""
-    write_ball_avatar(tmp_path / "avatar.npz")
-    bpy.ops.stga.show_avatar(filepath=str(tmp_path / "avatar.npz"))
-    splats = bpy.context.scene.stga.splats
-    bpy.ops.stga.choose_display(display="Native Splats")
-    bpy.ops.stga.export_splats(filepath=str(tmp_path / "a.ply"), format="ply")
+    show_ball(tmp_path / "avatar.npz")
+    splats = panel().splats
+    ops.choose_display(display="Native Splats")
+    ops.export_splats(filepath=tmp_path / "a.ply", format="ply")
     plain = read_ply(tmp_path / "a.ply")
     tree = splats.modifiers.new("move", "NODES").node_group = new_tree("move")
     del tree["stga_version"]
@@ -320,13 +317,13 @@ def test_modifiers_after_ours_count(extension, head, tmp_path):
     given = nodes.add("NodeGroupInput").outputs["Geometry"]
     moved = nodes.out("GeometryNodeSetPosition", {"Geometry": given, "Offset": (1, 2, 3)})
     nodes.finish("NodeGroupOutput", {"Geometry": moved})
-    bpy.ops.stga.export_splats(filepath=str(tmp_path / "b.ply"), format="ply")
+    ops.export_splats(filepath=tmp_path / "b.ply", format="ply")
     found = read_ply(tmp_path / "b.ply")
     offset = np.array(splats.matrix_world)[:3, :3] @ (1, 2, 3)
     assert_allclose(found.xyz, plain.xyz + offset, atol=1e-5)
     assert_allclose(found.sh[:, : plain.sh.shape[1]], plain.sh, atol=1e-4)
-    bpy.ops.stga.choose_display(display="As Trained")
-    bpy.ops.stga.export_splats(filepath=str(tmp_path / "c.ply"), format="ply")
+    ops.choose_display(display="As Trained")
+    ops.export_splats(filepath=tmp_path / "c.ply", format="ply")
     assert_array_equal(read_ply(tmp_path / "c.ply").xyz, plain.xyz)
     message = bpy.context.window_manager.stga_message
     sentence = "exported without move; Native Splats are exported with it"

@@ -16,6 +16,8 @@ from stga_addon.flame.model import JOINTS
 from stga_addon.scene.arrays import evaluated_vertices
 from stga_addon.scene.rig.head import rig_of
 
+from .session import ops, panel
+
 BLENDER_TOLERANCE_M = 2e-4
 """What the file's blend shapes leave out, times their weights."""
 
@@ -29,18 +31,18 @@ def demo_head(tmp_path):
         with np.load(file) as found:  # its offsets are those of another mesh
             kept = {name: found[name] for name in found.files if name != "static_offset"}
         np.savez(file, **kept)
-    bpy.ops.stga.import_capture(directory=str(folder), flame=str(model))
+    ops.import_capture(directory=folder, flame=model)
     capture = open_capture(folder, model)
     neutral = capture.neutral.astype(np.float32)
     splats = lattice_splats(neutral, capture.faces, sh_degree=0, convention="stga")
     write_avatar(tmp_path / "anna.npz", Avatar(splats, "stga", neutral, capture.faces))
-    bpy.ops.stga.show_avatar(filepath=str(tmp_path / "anna.npz"))
+    ops.show_avatar(filepath=tmp_path / "anna.npz")
     return capture
 
 
 def exported(folder, **options):
     path = folder / "anna.glb"
-    bpy.ops.stga.export_avatar(filepath=str(path), format="web", **options)
+    ops.export_avatar(filepath=path, format="web", **options)
     return read_web_data(path.read_bytes())
 
 
@@ -98,20 +100,20 @@ def test_an_avatar_comes_back(extension, tmp_path):
     scene = bpy.context.scene
     scene.render.fps = 30
     path = tmp_path / "anna.glb"
-    bpy.ops.stga.export_avatar(filepath=str(path), format="skinned-gltf")
+    ops.export_avatar(filepath=path, format="skinned-gltf")
     frames = range(scene.frame_start, scene.frame_end + 1)
 
     def meshes():
         found = []
         for frame in frames:
             bpy.context.scene.frame_set(frame)
-            found.append(evaluated_vertices(bpy.context.scene.stga.head))
+            found.append(evaluated_vertices(panel().head))
         return np.array(found)
 
     before = meshes()
     splats = read_avatar(tmp_path / "anna.npz").splats
     bpy.ops.wm.read_homefile(use_empty=True)
-    bpy.ops.stga.import_avatar(filepath=str(path))
+    ops.import_avatar(filepath=path)
     scene = bpy.context.scene
     frames = range(scene.frame_start, scene.frame_end + 1)
     assert scene.render.fps == 30

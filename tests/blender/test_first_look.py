@@ -6,7 +6,6 @@ import pytest
 from capture.factory import write_flame_capture, write_mesh_capture
 from mathutils import Vector
 from numpy.testing import assert_allclose, assert_array_equal
-from PIL import Image
 
 from stga_addon.development.demo.capture import unpack_capture
 from stga_addon.export.ply import write_ply
@@ -17,15 +16,16 @@ from stga_addon.scene.display.splat_nodes import AS_TRAINED, DISPLAY, LIMITS, NA
 from stga_addon.scene.display.splat_object import display_mode, set_input, splat_modifier
 from stga_addon.scene.objects import layers_of
 
-from .test_operators import write_ball_avatar
+from .session import failure, ops, panel, picture
+from .test_operators import show_ball, write_ball_avatar
 from .test_panel import draw
 
 
 @pytest.fixture
 def head(extension, tmp_path):
     folder, model = write_flame_capture(tmp_path / "capture")
-    bpy.ops.stga.import_capture(directory=str(folder), flame=str(model))
-    return bpy.context.scene.stga.head
+    ops.import_capture(directory=folder, flame=model)
+    return panel().head
 
 
 def viewports():
@@ -49,17 +49,17 @@ def test_viewports_look_at_the_head(head):
 
 def test_a_world_is_hidden_until_it_is_wanted(extension, tmp_path):
     """Catches a wall that covers the scene or lies down, and a second one."""
-    bpy.ops.stga.import_capture(directory=str(write_mesh_capture(tmp_path / "capture")))
+    ops.import_capture(directory=write_mesh_capture(tmp_path / "capture"))
     avatar = write_ball_avatar(tmp_path / "avatar.npz")
     write_ply(tmp_path / "world.ply", avatar.splats)
     for _ in range(2):
-        bpy.ops.stga.show_avatar(filepath=str(tmp_path / "avatar.npz"))
+        ops.show_avatar(filepath=tmp_path / "avatar.npz")
     (world,) = [thing for thing in bpy.data.objects if thing.get(tags.WORLD)]
-    head = bpy.context.scene.stga.head
+    head = panel().head
     bpy.context.view_layer.update()
     assert world.hide_get()
     assert world.hide_render
-    assert bpy.context.scene.stga.splats is not world
+    assert panel().splats is not world
     assert_allclose(np.array(world.matrix_world), np.array(head.matrix_world), atol=1e-6)
     assert len(world.data.vertices) == len(avatar.splats)
 
@@ -72,11 +72,11 @@ def test_the_start_up_cube_does_not_enclose_the_head(extension, tmp_path, moved)
     folder = str(write_mesh_capture(tmp_path / "capture"))
     cube.location.x = float(moved)
     bpy.context.view_layer.update()
-    bpy.ops.stga.import_capture(directory=folder)
+    ops.import_capture(directory=folder)
     assert (cube.name, cube.hide_get(), cube.hide_render) == ("Cube", not moved, not moved)
     cube.hide_set(False)
     cube.hide_render = False
-    bpy.ops.stga.import_capture(directory=folder)
+    ops.import_capture(directory=folder)
     assert (cube.hide_get(), cube.hide_render) == (False, False)
 
 
@@ -85,41 +85,33 @@ def test_pose_the_jaw_and_back(head, tmp_path):
     layer = bpy.context.view_layer
     (bones,) = layers_of(head.parent, tags.RIG, layer)
     assert bones.hide_viewport
-    bpy.ops.stga.pose_head()
+    ops.pose_head()
     rig = layer.objects.active
     assert (rig.get(tags.KIND), rig.mode, bones.hide_viewport) == (tags.RIG, "POSE", False)
     owners = rig.pose.bones if bpy.app.version >= (5, 0, 0) else rig.data.bones
     assert [bone.name for bone in owners if bone.select] == ["jaw"]
     assert rig.data.bones.active.name == "jaw"
-    bpy.ops.stga.pose_head()
+    ops.pose_head()
     assert (rig.mode, bones.hide_viewport) == ("OBJECT", True)
     unpack_capture(tmp_path / "bundled")
-    bpy.ops.stga.import_capture(directory=str(tmp_path / "bundled"))
-    bpy.ops.stga.pose_head()
+    ops.import_capture(directory=tmp_path / "bundled")
+    ops.pose_head()
     assert bpy.context.view_layer.objects.active.data.bones.active.name == "neck"
-    bpy.ops.stga.import_capture(directory=str(write_mesh_capture(tmp_path / "ball")))
-    with pytest.raises(RuntimeError, match="poll"):
-        bpy.ops.stga.pose_head()
+    ops.import_capture(directory=write_mesh_capture(tmp_path / "ball"))
+    with failure("poll"):
+        ops.pose_head()
 
 
 def test_images_by_other_engines(extension, tmp_path):
     """Catches a missing avatar, points, quads edge-on, and limits changed needlessly."""
-    bpy.ops.stga.import_capture(directory=str(write_mesh_capture(tmp_path / "capture")))
-    write_ball_avatar(tmp_path / "avatar.npz")
-    bpy.ops.stga.show_avatar(filepath=str(tmp_path / "avatar.npz"))
-    shown = bpy.context.scene.stga.splats
+    ops.import_capture(directory=write_mesh_capture(tmp_path / "capture"))
+    show_ball(tmp_path / "avatar.npz")
+    shown = panel().splats
     scene = bpy.context.scene
-    path = tmp_path / "image.png"
-    scene.render.engine = "CYCLES"
-    scene.cycles.samples = 1
-    scene.cycles.use_denoising = False
-    scene.render.image_settings.file_format = "PNG"
-    scene.render.filepath = str(path)
     images = {}
     for mode in (AS_TRAINED, QUADS, POINTS):
         set_input(shown, DISPLAY, mode)
-        bpy.ops.render.render(write_still=True)
-        images[mode] = np.asarray(Image.open(path)).astype(int)
+        images[mode] = picture(tmp_path / "image.png", "CYCLES")
     assert images[QUADS][..., :3].max() > 50
     assert_array_equal(images[AS_TRAINED], images[QUADS])
     assert np.abs(images[AS_TRAINED] - images[POINTS]).max() > 20
@@ -130,21 +122,21 @@ def test_images_by_other_engines(extension, tmp_path):
     assert other.transparent_max_bounces < 64
     cycles.transparent_max_bounces = 200
     cycles.min_transparent_bounces = 8
-    bpy.ops.stga.show_avatar(filepath=str(tmp_path / "avatar.npz"))
+    ops.show_avatar(filepath=tmp_path / "avatar.npz")
     assert (cycles.transparent_max_bounces, cycles.min_transparent_bounces) == (200, 64)
     shown = scene.stga.splats
     scene.render.engine = "CYCLES"
     cycles.transparent_max_bounces = 8
     set_input(shown, DISPLAY, AS_TRAINED)
-    bpy.ops.stga.preview_images()
+    ops.preview_images()
     best = NATIVE if compat.NATIVE_SPLATS else QUADS
     assert (display_mode(shown), cycles.transparent_max_bounces) == (best, 64)
     assert ("Make Exact" in draw(extension, "show")) == compat.NATIVE_SPLATS
-    with pytest.raises(RuntimeError, match="displayed as trained"):
-        bpy.ops.stga.preview_images()
+    with failure("displayed as trained"):
+        ops.preview_images()
     set_input(shown, DISPLAY, AS_TRAINED)
     scene.camera = None
-    bpy.ops.stga.preview_images()
+    ops.preview_images()
     assert display_mode(shown) == (NATIVE if compat.NATIVE_SPLATS else POINTS)
     tree = splat_modifier(shown).node_group
     menus = [node for node in tree.nodes if node.bl_idname == "GeometryNodeMenuSwitch"]

@@ -19,6 +19,7 @@ from stga_addon.scene.rig.keyframes import Placement, is_of_parts
 from stga_addon.scene.rig.motion import LivePose, apply_motion, sample_motion
 
 from .captures import at_frame, flame_model, flame_sequence, motion_capture
+from .session import open_file, placed, save
 
 TOLERANCE = 2e-6  # meters; float32 skinning of a head half a meter from its origin
 
@@ -190,8 +191,7 @@ def test_what_a_rig_cannot_hold_is_reported(source):
 
 def test_importing_again_replaces_the_rig(source):
     """Fails when a second import duplicates or leaves data, or another object becomes active."""
-    mine = bpy.data.objects.new("mine", None)
-    bpy.context.scene.collection.objects.link(mine)
+    mine = placed("mine", None)
     bpy.context.view_layer.objects.active = mine
     dynamic = flame_sequence(flame_model(), dynamic=True)
     first = import_head(motion_capture(dynamic, source), warn=lambda sentence: None)
@@ -222,9 +222,9 @@ def test_a_saved_rig_shows_the_same(source, tmp_path, capfd):
         for curve in owner.animation_data.drivers:
             assert curve.driver.is_simple_expression
             assert curve.is_valid
-    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "rig.blend"))
+    save(tmp_path / "rig.blend")
     bpy.ops.wm.read_factory_settings(use_empty=True)
-    bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "rig.blend"))
+    open_file(tmp_path / "rig.blend")
     assert_parity(bpy.data.objects[name], sequence)
     assert "cycle" not in "".join(capfd.readouterr()).lower()
     assert tags.REGION_PREFIX + "mouth" in bpy.data.objects[name].data.attributes

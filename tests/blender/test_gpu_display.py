@@ -11,7 +11,6 @@ from stga_addon.scene.display.splat_attributes import avatar_attributes
 from stga_addon.scene.display.splat_nodes import POINTS
 from stga_addon.scene.display.splat_object import (
     display_mode,
-    show_avatar,
     show_world_splats,
     update_splats,
 )
@@ -24,10 +23,11 @@ from stga_addon.scene.gpu.packing import (
 )
 from stga_addon.scene.layers import SceneLayer
 from stga_addon.scene.render import viewport_display
-from stga_addon.scene.render.scene_splats import SplatCache, visible_layers
+from stga_addon.scene.render.scene_splats import SplatCache
 from stga_addon.scene.render.viewport_display import GpuDisplay, region_view
 
-from .test_splat_object import FRAMES, animated_head, avatar_of, random_splats
+from .session import point_clouds, save, shown_layers
+from .test_splat_object import FRAMES, avatar_of, random_splats, show_on_head
 
 
 class Region:
@@ -88,13 +88,12 @@ def test_drawing_order(distance, spread, short_keys):
 def test_cache_follows_new_splats_and_shapes():
     """Catches splats of an earlier training state, and frames of an earlier pose."""
     avatar = avatar_of("stga")
-    head = animated_head(avatar.neutral, avatar.faces)
-    shown = show_avatar(avatar, head)
+    shown, _ = show_on_head(avatar)
     cache = SplatCache()
 
     def layer(frame):
         bpy.context.scene.frame_set(frame)
-        return visible_layers(bpy.context.evaluated_depsgraph_get(), cache)[0]
+        return shown_layers(cache)[0]
 
     first = layer(1)
     again = layer(1)
@@ -111,12 +110,7 @@ def test_cache_follows_new_splats_and_shapes():
 def test_an_error_ends_the_display(monkeypatch, capsys):
     """Catches points over the GPU's picture, an error in every redraw, and splats gone for good."""
     shown = show_world_splats(random_splats(1, 10), "scan")
-
-    def kinds():
-        depsgraph = bpy.context.evaluated_depsgraph_get()
-        return {instance.object.type for instance in depsgraph.object_instances}
-
-    assert "POINTCLOUD" not in kinds()
+    assert not point_clouds()
     display = GpuDisplay()
     monkeypatch.setattr(viewport_display, "display", display)
     monkeypatch.setattr(display, "_draw_region", lambda context: 1 / 0)
@@ -126,7 +120,7 @@ def test_an_error_ends_the_display(monkeypatch, capsys):
     assert capsys.readouterr().out.count("STGA:") == 1
     viewport_display.show_points()
     assert display_mode(shown) == POINTS
-    assert "POINTCLOUD" in kinds()
+    assert point_clouds()
     bpy.app.timers.unregister(viewport_display.show_points)
 
 
@@ -139,7 +133,7 @@ def positions(layer):
 def shown_at(frame, cache):
     """World positions of the one visible layer."""
     bpy.context.scene.frame_set(frame)
-    (layer,) = visible_layers(bpy.context.evaluated_depsgraph_get(), cache)
+    (layer,) = shown_layers(cache)
     return positions(layer)
 
 
@@ -147,8 +141,7 @@ def shown_at(frame, cache):
 def library(tmp_path):
     """A .blend file with a moving head and splats in "anna", and their places at FRAMES."""
     avatar = avatar_of("stga", 300)
-    head = animated_head(avatar.neutral, avatar.faces)
-    shown = show_avatar(avatar, head)
+    shown, head = show_on_head(avatar)
     collection = bpy.data.collections.new("anna")
     bpy.context.scene.collection.children.link(collection)
     for thing in (head.parent, head, shown):
@@ -156,7 +149,7 @@ def library(tmp_path):
         collection.objects.link(thing)
     expected = [shown_at(frame, SplatCache()) for frame in FRAMES]
     assert np.abs(expected[0] - expected[1]).max() > 1e-3, "the head does not move"
-    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "library.blend"))
+    save(tmp_path / "library.blend")
     bpy.ops.wm.read_factory_settings(use_empty=True)
     return tmp_path / "library.blend", expected
 

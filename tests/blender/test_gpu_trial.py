@@ -14,6 +14,7 @@ from stga_addon.scene.render import engine, viewport_display
 from stga_addon.scene.render.viewport_display import GpuDisplay
 
 from .gpu_context import run_with_gpu
+from .session import viewport
 from .test_gpu_renderer import needs_gpu
 
 BROKEN = {
@@ -112,8 +113,7 @@ def test_viewports_fall_back_to_points(monkeypatch, capsys, is_engine):
 
 def test_points_are_shown_in_material_preview(monkeypatch):
     """Catches viewports of the engine, which draws no points, that stay empty."""
-    screen = bpy.context.window_manager.windows[0].screen
-    shading = next(area for area in screen.areas if area.type == "VIEW_3D").spaces.active.shading
+    shading = viewport()[1].spaces.active.shading
     shading.type = "RENDERED"
     viewport_display.show_points()
     assert shading.type == "RENDERED"

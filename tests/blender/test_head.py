@@ -14,6 +14,7 @@ from stga_addon.scene.compat import SLOTTED_ACTIONS
 from stga_addon.scene.rig.head import import_head
 
 from .captures import at_frame, flame_model, flame_sequence, mesh_capture, motion_capture
+from .session import open_file, save
 
 
 def block_counts():
@@ -28,9 +29,9 @@ def test_each_frame_evaluates_to_its_timestep(tmp_path):
     if SLOTTED_ACTIONS:  # their layers are what artists see
         (layer,) = head.data.shape_keys.animation_data.action.layers
         assert layer.name == "Layer"
-    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "head.blend"))
+    save(tmp_path / "head.blend")
     name = head.name
-    bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "head.blend"))
+    open_file(tmp_path / "head.blend")
     head = bpy.data.objects[name]
     mesh = capture.mesh
     expected = {timestep: mesh(timestep) for timestep in capture.timesteps}

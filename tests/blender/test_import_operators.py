@@ -21,7 +21,8 @@ from stga_addon.capture.open import open_capture
 from stga_addon.scene.arrays import evaluated_vertices
 from stga_addon.scene.display.splat_object import evaluated_splats
 
-from .test_operators import write_ball_avatar
+from .session import failure, ops, panel, placed, save
+from .test_operators import show_ball, write_ball_avatar
 
 pytestmark = pytest.mark.usefixtures("extension")
 
@@ -58,7 +59,7 @@ def test_importing_again_doubles_nothing(tmp_path, model, kind):
     """Catches a second head, rig, camera, action or image, other meshes than the source's, and a
     head that cannot be worked with because there is no folder around it."""
     folder = tmp_path / "source"
-    ops = bpy.ops.stga
+
     flame = str(model)
     if kind == "motion":
         source = write_motion(tmp_path / "source.npz")
@@ -91,26 +92,25 @@ def test_importing_again_doubles_nothing(tmp_path, model, kind):
 def test_importing_again_keeps_what_an_artist_painted(tmp_path):
     """Catches painted regions and materials lost by another import, and others left selected."""
     folder = write_mesh_capture(tmp_path / "capture")
-    bpy.ops.stga.import_capture(directory=str(folder))
-    head = bpy.context.scene.stga.head
+    ops.import_capture(directory=folder)
+    head = panel().head
     head.vertex_groups.new(name="dimple").add([3, 4, 5], 1.0, "REPLACE")
     head.vertex_groups.new(name="stga_3").add([7], 0.7, "REPLACE")
     head.data.materials.append(bpy.data.materials.new("skin"))
-    bpy.ops.stga.import_capture(directory=str(folder))
-    assert bpy.context.scene.stga.head == head
+    ops.import_capture(directory=folder)
+    assert panel().head == head
     assert head.vertex_groups["dimple"].weight(4) == 1.0
     assert head.vertex_groups["stga_3"].weight(7) == pytest.approx(0.7)
     assert [material.name for material in head.data.materials] == ["skin"]
     bpy.context.scene.frame_set(3)
     assert_allclose(evaluated_vertices(head), moved(3, ball()[0]), atol=1e-6)
     mesh = bpy.data.meshes.new("other")
-    other = bpy.data.objects.new("other", mesh)
-    bpy.context.scene.collection.objects.link(other)
+    other = placed("other", mesh)
     bpy.context.view_layer.objects.active = other
     other.select_set(True)
     bpy.ops.object.mode_set(mode="EDIT")
-    bpy.ops.stga.import_capture(directory=str(write_mesh_capture(tmp_path / "second")))
-    head = bpy.context.scene.stga.head
+    ops.import_capture(directory=write_mesh_capture(tmp_path / "second"))
+    head = panel().head
     assert other.mode == "OBJECT"
     assert set(bpy.context.selected_objects) == {head, head.parent}
     assert bpy.context.view_layer.objects.active == head
@@ -133,36 +133,35 @@ def test_wrong_files_change_nothing(tmp_path, model):
         ("other.npz", "", "choose your FLAME model in the add-on's preferences"),
         ("a.npz", tmp_path / "no model.npz", "no model"),
     ):
-        with pytest.raises(RuntimeError, match=message):
-            bpy.ops.stga.import_motion(filepath=str(tmp_path / name), flame=str(flame))
-    with pytest.raises(RuntimeError, match="is not a capture"):
-        bpy.ops.stga.import_meshes(filepath=str(tmp_path / "empty/a.obj"))
+        with failure(message):
+            ops.import_motion(filepath=tmp_path / name, flame=flame)
+    with failure("is not a capture"):
+        ops.import_meshes(filepath=tmp_path / "empty/a.obj")
     assert state_of_file() == before
-    assert bpy.context.scene.stga.head is None
+    assert panel().head is None
 
 
 def test_linked_heads_are_left_alone(tmp_path):
     """Catches changes to, or tracebacks about, what belongs to another file."""
     folder = write_mesh_capture(tmp_path / "capture")
-    bpy.ops.stga.import_capture(directory=str(folder))
-    name = bpy.context.scene.stga.head.name
-    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "library.blend"))
+    ops.import_capture(directory=folder)
+    name = panel().head.name
+    save(tmp_path / "library.blend")
     bpy.ops.wm.read_factory_settings(use_empty=True)
     with bpy.data.libraries.load(str(tmp_path / "library.blend"), link=True) as (_, target):
         target.collections = [name.removesuffix(" head")]
     bpy.context.scene.collection.children.link(target.collections[0])
     linked = target.collections[0].objects[name]
-    bpy.context.scene.stga.head = linked
-    avatar = write_ball_avatar(tmp_path / "a.npz", order=0)
-    bpy.ops.stga.show_avatar(filepath=str(tmp_path / "a.npz"))
-    assert len(evaluated_splats(bpy.context.scene.stga.splats)[0]) == len(avatar.splats)
+    panel().head = linked
+    avatar = show_ball(tmp_path / "a.npz", order=0)
+    assert len(evaluated_splats(panel().splats)[0]) == len(avatar.splats)
     assert not linked.hide_render
     for operator in ("select", "heat_map", "apply_motion"):
-        with pytest.raises(RuntimeError, match="linked from another file"):
-            getattr(bpy.ops.stga, operator)()
-    bpy.ops.stga.import_capture(directory=str(folder))  # its own, beside the linked one
-    assert bpy.context.scene.stga.head != linked
-    assert bpy.context.scene.stga.head.library is None
+        with failure("linked from another file"):
+            getattr(ops, operator)()
+    ops.import_capture(directory=folder)  # its own, beside the linked one
+    assert panel().head != linked
+    assert panel().head.library is None
 
 
 HANDLERS = {
@@ -179,7 +178,7 @@ def test_handlers_call_operators_that_take_a_file(name):
     """Catches a handler whose operator takes no file, and JSON dropped into the text editor."""
     handler = getattr(bpy.types, f"STGA_FH_{name}")
     assert handler.bl_import_operator == HANDLERS[name]
-    operator = getattr(bpy.ops.stga, HANDLERS[name].removeprefix("stga."))
+    operator = getattr(ops, HANDLERS[name].removeprefix("stga."))
     properties = operator.get_rna_type().properties
     assert properties["filepath"].subtype == "FILE_PATH"
     assert properties["filepath"].is_skip_save
@@ -194,11 +193,11 @@ def test_a_file_stands_for_its_capture(tmp_path):
     image = next(folder.rglob("*.png"))
     for given in (folder / "transforms_train.json", image, folder / "demo.blend"):
         bpy.ops.wm.read_homefile(use_empty=True)
-        bpy.ops.stga.import_capture(filepath=str(given))
-        assert bpy.context.scene.stga.head["stga_capture"] == str(folder)
+        ops.import_capture(filepath=given)
+        assert panel().head["stga_capture"] == str(folder)
     (tmp_path / "notes.json").write_text("{}")
-    with pytest.raises(RuntimeError, match=r"notes.json: is in no capture; choose"):
-        bpy.ops.stga.import_capture(filepath=str(tmp_path / "notes.json"))
+    with failure(r"notes.json: is in no capture; choose"):
+        ops.import_capture(filepath=tmp_path / "notes.json")
 
 
 def test_an_npz_is_opened_by_its_content(tmp_path):
@@ -215,16 +214,16 @@ def test_an_npz_is_opened_by_its_content(tmp_path):
         ("noise.npz", "cannot be read as an .npz file"),
         ("gone.npz", "cannot be read as an .npz file"),
     ):
-        with pytest.raises(RuntimeError, match=f"^Error: .*{name}: {sentence}"):
-            bpy.ops.stga.open_npz(filepath=str(tmp_path / name))
+        with failure(f"^Error: .*{name}: {sentence}"):
+            ops.open_npz(filepath=tmp_path / name)
     folder, model = write_flame_capture(tmp_path / "capture")
-    bpy.ops.stga.import_capture(directory=str(folder), flame=str(model))
+    ops.import_capture(directory=folder, flame=model)
     objects = len(bpy.data.objects)
-    bpy.ops.stga.open_npz(filepath=str(motion))
+    ops.open_npz(filepath=motion)
     assert len(bpy.data.objects) == objects
     assert [action for action in bpy.data.actions if "smile" in action.name]
-    bpy.ops.stga.open_npz(filepath=str(avatar))
-    assert bpy.context.scene.stga.splats is not None
+    ops.open_npz(filepath=avatar)
+    assert panel().splats is not None
 
 
 def test_a_second_head_stands_beside_the_first(extension, head, tmp_path):
@@ -232,15 +231,14 @@ def test_a_second_head_stands_beside_the_first(extension, head, tmp_path):
     speaks of the first head still, and a folder that two heads share."""
     scene = bpy.context.scene
     settings = scene.stga
-    write_ball_avatar(tmp_path / "avatar.npz")
-    bpy.ops.stga.show_avatar(filepath=str(tmp_path / "avatar.npz"))
+    show_ball(tmp_path / "avatar.npz")
     splats = settings.splats
     settings.run_folder = str(tmp_path / "first run")
     kept = ("camera", "frame_start", "frame_end", "frame_current")
     before = [getattr(scene, name) for name in kept]
     size = scene.render.resolution_x
     second = write_mesh_capture(tmp_path / "second", timesteps=(20, 21))
-    bpy.ops.stga.import_capture(directory=str(second))
+    ops.import_capture(directory=second)
     other = settings.head
     assert other != head
     right = max((head.matrix_world @ vertex.co).x for vertex in head.data.vertices)
@@ -258,6 +256,6 @@ def test_a_second_head_stands_beside_the_first(extension, head, tmp_path):
     bpy.context.view_layer.update()
     assert settings.head == other
     place = other.parent.location.copy()
-    bpy.ops.stga.import_capture(directory=str(second), set_up_scene=True)
+    ops.import_capture(directory=second, set_up_scene=True)
     assert scene.frame_start == 20
     assert other.parent.location == place

@@ -19,8 +19,9 @@ from stga_addon.scene.display.splat_attributes import LINEAR_SH, read_attribute
 from stga_addon.scene.display.splat_nodes import PERCENTAGE
 from stga_addon.scene.display.splat_object import hide_object, set_input, show_avatar, stored_avatar
 from stga_addon.scene.light import throw_shadow, throws_shadow
-from stga_addon.scene.render.scene_splats import SplatCache, visible_layers
+from stga_addon.scene.render.scene_splats import SplatCache
 
+from .session import failure, ops, picture, placed, shown_layers
 from .test_engine import add_sun
 from .test_other_engines import EEVEE, EEVEE_MARKS
 from .test_splat_object import active_camera
@@ -39,8 +40,7 @@ pytestmark = pytest.mark.usefixtures("lighting")
 def shown_head():
     """An avatar with its light on a head at PLACE; returns splats and head."""
     avatar = lit_avatar()
-    head = bpy.data.objects.new("head", triangle_mesh("head", avatar.neutral, avatar.faces))
-    bpy.context.scene.collection.objects.link(head)
+    head = placed("head", triangle_mesh("head", avatar.neutral, avatar.faces))
     head.matrix_world = PLACE
     bpy.context.view_layer.update()
     shown = show_avatar(avatar, head)
@@ -62,17 +62,16 @@ def lamp(kind, location, energy, **properties):
     light.color = (1.0, 0.8, 0.5)
     for name, value in properties.items():
         setattr(light, name, value)
-    placed = bpy.data.objects.new(kind, light)
-    placed.location = location
+    made = placed(kind, light)
+    made.location = location
     outward = Vector(location) - PLACE.translation
-    placed.rotation_euler = outward.to_track_quat("Z", "Y").to_euler()
-    bpy.context.scene.collection.objects.link(placed)
-    return placed
+    made.rotation_euler = outward.to_track_quat("Z", "Y").to_euler()
+    return made
 
 
 def relit():
     bpy.context.view_layer.update()
-    (layer,) = visible_layers(bpy.context.evaluated_depsgraph_get(), SplatCache())
+    (layer,) = shown_layers()
     return layer.relit
 
 
@@ -231,7 +230,7 @@ def test_nothing_is_made_anew_while_nothing_moves():
 
     def again():
         bpy.context.view_layer.update()
-        (layer,) = visible_layers(bpy.context.evaluated_depsgraph_get(), cache)
+        (layer,) = shown_layers(cache)
         return layer.relit
 
     first = again()
@@ -257,23 +256,14 @@ def test_shadow_onto_the_scene(engine, tmp_path):
     bpy.ops.mesh.primitive_plane_add(size=2, location=(0.4, -0.2, 0.0))
     scene = bpy.context.scene
     active_camera((0.4, -0.2, 3.0))
-    scene.render.engine = engine
-    scene.cycles.samples = 4
-    scene.cycles.use_denoising = False
-    scene.eevee.taa_render_samples = 1
     scene.eevee.shadow_pool_size = "16"
     scene.eevee.shadow_resolution_scale = 0.1
-    scene.render.resolution_x = scene.render.resolution_y = 32
     scene.view_settings.view_transform = "Raw"
     set_input(shown, PERCENTAGE, 0.0)
 
     def middle():
-        scene.render.filepath = str(tmp_path / "image.png")
-        bpy.ops.render.render(write_still=True)
-        image = bpy.data.images.load(str(tmp_path / "image.png"))
-        value = np.array(image.pixels[:]).reshape(32, 32, 4)[15:17, 15:17, :3].mean()
-        bpy.data.images.remove(image)
-        return float(value)
+        image = picture(tmp_path / "image.png", engine, 32, 4 if engine == "CYCLES" else 1)
+        return image[15:17, 15:17, :3].mean()
 
     open_ground = middle()
     throw_shadow(shown, True)
@@ -289,25 +279,25 @@ def test_estimate_light(extension, tmp_path):
     """Catches a light other than training's, that does not reach the splats, or reaches others."""
     run = tmp_path / "run"
     scene = bpy.context.scene
-    bpy.ops.stga.import_capture(directory=str(write_mesh_capture(tmp_path / "capture")))
-    bpy.ops.stga.train(directory=str(run), iterations=6)
+    ops.import_capture(directory=write_mesh_capture(tmp_path / "capture"))
+    ops.train(directory=run, iterations=6)
     trained = read_avatar(run / "avatar.npz")
     write_avatar(run / "avatar.npz", replace(trained, light=None))
-    bpy.ops.stga.show_avatar(filepath=str(run / "avatar.npz"))
+    ops.show_avatar(filepath=run / "avatar.npz")
     shown = scene.stga.splats
     scene.stga.run_folder = str(run)
     assert stored_avatar(shown).light is None
     add_sun()
     scene.stga_lighting.mode = "scene"
 
-    bpy.ops.stga.estimate_light()
+    ops.estimate_light()
     found = stored_avatar(shown).light
     for name in vars(found).keys() - {"source"}:
         assert_allclose(getattr(found, name), getattr(trained.light, name), atol=1e-6, err_msg=name)
     assert found.source == "estimated"
     assert read_avatar(run / "avatar.npz").light.source == "estimated"
 
-    bpy.ops.stga.make_exact()
+    ops.make_exact()
     fitted = read_avatar(run / "avatar.npz")
     assert fitted.light is not None
     assert_array_equal(fitted.splats.sh, trained.splats.sh)
@@ -317,9 +307,9 @@ def test_estimate_light(extension, tmp_path):
     assert [light.kind for light in relit().lighting.lights] == ["sun"]
 
     write_avatar(tmp_path / "other.npz", replace(trained, splats=trained.splats.rows(np.arange(9))))
-    bpy.ops.stga.show_avatar(filepath=str(tmp_path / "other.npz"))
+    ops.show_avatar(filepath=tmp_path / "other.npz")
     scene.stga.run_folder = str(run)
     assert LINEAR_SH not in scene.stga.splats.data.attributes
-    for add in (bpy.ops.stga.estimate_light, bpy.ops.stga.make_exact):
-        with pytest.raises(RuntimeError, match="is not the one that the scene shows"):
+    for add in (ops.estimate_light, ops.make_exact):
+        with failure("is not the one that the scene shows"):
             add()

@@ -9,7 +9,6 @@ from light.scenes import RADIUS, lit_avatar
 from mathutils import Vector
 from numpy.linalg import norm
 from numpy.testing import assert_allclose, assert_array_equal
-from PIL import Image
 
 from stga_addon.capture.mesh_geometry import vertex_normals
 from stga_addon.light.relight import Relighter
@@ -28,6 +27,7 @@ from stga_addon.scene.display.splat_nodes import DISPLAY, NATIVE, NATIVE_LIGHT, 
 from stga_addon.scene.display.splat_object import set_input, store_light
 from stga_addon.scene.render.scene_splats import light_hint
 
+from .session import picture
 from .test_light import BALL, background, lamp, shown_head
 from .test_other_engines import EEVEE, EEVEE_MARKS
 from .test_panel import draw
@@ -161,20 +161,11 @@ def test_lamps_shine_on_native_splats(engine, tmp_path):
     bpy.ops.mesh.primitive_plane_add(
         size=3, location=center + Vector((0, 0.4, 0)), rotation=(np.pi / 2, 0, 0)
     )
-    scene.render.engine = engine
-    scene.render.resolution_x = scene.render.resolution_y = 40
-    scene.render.image_settings.file_format = "PNG"
-    scene.render.filepath = str(tmp_path / "image.png")
     scene.view_settings.view_transform = "Standard"
-    if engine == "CYCLES":
-        scene.cycles.samples = 16
-        scene.cycles.use_denoising = False
-    else:
-        scene.eevee.taa_render_samples = 8
 
     def image():
-        bpy.ops.render.render(write_still=True)
-        return np.asarray(Image.open(tmp_path / "image.png").convert("L"), np.float32) / 255
+        whole = picture(tmp_path / "image.png", engine, 40, 16 if engine == "CYCLES" else 8)
+        return whole[..., :3].mean(-1) / 255
 
     ball = (slice(16, 24), slice(15, 25))
     right = (slice(16, 24), slice(22, 25))

@@ -20,6 +20,7 @@ from stga_addon.scene.rig.keyframes import Placement
 from stga_addon.scene.rig.motion import apply_motion, sample_motion
 
 from .captures import at_frame, flame_model, flame_sequence, mesh_capture, motion_capture
+from .session import placed, reopen
 
 TOLERANCE = 2e-6
 FIELDS = ("expr", "rotation", "neck_pose", "jaw_pose", "eyes_pose", "translation")
@@ -74,8 +75,7 @@ def test_the_old_action_is_unchanged(head, own, other, tmp_path):
     before = [(action.name, curves_of(owner, action)) for owner, action in actions]
     apply_motion(head, retimed(other), Placement(2, "other"))
     name = head.name
-    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "a.blend"))
-    bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "a.blend"))
+    reopen(tmp_path / "a.blend")
     head = bpy.data.objects[name]
     for owner, (title, curves) in zip(owners(head), before, strict=True):
         assert owner.animation_data.action.name != title
@@ -212,9 +212,8 @@ def test_sampled_motion_includes_edits_by_hand(head, own):
     keys = head.data.shape_keys.key_blocks
     rig.animation_data.action = head.data.shape_keys.animation_data.action = None
     rig.pose.bones["neck"].rotation_quaternion = (0.9, 0.3, 0.1, 0.2)
-    turned = bpy.data.objects.new("turned", None)
+    turned = placed("turned", None)
     turned.rotation_euler = (0.4, 0, 0)
-    bpy.context.scene.collection.objects.link(turned)
     rig.pose.bones["jaw"].constraints.new("COPY_ROTATION").target = turned
     keys["identity_002"].value = 1.5
     keys["expr_001"].value = -2.0

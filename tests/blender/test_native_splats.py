@@ -28,6 +28,7 @@ from stga_addon.scene.layers import FROZEN_COLOR
 from stga_addon.scene.rig.head import import_head, rig_of
 
 from .captures import flame_model, flame_sequence, motion_capture
+from .session import open_file, ops, panel, point_clouds, reopen, save
 from .test_operators import write_ball_avatar
 from .test_splat_object import driven_avatar, same_rotation
 from .test_versions import python_of
@@ -127,11 +128,7 @@ def test_native_splats_follow_bones_shape_keys_and_strain(tmp_path):
         posed = evaluated_vertices(head)
         assert np.abs(posed - before).max() > 0.01
         wanted = to_world(avatar.splats, avatar.frames(posed))
-        (cloud,) = [
-            read_native_splats(each.object.data)
-            for each in bpy.context.evaluated_depsgraph_get().object_instances
-            if each.object.type == "POINTCLOUD"
-        ]
+        (cloud,) = map(read_native_splats, point_clouds())
         assert_allclose(cloud.xyz, wanted.xyz, atol=1e-5)
         size = np.exp(wanted.log_scale).max(1)[:, None, None]
         found, expected = (covariance(each) / size**2 for each in (cloud, wanted))
@@ -166,24 +163,23 @@ def test_a_file_from_before_native_splats_can_show_them(
     path = str(tmp_path / "a.npz")
     write_ball_avatar(tmp_path / "a.npz")
     pretend(False)
-    bpy.ops.stga.show_avatar(filepath=path)
-    splat_object.set_input(bpy.context.scene.stga.splats, splat_nodes.SIZE, 1.5)
-    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "a.blend"))
+    ops.show_avatar(filepath=path)
+    splat_object.set_input(panel().splats, splat_nodes.SIZE, 1.5)
+    save(tmp_path / "a.blend")
     pretend(True)
-    bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "a.blend"))
-    settings = bpy.context.scene.stga
+    open_file(tmp_path / "a.blend")
+    settings = panel()
     if shows_again:
-        bpy.ops.stga.show_avatar(filepath=path)
+        ops.show_avatar(filepath=path)
         splat_object.set_input(settings.splats, splat_nodes.DISPLAY, NATIVE)
     elif compat.NATIVE_SPLATS:
-        bpy.ops.stga.choose_display(display=NATIVE)
+        ops.choose_display(display=NATIVE)
     else:  # where the operator does not offer it
         splat_object.choose_display(settings.splats, NATIVE)
     assert splat_object.display_mode(settings.splats) == NATIVE
     assert splat_object.get_input(settings.splats, splat_nodes.SIZE) == 1.5
     assert splat_object.get_input(settings.splats, splat_nodes.HEAD) == settings.head
-    instances = bpy.context.evaluated_depsgraph_get().object_instances
-    (data,) = [each.object.data for each in instances if each.object.type == "POINTCLOUD"]
+    (data,) = point_clouds()
     assert not compat.NATIVE_SPLATS or data.type == "GAUSSIAN_SPLAT"
 
 
@@ -203,15 +199,14 @@ def test_native_splats_become_quads_in_an_older_blender(extension, head, pretend
     splat_object = extension.stga_addon.scene.display.splat_object
     write_ball_avatar(tmp_path / "a.npz")
     pretend(True)
-    bpy.ops.stga.show_avatar(filepath=str(tmp_path / "a.npz"))
-    shown = bpy.context.scene.stga.splats
+    ops.show_avatar(filepath=tmp_path / "a.npz")
+    shown = panel().splats
     splat_object.set_input(shown, splat_nodes.DISPLAY, NATIVE)
-    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "a.blend"))
-    bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "a.blend"))
-    assert splat_object.display_mode(bpy.context.scene.stga.splats) == NATIVE
+    reopen(tmp_path / "a.blend")
+    assert splat_object.display_mode(panel().splats) == NATIVE
     pretend(False)
-    bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "a.blend"))
-    shown = bpy.context.scene.stga.splats
+    open_file(tmp_path / "a.blend")
+    shown = panel().splats
     sentence = f"{shown.name} is displayed as {QUADS}; native splats need Blender 5.3 or newer"
     assert splat_object.display_mode(shown) == QUADS
     assert f"STGA: {sentence}\n" in capsys.readouterr().out
@@ -220,8 +215,8 @@ def test_native_splats_become_quads_in_an_older_blender(extension, head, pretend
     with bpy.data.libraries.load(str(tmp_path / "library.blend")) as (_, target):
         target.objects = [shown.name]
     assert splat_object.display_mode(target.objects[0]) == (QUADS if compat.APPENDED else NATIVE)
-    bpy.ops.stga.choose_display(display=POINTS)
-    bpy.ops.stga.show_avatar(filepath=str(tmp_path / "a.npz"))
+    ops.choose_display(display=POINTS)
+    ops.show_avatar(filepath=tmp_path / "a.npz")
     assert splat_object.display_mode(shown) == POINTS
 
 

@@ -16,9 +16,9 @@ from stga_addon.scene.arrays import triangle_mesh
 from stga_addon.scene.compat import enable_nodes
 from stga_addon.scene.display.splat_nodes import POINTS
 from stga_addon.scene.display.splat_object import display_mode, show_avatar
-from stga_addon.scene.render.scene_splats import SplatCache, visible_layers
 
-from .test_operators import write_ball_avatar
+from .session import open_file, ops, panel, reopen, save, shown_layers, viewport
+from .test_operators import show_ball
 from .test_panel import draw
 
 LACKS = (
@@ -63,32 +63,31 @@ def test_long_errors_are_in_the_panel(extension, head, monkeypatch, sentence):
 
 def test_the_file_knows_its_run(extension, head, tmp_path):
     """Catches a run lost when an avatar is shown, or the file moved with it or saved elsewhere."""
-    settings = bpy.context.scene.stga
+    settings = panel()
     folder = tmp_path / "work"
     (folder / "run").mkdir(parents=True)
     (folder / "run/run.json").write_text("{}")
-    write_ball_avatar(folder / "run/avatar.npz")
-    bpy.ops.stga.show_avatar(filepath=str(folder / "run/avatar.npz"))
+    show_ball(folder / "run/avatar.npz")
     assert settings.run_folder == str(folder / "run")
-    bpy.ops.wm.save_as_mainfile(filepath=str(folder / "head.blend"))
+    save(folder / "head.blend")
     assert (settings.run_folder, settings.avatar) == ("//run", "//run/avatar.npz")
-    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "copy.blend"), copy=True)
+    save(tmp_path / "copy.blend", copy=True)
     assert settings.run_folder == "//run"
     settings.holds_run = False
     bpy.ops.wm.save_mainfile()
     shutil.move(folder, tmp_path / "moved")
-    bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "moved/head.blend"))
-    settings = bpy.context.scene.stga
+    open_file(tmp_path / "moved/head.blend")
+    settings = panel()
     assert Path(bpy.path.abspath(settings.run_folder)) == tmp_path / "moved/run"
     assert settings.holds_run, "as in a file that an older version saved"
     (tmp_path / "elsewhere").mkdir()
-    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "elsewhere/head.blend"))
+    save(tmp_path / "elsewhere/head.blend")
     assert settings.run_folder == str(tmp_path / "moved/run")
 
 
 def test_a_run_made_after_its_head(extension, head, tmp_path):
     """Catches no Train More after Avatar from Video, whose head is there before its run."""
-    settings = bpy.context.scene.stga
+    settings = panel()
     settings.run_folder = str(tmp_path / "run")
     (tmp_path / "run").mkdir()
     (tmp_path / "run/run.json").write_text("{}")
@@ -102,28 +101,26 @@ def test_a_file_made_without_the_panel(extension, head, tmp_path):
     """Catches demo.blend with an empty panel, and a chosen head replaced at loading."""
     (tmp_path / "run").mkdir()
     (tmp_path / "run/run.json").write_text("{}")
-    write_ball_avatar(tmp_path / "run/avatar.npz")
-    bpy.ops.stga.show_avatar(filepath=str(tmp_path / "run/avatar.npz"))
-    settings = bpy.context.scene.stga
+    show_ball(tmp_path / "run/avatar.npz")
+    settings = panel()
     name = head.name
     path = str(tmp_path / "demo.blend")
     settings.splats[tags.AVATAR] = "//run/avatar.npz"
     for each in ("head", "splats", "avatar", "run_folder"):
         settings.property_unset(each)
-    bpy.ops.wm.save_as_mainfile(filepath=path)
-    bpy.ops.wm.open_mainfile(filepath=path)
-    assert bpy.context.scene.stga.run_folder == "//run"
-    assert bpy.context.scene.stga.head.name == name
-    other = bpy.context.scene.stga.head = bpy.data.objects.new("other", None)
+    reopen(path)
+    assert panel().run_folder == "//run"
+    assert panel().head.name == name
+    other = panel().head = bpy.data.objects.new("other", None)
     bpy.context.scene.collection.objects.link(other)
     bpy.ops.wm.save_mainfile()
-    bpy.ops.wm.open_mainfile(filepath=path)
-    assert bpy.context.scene.stga.head.name == "other"
+    open_file(path)
+    assert panel().head.name == "other"
 
 
 def test_the_chosen_row_is_that_of_the_frame(head):
     """Catches a highlight that stays when another row, or the timeline, is clicked."""
-    bpy.ops.stga.select(threshold=0.0005)
+    ops.select(threshold=0.0005)
     scene = bpy.context.scene
     for row, frame in enumerate(settings_row.frame for settings_row in scene.stga.selected_frames):
         scene.stga.selected_row = row
@@ -139,9 +136,9 @@ def test_what_the_small_edition_begins_with(extension, monkeypatch):
     for has_demo, has_python in ((False, False), (True, True)):
         poll = staticmethod(lambda context, has_demo=has_demo: has_demo)
         monkeypatch.setattr(extension.ui.next_step.OpenDemo, "poll", poll)
-        for panel in (extension.ui.next_step, extension.ui.train_panel):
+        for each in (extension.ui.next_step, extension.ui.train_panel):
             there = lambda context, has_python=has_python: has_python  # noqa: E731
-            monkeypatch.setattr(panel, "has_training_python", there)
+            monkeypatch.setattr(each, "has_training_python", there)
         said = " ".join(draw(extension, "next_step"))
         assert ("no demo" in said, "Open Demo Capture" in said) == (not has_demo, has_demo)
         assert ("first. " in said, "Choose a Python " in said) == (not has_python, not has_python)
@@ -178,25 +175,23 @@ def test_exports_propose_the_name_of_the_head(extension, head, tmp_path):
     manager = SimpleNamespace(fileselect_add=asked.append)
     context = SimpleNamespace(scene=bpy.context.scene, window_manager=manager, blend_data=bpy.data)
     head.parent.name = "anna 1/2"
-    bpy.context.scene.stga.run_folder = str(tmp_path / "run") + "/"
+    panel().run_folder = str(tmp_path / "run") + "/"
     Video().invoke(context, None)
     assert [each.filepath for each in asked] == [str(tmp_path / "anna_1_2.mp4")]
-    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "saved.blend"))
+    save(tmp_path / "saved.blend")
     Video().invoke(context, None)
     assert asked[1].filepath == str(tmp_path / "saved.mp4")
 
 
 def test_a_display_is_chosen_with_a_shading_that_shows_it(extension, head, tmp_path):
     """Catches gray splats in Solid mode after another display was chosen."""
-    write_ball_avatar(tmp_path / "avatar.npz")
-    bpy.ops.stga.show_avatar(filepath=str(tmp_path / "avatar.npz"))
-    window = bpy.context.window_manager.windows[0]
-    area = next(area for area in window.screen.areas if area.type == "VIEW_3D")
+    show_ball(tmp_path / "avatar.npz")
+    window, area = viewport()
     shading = area.spaces.active.shading
     shading.type = "SOLID"
     with bpy.context.temp_override(window=window, area=area):
-        bpy.ops.stga.choose_display(display=POINTS)
-    assert (display_mode(bpy.context.scene.stga.splats), shading.type) == (POINTS, "MATERIAL")
+        ops.choose_display(display=POINTS)
+    assert (display_mode(panel().splats), shading.type) == (POINTS, "MATERIAL")
 
 
 def test_the_first_click_on_scene_light_is_as_bright_as_trained(extension):
@@ -211,7 +206,7 @@ def test_the_first_click_on_scene_light_is_as_bright_as_trained(extension):
     enable_nodes(scene.world).nodes["Background"].inputs["Strength"].default_value = 40.0
     lighting = scene.stga_lighting
     lighting.mode = "scene"
-    (layer,) = visible_layers(bpy.context.evaluated_depsgraph_get(), SplatCache())
+    (layer,) = shown_layers()
     eye = np.array((0.0, 0.0, 1.0))
     relit = layer.relit
     recorded = replace(relit.lighting, mode="recorded")
@@ -231,7 +226,7 @@ def test_appended_and_deleted_heads(head, tmp_path):
     """Catches a panel that does not know an appended head, or works on one that is deleted."""
     file = str(tmp_path / "head.blend")
     name = head.name
-    bpy.ops.wm.save_as_mainfile(filepath=file)
+    save(file)
     bpy.ops.wm.read_homefile(use_empty=True)
     bpy.ops.wm.append(directory=f"{file}/Object/", filename=name)
     scene = bpy.context.scene

@@ -27,6 +27,7 @@ from stga_addon.scene.vertex_groups import read_selection
 from stga_addon.selection import SelectionOptions, select_capture
 
 from .captures import closure
+from .session import failure, ops, panel, reopen
 
 pytestmark = pytest.mark.usefixtures("extension")
 
@@ -56,9 +57,8 @@ def mesh_capture(tmp_path):
 @pytest.fixture
 def shown(mesh_capture, tmp_path):
     """A mesh capture whose head is in the scene with the avatar of avatar.npz."""
-    bpy.ops.stga.import_capture(directory=str(mesh_capture))
-    avatar = write_ball_avatar(tmp_path / "avatar.npz")
-    bpy.ops.stga.show_avatar(filepath=str(tmp_path / "avatar.npz"))
+    ops.import_capture(directory=mesh_capture)
+    avatar = show_ball(tmp_path / "avatar.npz")
     return open_capture(mesh_capture), avatar
 
 
@@ -72,6 +72,13 @@ def write_ball_avatar(path, neutral=None, **options):
     splats = replace(splats, xyz=splats.xyz + off)
     avatar = Avatar(splats, "stga", vertices.astype(np.float32), faces)
     write_avatar(path, avatar)
+    return avatar
+
+
+def show_ball(path, neutral=None, **options):
+    """Write such an avatar and show it."""
+    avatar = write_ball_avatar(path, neutral, **options)
+    ops.show_avatar(filepath=path)
     return avatar
 
 
@@ -108,7 +115,7 @@ def test_every_operator_explains_itself():
     script's `resume` that Blender remembers for the next click: what tells it not to is checked."""
     for name in operators():
         function = name.removeprefix("STGA_OT_")
-        kind = getattr(bpy.ops.stga, function).get_rna_type()
+        kind = getattr(ops, function).get_rna_type()
         assert kind.description not in ("", "(undocumented operator)"), name
         properties = [prop for prop in kind.properties if prop.identifier != "rna_type"]
         for prop in properties:
@@ -120,14 +127,14 @@ def test_every_operator_explains_itself():
 
 def test_options_are_those_of_the_request(extension):
     """Catches a limit, default or choice other than the command line's, and 0 taken for a value."""
-    shown = bpy.ops.stga.track_footage.get_rna_type().properties
+    shown = ops.track_footage.get_rna_type().properties
     for name in ("focal", "start", "stop", "step"):
         field = Track.__dataclass_fields__[name]
         least = 0 if field.default is None else field.metadata["minimum"]
         assert (shown[name].hard_min, shown[name].default) == (least, field.default or 0), name
         assert "default" not in shown[name].description
     assert shown["stop"].description == "Timestep to stop before; 0: all"
-    strategies = bpy.ops.stga.train.get_rna_type().properties["strategy"].enum_items
+    strategies = ops.train.get_rna_type().properties["strategy"].enum_items
     names = {"global", "selective", "gaussian-avatars"}
     assert {item.identifier for item in strategies} == names
     given = {"focal": 0.0, "start": 0, "stop": 0, "step": 2, "model": "", "cameras": "/a.json"}
@@ -146,11 +153,11 @@ def test_from_import_to_show(tmp_path, layout):
     else:
         folder, model = write_flame_capture(tmp_path / "capture")
     capture = open_capture(folder, model)
-    bpy.ops.stga.import_capture(directory=str(folder), flame=str(model or ""))
+    ops.import_capture(directory=folder, flame=model or "")
     scene = bpy.context.scene
     assert (scene.frame_start, scene.frame_end) == (0, 3)
     assert (scene.render.resolution_x, scene.render.resolution_y) == (40, 60)
-    bpy.ops.stga.select(threshold=0.0015)
+    ops.select(threshold=0.0015)
     rule = select_capture(capture, SelectionOptions(threshold=0.0015))
     written = read_selection(scene.stga.head)
     assert rule[3].any()
@@ -158,10 +165,8 @@ def test_from_import_to_show(tmp_path, layout):
     for timestep, selected in rule.items():
         expected = closure(selected, capture.faces) & selected.any()
         assert_array_equal(written[timestep], expected)
-    avatar = write_ball_avatar(tmp_path / "avatar.npz")
-    bpy.ops.stga.show_avatar(filepath=str(tmp_path / "avatar.npz"))
-    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "head.blend"))
-    bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "head.blend"))
+    avatar = show_ball(tmp_path / "avatar.npz")
+    reopen(tmp_path / "head.blend")
     scene = bpy.context.scene
     assert scene.stga.head.hide_render
     assert not scene.stga.head.visible_get()
@@ -187,7 +192,7 @@ def test_exports(shown, tmp_path):
         "a.spz": "spz",
     }
     for name, format in formats.items():
-        bpy.ops.stga.export_avatar(filepath=str(tmp_path / name), format=format)
+        ops.export_avatar(filepath=tmp_path / name, format=format)
         assert (tmp_path / name).stat().st_size > 0
     assert bpy.context.scene.frame_current == 3
     stage = usd.Stage.Open(str(tmp_path / "a.usdz"))
@@ -200,24 +205,24 @@ def test_exports(shown, tmp_path):
         many = read_ply(tmp_path / f"many/{frame:05d}.ply").xyz
         assert_allclose(many, expected, atol=1e-5)
     assert_array_equal(read_ply(tmp_path / "one.ply").xyz, many)
-    with pytest.raises(RuntimeError, match="not tracked with FLAME"):
-        bpy.ops.stga.export_avatar(filepath=str(tmp_path / "pair"), format="gaussian-avatars")
-    one = {"filepath": str(tmp_path / "one.ply"), "format": "ply", "filmed_only": True}
-    with pytest.raises(RuntimeError, match="does not say what was filmed"):
-        bpy.ops.stga.export_avatar(**one)
+    with failure("not tracked with FLAME"):
+        ops.export_avatar(filepath=tmp_path / "pair", format="gaussian-avatars")
+    one = {"filepath": tmp_path / "one.ply", "format": "ply", "filmed_only": True}
+    with failure("does not say what was filmed"):
+        ops.export_avatar(**one)
     unseen = np.arange(len(avatar.faces)) % 2 == 0
     path = tmp_path / "avatar.npz"
     write_avatar(path, replace(read_avatar(path), regions={"unseen": unseen}))
-    bpy.ops.stga.export_avatar(**one)
+    ops.export_avatar(**one)
     kept = expected.astype(np.float32)[~unseen[avatar.splats.face]]
     assert_allclose(read_ply(tmp_path / "one.ply").xyz, kept, atol=1e-5)
     bpy.context.scene.frame_start = 1
-    bpy.ops.stga.export_avatar(filepath=str(tmp_path / "a.glb"), format="web")
+    ops.export_avatar(filepath=tmp_path / "a.glb", format="web")
     header, arrays = read_web_data((tmp_path / "a.glb").read_bytes())
     assert len(arrays["translation"]) == 3
     centers = [capture.mesh(timestep).mean(0) for timestep in (1, 3)]
     assert_allclose(arrays["translation"][[0, 2]], centers, atol=1e-5)
-    up = np.array(bpy.context.scene.stga.head.matrix_world.to_3x3()) @ header["up"]
+    up = np.array(panel().head.matrix_world.to_3x3()) @ header["up"]
     assert_allclose(up, [0, 0, 1], atol=1e-5)
 
 
@@ -228,7 +233,7 @@ class RangeExport:
         operator = extension.operators.export.ExportAvatar
         objects = extension.stga_addon.scene.objects
         view = objects.SceneView(bpy.context)
-        head = objects.Identity(bpy.context.scene.stga.head)
+        head = objects.Identity(panel().head)
         self.said: list[str] = []
         self.dialog = SimpleNamespace(others="", inform=self.said.append)
         self.dialog.report = self.dialog.tell = lambda kind, text: self.said.append(text)
@@ -319,7 +324,7 @@ def test_an_export_always_ends(extension, shown, tmp_path, monkeypatch, end):
     running = RangeExport(extension, frames_to(tmp_path / "out", shown[1], given), range(40))
     assert running.until(lambda: "frame 2" in given) == "RUNNING_MODAL"
     if end == "no head":
-        bpy.data.objects.remove(bpy.context.scene.stga.head)
+        bpy.data.objects.remove(panel().head)
         assert running.until() == "CANCELLED"
         assert running.said[-1].endswith("head: was removed meanwhile")
     elif end == "bug":
@@ -349,7 +354,7 @@ def test_undo_and_new_names_do_not_end_an_export(extension, shown, tmp_path):
     running.until(lambda: "frame 1" in given)
     bpy.ops.ed.undo()
     bpy.context.scene.name = "renamed"
-    bpy.context.scene.stga.head.name = "Anna"
+    panel().head.name = "Anna"
     assert (running.until(), running.said) == ("FINISHED", ["Exported to ."])
     expected = expected_world(avatar, capture.mesh(3)).xyz
     assert_allclose(read_ply(tmp_path / "out/00003.ply").xyz, expected, atol=1e-5)
@@ -393,8 +398,8 @@ def test_import_ply(tmp_path):
     splats = replace(splats, face=np.zeros(len(faces), np.int32))
     write_ply(tmp_path / "scan.ply", splats)
     for up, axis in (("Y", (0, 1, 0)), ("-Y", (0, -1, 0)), ("Z", (0, 0, 1))):
-        bpy.ops.stga.import_ply(filepath=str(tmp_path / "scan.ply"), up=up)
-        shown = bpy.context.scene.stga.splats
+        ops.import_ply(filepath=tmp_path / "scan.ply", up=up)
+        shown = panel().splats
         bpy.context.view_layer.update()
         turned = np.array(shown.matrix_world)[:3, :3] @ axis
         assert_allclose(turned, (0, 0, 1), atol=1e-6)
@@ -412,17 +417,17 @@ def test_mistakes_are_sentences(mesh_capture, tmp_path):
         ("import_capture", {"directory": f"{tmp_path}/nowhere"}, ".*nowhere: is not a folder"),
         ("import_capture", {}, ".*no path given"),
         ("import_capture", {"directory": "//capture"}, ".*has not been saved yet"),
-        ("import_capture", {"directory": str(mesh_capture)}, r".*00003\.obj"),
-        ("import_ply", {"filepath": str(broken)}, ".*broken.ply: is not a PLY file"),
+        ("import_capture", {"directory": mesh_capture}, r".*00003\.obj"),
+        ("import_ply", {"filepath": broken}, ".*broken.ply: is not a PLY file"),
     ):
-        with pytest.raises(RuntimeError, match=f"^Error: {sentence}"):
-            getattr(bpy.ops.stga, operator)(**arguments)
+        with failure(f"^Error: {sentence}"):
+            getattr(ops, operator)(**arguments)
     assert not bpy.data.objects
     for name in ("select", "train", "show_avatar", "export_avatar", "heat_map", "apply_motion"):
-        with pytest.raises(RuntimeError, match="Import a capture first"):
-            getattr(bpy.ops.stga, name)()
+        with failure("Import a capture first"):
+            getattr(ops, name)()
     mesh.write_text(whole)
-    bpy.ops.stga.import_capture(directory=str(mesh_capture))
+    ops.import_capture(directory=mesh_capture)
     mesh_capture.rename(tmp_path / "elsewhere")
-    with pytest.raises(RuntimeError, match=r"capture: is not a folder"):
-        bpy.ops.stga.select()
+    with failure(r"capture: is not a folder"):
+        ops.select()

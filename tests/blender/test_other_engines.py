@@ -5,12 +5,12 @@ from dataclasses import replace
 import bpy
 import numpy as np
 import pytest
+from avatar.conftest import splats_of
 from numpy.testing import assert_allclose, assert_array_equal
-from PIL import Image
 from refusal import refusal
 
 from stga_addon.avatar.embedding import WORLD
-from stga_addon.avatar.splats import SH_C0, Splats
+from stga_addon.avatar.splats import SH_C0
 from stga_addon.capture.color import linear_to_srgb, srgb_to_linear
 from stga_addon.light.relight import Relighter
 from stga_addon.raster.cpu.compose import compose
@@ -21,12 +21,11 @@ from stga_addon.scene.display.splat_nodes import DISPLAY, QUADS
 from stga_addon.scene.display.splat_object import set_input, show_world_splats
 from stga_addon.scene.gpu.context import has_gpu_context
 from stga_addon.scene.render.scene_splats import (
-    SplatCache,
     forget_frame,
     relight_frame,
-    visible_layers,
 )
 
+from .session import ops, picture, shown_layers
 from .test_engine import add_sun, camera_at, show, textured, with_light
 from .test_panel import draw
 from .test_splat_object import active_camera, avatar_of, displayed_colors
@@ -45,18 +44,15 @@ EEVEE_MARKS = (
 def overlapping_splats():
     """Translucent splats of two colors, which tell the order in which they are blended."""
     rng = np.random.default_rng(0)
-    count = 400
-    direction = rng.normal(size=(count, 3))
+    direction = rng.normal(size=(400, 3))
     xyz = 0.1 * direction / np.linalg.norm(direction, axis=1, keepdims=True)
     colors = np.where(xyz[:, 2:] > 0, (1.2, -0.3, -0.8), (-0.8, 0.2, 1.2))
-    return Splats(
-        xyz=xyz.astype(np.float32),
-        rotation=rng.normal(size=(count, 4)).astype(np.float32),
-        log_scale=rng.normal(-4.5, 0.3, (count, 3)).astype(np.float32),
-        opacity=rng.normal(1.0, 1.0, count).astype(np.float32),
-        sh=colors[:, None].astype(np.float32),
-        face=np.zeros(count, np.int32),
-        unbound=np.zeros(count, bool),
+    return splats_of(
+        xyz,
+        rotation=rng.normal(size=(400, 4)),
+        log_scale=rng.normal(-4.5, 0.3, (400, 3)),
+        opacity=rng.normal(1.0, 1.0, 400),
+        sh=colors[:, None],
     )
 
 
@@ -78,24 +74,12 @@ def test_images_without_noise(engine, tmp_path):
     camera.data.lens = 80
     scene.world = bpy.data.worlds.new("black")
     enable_nodes(scene.world).nodes["Background"].inputs["Color"].default_value = (0, 0, 0, 1)
-    render = scene.render
-    render.engine = engine
-    render.filepath = str(tmp_path / "image.png")
-    render.resolution_x = render.resolution_y = SIZE_PX
-    render.image_settings.file_format = "PNG"
-    render.image_settings.color_mode = "RGB"
     scene.view_settings.view_transform = "Standard"
-    if engine == "CYCLES":
-        scene.cycles.samples = SAMPLES
-        scene.cycles.use_denoising = False
-    else:
-        scene.eevee.taa_render_samples = SAMPLES
-    bpy.ops.render.render(write_still=True)
-    found = np.asarray(Image.open(tmp_path / "image.png"), np.float32).transpose(2, 0, 1) / 255
+    found = picture(tmp_path / "image.png", engine, SIZE_PX, SAMPLES)[..., :3] / 255
     depsgraph = bpy.context.evaluated_depsgraph_get()
     view = render_camera(camera.evaluated_get(depsgraph), depsgraph, SIZE_PX, SIZE_PX)
     expected = blended_in_linear_light(splats, view)
-    psnr_db = -10 * np.log10(np.mean((found - expected) ** 2))
+    psnr_db = -10 * np.log10(np.mean((found.transpose(2, 0, 1) - expected) ** 2))
     print(f"{engine}: {psnr_db:.1f} dB")
     assert expected.mean() > 0.1, "nothing to compare"
     assert psnr_db >= MIN_PSNR_DB
@@ -124,7 +108,7 @@ def test_images_of_recorded_light_say_so(extension, tmp_path, capsys):
     scene.stga_lighting.mode = "scene"
     assert "render colors as recorded" in said()
     assert any(cast in text for text in draw(extension, "lighting"))
-    bpy.ops.stga.relight_frame()
+    ops.relight_frame()
     assert cast not in said()
     assert not any(cast in text for text in draw(extension, "lighting"))
     text = said(animation=True)
@@ -132,9 +116,9 @@ def test_images_of_recorded_light_say_so(extension, tmp_path, capsys):
     assert text.count(cast) == 1
     scene.frame_set(6)
     assert cast in said()
-    bpy.ops.stga.relight_frame()
+    ops.relight_frame()
     assert cast not in said()
-    bpy.ops.stga.relight_frame(clear=True)
+    ops.relight_frame(clear=True)
     assert "render colors as recorded" in said()
     shown.hide_render = True
     assert cast not in said()
@@ -151,7 +135,7 @@ def test_relit_color_of_a_frame(lighting):
         relight_frame(shown, bpy.context.scene)
     lighting.mode = "scene"
     relight_frame(shown, bpy.context.scene)
-    (layer,) = visible_layers(bpy.context.evaluated_depsgraph_get(), SplatCache())
+    (layer,) = shown_layers()
     eye = layer.eye_in_avatar(np.array(camera.matrix_world)[:3, 3])
     relit = Relighter(avatar).radiance(layer.relit.mesh, eye, layer.relit.lighting)
     assert_allclose(displayed_colors(shown), np.maximum(relit, 0), atol=2e-3)

@@ -16,13 +16,14 @@ from stga_addon.jobs.table import Kind
 from stga_addon.progress import Progress
 from stga_addon.report import CURVE_COLOR, DETAIL_COLOR, FORECAST_COLOR, MARGIN, SIZE, curve_image
 
+from .session import ops, panel
 from .test_operators import write_ball_avatar
 
 
 @pytest.fixture
 def trained(extension, head, tmp_path, monkeypatch):
     """A scene whose run has finished, with curve and refined tracking, as the timer has read it."""
-    bpy.ops.stga.select(threshold=0.0005)
+    ops.select(threshold=0.0005)
     run = tmp_path / "run"
     jobs = extension.stga_addon.jobs
     monitor = extension.operators.monitor
@@ -38,7 +39,7 @@ def trained(extension, head, tmp_path, monkeypatch):
     write_ball_avatar(run / "avatar.npz")
     for _ in range(300):
         monitor.tick()
-        if bpy.context.scene.stga.result_shown:
+        if panel().result_shown:
             break
     monkeypatch.setattr(extension.operators.timers, "has_timer", lambda: True)
     monkeypatch.setattr(monitor, "start_timer", lambda: None)
@@ -107,7 +108,7 @@ def test_panels(extension, trained, monkeypatch, capsys):
 def test_a_word_for_the_quality_and_more_training(extension, trained, tmp_path):
     """Catches figures that only an expert reads, a finished run that can only be resumed, which
     trains nothing, and *Resume* where there is no run."""
-    settings = bpy.context.scene.stga
+    settings = panel()
     settings.run_folder = str(trained)
     settings.minutes = 3.0
     texts = draw(extension, "STGA_PT_train")
@@ -117,7 +118,7 @@ def test_a_word_for_the_quality_and_more_training(extension, trained, tmp_path):
     (trained / "run.json").write_text("{}")
     settings.show_figures = True
     assert "PSNR 27.00 dB" in draw(extension, "STGA_PT_train")
-    bpy.ops.stga.dismiss(request="training")
+    ops.dismiss(request="training")
     assert "Train 3 min More" in draw(extension, "STGA_PT_train")
     another = tmp_path / "another"
     settings.run_folder = str(another)
@@ -135,7 +136,7 @@ def test_what_is_said_of_an_operator(extension, head):
     operator = SimpleNamespace(report=lambda kind, sentence: None)
     tell = extension.operators.common.Action.tell
     manager = bpy.context.window_manager
-    bpy.ops.stga.select(threshold=0.0005)
+    ops.select(threshold=0.0005)
     for kind, sentence, expected in (
         ("WARNING", "One image is missing", ["Done", "One image is missing"]),
         ("WARNING", "So is one mask", ["Done", "One image is missing", "So is one mask"]),
@@ -144,7 +145,7 @@ def test_what_is_said_of_an_operator(extension, head):
         tell(operator, kind, sentence)
         texts = draw(extension, "next_step")
         assert [text for text in texts if text in {*expected, "Done", "Not Done"}] == expected
-    bpy.ops.stga.select(threshold=0.0005)
+    ops.select(threshold=0.0005)
     assert (manager.stga_message, manager.stga_failed) == ("", False)
 
 

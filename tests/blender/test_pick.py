@@ -11,7 +11,8 @@ from stga_addon.scene import tags
 from stga_addon.scene.arrays import evaluated_vertices
 from stga_addon.scene.objects import Identity
 
-from .test_operators import write_ball_avatar
+from .session import panel, placed
+from .test_operators import show_ball
 
 SIZE = (400, 300)
 
@@ -19,8 +20,7 @@ SIZE = (400, 300)
 @pytest.fixture
 def view(head, tmp_path):
     """The context of a viewport that looks at an avatar, and the point where that is seen."""
-    write_ball_avatar(tmp_path / "avatar.npz")
-    bpy.ops.stga.show_avatar(filepath=str(tmp_path / "avatar.npz"))
+    show_ball(tmp_path / "avatar.npz")
     layer = bpy.context.view_layer
     root = head.parent
     root.location = (0.5, 0.25, 0)
@@ -56,7 +56,7 @@ def test_a_click_finds_what_moves_the_avatar(extension, head, view):
     bpy.ops.mesh.primitive_cube_add(size=0.1, location=place + place.__class__((0, 0, 1)))
     context.view_layer.update()
     assert pick.avatar_at(context, middle) is None
-    splats = bpy.context.scene.stga.splats
+    splats = panel().splats
     bpy.context.object.hide_set(True)
     splats.modifiers.clear()  # and no traceback
     assert pick.avatar_at(context, middle) is None
@@ -69,11 +69,10 @@ def test_the_click_selects_it(extension, head, view):
     """Catches a camera that Blender has found there and that the avatar takes the selection of, and
     splats that stay selected, which G does not move."""
     objects = bpy.context.view_layer.objects
-    splats = bpy.context.scene.stga.splats
+    splats = panel().splats
     root = head.parent
     identity = Identity(root)
-    camera = bpy.data.objects.new("eye", bpy.data.cameras.new("eye"))
-    bpy.context.scene.collection.objects.link(camera)
+    camera = placed("eye", bpy.data.cameras.new("eye"))
     for found, extend, expected in (
         ((), False, {root}),
         ((splats,), False, {root}),

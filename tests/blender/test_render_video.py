@@ -12,13 +12,13 @@ import av
 import bpy
 import numpy as np
 import pytest
+from avatar.conftest import splats_of
 from capture.factory import write_mesh_capture
 from numpy.random import default_rng
 from numpy.testing import assert_allclose, assert_array_equal
 from PIL import Image
 
 from stga_addon.avatar.file import write_avatar
-from stga_addon.avatar.splats import Splats
 from stga_addon.capture.camera import Camera
 from stga_addon.errors import StgaError
 from stga_addon.export.ply import write_ply
@@ -28,6 +28,7 @@ from stga_addon.render.video import check_output
 from stga_addon.scene.render import drawn_video
 from stga_addon.scene.render.drawn_video import DrawnVideo, png_bytes
 
+from .session import failure, ops, panel, picture
 from .test_operators import write_ball_avatar
 from .test_splat_object import active_camera
 
@@ -35,13 +36,11 @@ from .test_splat_object import active_camera
 @pytest.fixture
 def shown(extension, tmp_path):
     """A scene of three frames that shows an avatar on the moving ball."""
-    bpy.ops.stga.import_capture(
-        directory=str(write_mesh_capture(tmp_path / "capture", range(3), range(3)))
-    )
+    ops.import_capture(directory=write_mesh_capture(tmp_path / "capture", range(3), range(3)))
     avatar = write_ball_avatar(tmp_path / "avatar.npz")
     colors = default_rng(1).normal(0, 1.5, avatar.splats.sh.shape).astype(np.float32)
     write_avatar(tmp_path / "avatar.npz", replace(avatar, splats=replace(avatar.splats, sh=colors)))
-    bpy.ops.stga.show_avatar(filepath=str(tmp_path / "avatar.npz"))
+    ops.show_avatar(filepath=tmp_path / "avatar.npz")
     render = bpy.context.scene.render
     render.resolution_percentage = 200
     render.fps = 10
@@ -62,14 +61,8 @@ def temporary(tmp_path, monkeypatch):
 
 def engine_image(frame, path):
     """The frame as the render engine writes it, (H, W, 4) uint8."""
-    scene = bpy.context.scene
-    scene.render.engine = "STGA_SPLATS"
-    scene.render.filepath = str(path)
-    scene.render.image_settings.file_format = "PNG"
-    scene.render.image_settings.color_mode = "RGBA"
-    scene.frame_set(frame)
-    bpy.ops.render.render(write_still=True)
-    return np.asarray(Image.open(path)).astype(int)
+    bpy.context.scene.frame_set(frame)
+    return picture(path, "STGA_SPLATS")
 
 
 def around_each_image(extension, monkeypatch, before, after):
@@ -95,7 +88,7 @@ def test_image_sequence_of_the_scene(extension, shown, monkeypatch):
     takes told as that of the video."""
     own = bpy.context.scene
     render = {"path": "scene", "format": "png"}
-    bpy.ops.stga.render_video(filepath=str(shown / "images"), **render)
+    ops.render_video(filepath=shown / "images", **render)
     assert own.frame_current == 1
     written = sorted((shown / "images").glob("*.png"))
     assert [path.name for path in written] == ["0001.png", "0002.png", "0003.png"]
@@ -120,7 +113,7 @@ def test_image_sequence_of_the_scene(extension, shown, monkeypatch):
     look = lambda: setattr(window, "scene", other)  # noqa: E731
     around_each_image(extension, monkeypatch, look, count)
     try:
-        bpy.ops.stga.render_video(filepath=str(shown / "beside"), **render)
+        ops.render_video(filepath=shown / "beside", **render)
         assert window.scene == other
         assert (own.frame_current, other.frame_current) == (1, 7)
     finally:
@@ -152,17 +145,17 @@ def test_undo_and_a_removed_scene_meanwhile(extension, shown, monkeypatch, tempo
     monkeypatch.setattr(operator, "Recorder", Recorder)
     monkeypatch.setattr(operator, "start", lambda *arguments: started.append(arguments[1].images))
     bpy.ops.ed.undo_push(message="before")
-    bpy.context.scene.stga.head.location.x = 5
+    panel().head.location.x = 5
     bpy.ops.ed.undo_push(message="moved")
 
     def undo():
-        if bpy.context.scene.stga.head.location.x:
+        if panel().head.location.x:
             bpy.ops.ed.undo()
             bpy.context.scene.name = "renamed"
 
     with monkeypatch.context() as patch:
         around_each_image(extension, patch, lambda: None, undo)
-        bpy.ops.stga.render_video(filepath=str(shown / "meanwhile"), path="scene", format="png")
+        ops.render_video(filepath=shown / "meanwhile", path="scene", format="png")
     assert np.round(recorded).tolist() == [5, 0, 0]
     assert started == [3]
     assert bpy.context.scene.frame_current == 1
@@ -174,13 +167,13 @@ def test_undo_and_a_removed_scene_meanwhile(extension, shown, monkeypatch, tempo
             bpy.data.scenes.remove(bpy.data.scenes["renamed"])
 
     around_each_image(extension, monkeypatch, lambda: None, remove)
-    with pytest.raises(RuntimeError, match="renamed: was removed meanwhile"):
-        bpy.ops.stga.render_video(filepath=str(shown / "gone"), path="scene", format="png")
+    with failure("renamed: was removed meanwhile"):
+        ops.render_video(filepath=shown / "gone", path="scene", format="png")
 
 
 def test_turntable_video(shown):
     """Catches a turntable that stands still, lasts another time, or ends without its file."""
-    bpy.ops.stga.render_video(filepath=str(shown / "turn"), seconds=1.5)
+    ops.render_video(filepath=shown / "turn", seconds=1.5)
     with av.open(str(shown / "turn.mp4")) as container:
         assert container.streams.video[0].average_rate == 10
         frames = container.decode(video=0)
@@ -196,22 +189,13 @@ def test_turntable_of_a_ply(extension, tmp_path):
     rng = default_rng(0)
     xyz = rng.normal((3, 1, 0), 0.1, (200, 3))
     xyz[0] = 1e4
-    floats = {
-        "xyz": xyz,
-        "rotation": np.tile([1, 0, 0, 0], (200, 1)),
-        "log_scale": np.full((200, 3), -4.0),
-        "opacity": np.full(200, 3.0),
-        "sh": np.full((200, 1, 3), 1.5),
-    }
-    rows = {"face": np.zeros(200, np.int32), "unbound": np.zeros(200, bool)}
-    floats = {name: values.astype(np.float32) for name, values in floats.items()}
-    write_ply(tmp_path / "scan.ply", Splats(**floats, **rows))
-    bpy.ops.stga.import_ply(filepath=str(tmp_path / "scan.ply"))
+    write_ply(tmp_path / "scan.ply", splats_of(xyz, opacity=3, sh=1.5))
+    ops.import_ply(filepath=tmp_path / "scan.ply")
     scene = bpy.context.scene
     active_camera((3, -1, 1)).rotation_euler = (np.pi / 2, 0, 0)
     scene.render.resolution_percentage = 5
     scene.frame_end = 3
-    bpy.ops.stga.render_video(filepath=str(tmp_path / "turn"), format="png", seconds=0.5)
+    ops.render_video(filepath=tmp_path / "turn", format="png", seconds=0.5)
     paths = sorted((tmp_path / "turn").glob("*.png"))
     images = [np.asarray(Image.open(path)).astype(int) for path in paths]
     assert len(images) == 12
@@ -227,11 +211,11 @@ def test_failures_leave_no_job(extension, shown, monkeypatch):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     def fails(sentence, name="turn", **options):
-        with pytest.raises(RuntimeError, match=sentence):
-            bpy.ops.stga.render_video(filepath=str(shown / name), **options)
+        with failure(sentence):
+            ops.render_video(filepath=shown / name, **options)
         assert bpy.context.scene.frame_current == 1
-        assert not bpy.ops.stga.cancel.poll()
-        assert not bpy.ops.stga.dismiss.poll()
+        assert not ops.cancel.poll()
+        assert not ops.dismiss.poll()
 
     (shown / "file").write_text("")
     fails("cannot be written", "file/turn.mp4")
@@ -240,9 +224,9 @@ def test_failures_leave_no_job(extension, shown, monkeypatch):
         fails("No space left on device")
     with monkeypatch.context() as patch:
         patch.setattr(operator, "training_python", lambda _: str(shown / "no python"))
-        with pytest.raises(RuntimeError, match="cannot be started"):
-            bpy.ops.stga.render_video(filepath=str(shown / "turn"), seconds=0.1)
-    bpy.data.objects.remove(bpy.context.scene.stga.head)
+        with failure("cannot be started"):
+            ops.render_video(filepath=shown / "turn", seconds=0.1)
+    bpy.data.objects.remove(panel().head)
     fails("has no head to follow", path="scene")
 
 

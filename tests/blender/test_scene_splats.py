@@ -8,10 +8,11 @@ import pytest
 
 from stga_addon.scene import tags, vertex_groups
 from stga_addon.scene.display import splat_nodes
-from stga_addon.scene.display.splat_object import set_input, show_avatar
+from stga_addon.scene.display.splat_object import set_input
 from stga_addon.scene.render.scene_splats import SplatCache, visible_layers
 
-from .test_splat_object import animated_head, avatar_of
+from .session import placed, shown_layers
+from .test_splat_object import avatar_of, show_on_head
 
 
 class PlainObject:
@@ -25,8 +26,7 @@ class PlainObject:
 
 def shown_avatar():
     avatar = avatar_of("stga", count=50)
-    head = animated_head(avatar.neutral, avatar.faces)
-    return show_avatar(avatar, head), head
+    return show_on_head(avatar)
 
 
 def test_objects_without_splats_are_not_asked():
@@ -61,7 +61,7 @@ def test_a_selection_is_read_once(monkeypatch):
     )
 
     def frozen():
-        (layer,) = visible_layers(bpy.context.evaluated_depsgraph_get(), cache)
+        (layer,) = shown_layers(cache)
         fresh = vertex_groups.frame_selection(head, scene.frame_current)
         reads.pop() if fresh is not None else None
         assert (layer.frozen is None) == (fresh is None)
@@ -103,10 +103,9 @@ def test_splats_are_found_among_many_objects(kind):
     if kind == "COLLECTION":
         inside = bpy.data.collections.new("inside")
         inside.objects.link(shown)
-        empty = bpy.data.objects.new("empty", None)
+        empty = placed("empty", None)
         empty.instance_type = "COLLECTION"
         empty.instance_collection = inside
-        bpy.context.scene.collection.objects.link(empty)
         expected = 2
     bpy.context.view_layer.update()
     depsgraph = bpy.context.evaluated_depsgraph_get()

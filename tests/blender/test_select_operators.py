@@ -14,15 +14,14 @@ from stga_addon.scene.vertex_groups import HEAT, SHARE, read_selection, write_se
 from stga_addon.selection import SelectionOptions, select_capture
 
 from .captures import closure, flame_model, flame_sequence, mesh_capture, motion_capture
-from .test_operators import write_ball_avatar
+from .session import failure, ops, panel
+from .test_operators import show_ball
 
 pytestmark = pytest.mark.usefixtures("extension")
 
 
 def rows():
-    return [
-        (row.frame, row.triangles, row.splats) for row in bpy.context.scene.stga.selected_frames
-    ]
+    return [(row.frame, row.triangles, row.splats) for row in panel().selected_frames]
 
 
 def paint_chin(head, capture):
@@ -43,10 +42,10 @@ def test_regions_that_are_selected_as_a_whole(head, tmp_path):
     region = paint_chin(head, capture)
     alone = select_capture(capture, SelectionOptions(threshold=0.0005))[3]
     for expected in (alone | region, alone):
-        bpy.ops.stga.toggle_region(name="chin")
-        bpy.ops.stga.select(threshold=0.0005)
+        ops.toggle_region(name="chin")
+        ops.select(threshold=0.0005)
         assert_array_equal(read_selection(head)[3], closure(expected, capture.faces))
-    bpy.ops.stga.select(threshold=0.0005, regions="chin")
+    ops.select(threshold=0.0005, regions="chin")
     before = {timestep: faces.tolist() for timestep, faces in read_selection(head).items()}
     assert np.array(before[3])[region].all()
     assert not any(before[0])
@@ -57,22 +56,21 @@ def test_regions_that_are_selected_as_a_whole(head, tmp_path):
         ("select", {"regions": "mouth, lips"}, "no region and no vertex group 'lips'"),
         ("select", {"regions": "empty"}, "no triangle has all its corners in .* 'empty'"),
     ):
-        with pytest.raises(RuntimeError, match=sentence):
-            getattr(bpy.ops.stga, operator)(**arguments)
+        with failure(sentence):
+            getattr(ops, operator)(**arguments)
     assert {t: faces.tolist() for t, faces in read_selection(head).items()} == before
 
 
 def test_the_table_counts_what_each_frame_trains(head, tmp_path):
     """Catches counts of the rule instead of the groups, of six a triangle, or of another head."""
-    bpy.ops.stga.select(threshold=0.0005)
+    ops.select(threshold=0.0005)
     chosen = read_selection(head)
     assert rows() == [(t, int(faces.sum()), 6 * int(faces.sum())) for t, faces in chosen.items()]
-    avatar = write_ball_avatar(tmp_path / "a.npz", order=4)
-    bpy.ops.stga.show_avatar(filepath=str(tmp_path / "a.npz"))
+    avatar = show_ball(tmp_path / "a.npz", order=4)
     per_face = np.bincount(avatar.splats.face, minlength=len(avatar.faces))
     head.vertex_groups["stga_3"].add(list(range(80)), 0.4, "REPLACE")
     head.vertex_groups["stga_3"].add(list(range(80, 120)), 0.6, "REPLACE")
-    bpy.ops.stga.count_selected()
+    ops.count_selected()
     painted = read_selection(head)
     corners = np.array([polygon.vertices[:] for polygon in head.data.polygons])
     inside = np.zeros(len(head.data.vertices), bool)
@@ -84,7 +82,7 @@ def test_the_table_counts_what_each_frame_trains(head, tmp_path):
     assert rows() == [
         (t, int(faces.sum()), int(per_face[faces].sum())) for t, faces in painted.items()
     ]
-    bpy.context.scene.stga.head = None
+    panel().head = None
     assert rows() == []
 
 
@@ -103,12 +101,12 @@ def heat(head, name, kind, size):
 
 def test_heat_map(head, tmp_path):
     """Catches colors of other triangles or an old selection, and a head left changed."""
-    with pytest.raises(RuntimeError, match="no frame selects a triangle yet"):
-        bpy.ops.stga.heat_map()
+    with failure("no frame selects a triangle yet"):
+        ops.heat_map()
     head.data.materials.append(bpy.data.materials.new("skin"))
-    bpy.ops.stga.select(threshold=0.0025)
-    bpy.ops.stga.heat_map()
-    bpy.ops.stga.select(threshold=0.0015)
+    ops.select(threshold=0.0025)
+    ops.heat_map()
+    ops.select(threshold=0.0015)
     expected = np.mean(list(read_selection(head).values()), axis=0)
     assert_allclose(heat(head, SHARE, "value", 1), expected, atol=1e-6)
     assert head.data.color_attributes.active_color.name == HEAT
@@ -118,16 +116,15 @@ def test_heat_map(head, tmp_path):
     never = color[expected.argmin(), 0]
     assert hottest[0] > 0.8 > 0.2 > never[0]
     assert materials_of(head) == {"STGA Heat Map"}
-    bpy.ops.stga.heat_map(show=False)
+    ops.heat_map(show=False)
     assert not head.modifiers
     assert not {SHARE, HEAT} & set(head.data.attributes.keys())
     assert materials_of(head) == {"skin"}
-    write_ball_avatar(tmp_path / "a.npz", order=2)
-    bpy.ops.stga.show_avatar(filepath=str(tmp_path / "a.npz"))
+    show_ball(tmp_path / "a.npz", order=2)
     for show in (True, False):
-        bpy.ops.stga.heat_map(show=show)
+        ops.heat_map(show=show)
         assert head.visible_get() == show
-        assert bpy.context.scene.stga.splats.hide_get() == show
+        assert panel().splats.hide_get() == show
 
 
 def test_only_selection_groups_change(tmp_path):

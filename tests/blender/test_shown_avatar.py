@@ -27,7 +27,8 @@ from stga_addon.scene.display.splat_object import (
 from stga_addon.training.run.folder import Run, write_run
 from stga_addon.training.settings import make_settings
 
-from .test_operators import expected_world, write_ball_avatar
+from .session import open_file, ops, panel, reopen, save
+from .test_operators import expected_world, show_ball, write_ball_avatar
 from .test_train_operators import tick_until
 
 
@@ -42,9 +43,9 @@ def ben(head, tmp_path):
     def arrive():
         with suppress(ReferenceError):  # it was deleted
             head.name = "Anna"  # as a user renames it
-        bpy.ops.stga.import_capture(directory=str(write_mesh_capture(tmp_path / "ben")))
-        bpy.context.scene.stga.head.name = "Ben"
-        return bpy.context.scene.stga.head
+        ops.import_capture(directory=write_mesh_capture(tmp_path / "ben"))
+        panel().head.name = "Ben"
+        return panel().head
 
     return arrive
 
@@ -52,7 +53,7 @@ def ben(head, tmp_path):
 def end(worker, iterations=5000, cancel=False, **options):
     """Let the worker end with an avatar."""
     if cancel:
-        bpy.ops.stga.cancel(request="training")
+        ops.cancel(request="training")
     worker.report(Progress(0.9, "Ending", figures=lambda: {"iteration": iterations}))
     write_ball_avatar(worker.run / "avatar.npz", **options)
     worker.leave()
@@ -67,11 +68,10 @@ def test_a_result_reaches_the_head_it_was_trained_for(extension, worker, ben, tm
     path = str(tmp_path / "both.blend")
     ben()
     write_ball_avatar(tmp_path / "ben.npz")
-    bpy.ops.stga.show_avatar(filepath=str(tmp_path / "ben.npz"), hide_head=False)
+    ops.show_avatar(filepath=tmp_path / "ben.npz", hide_head=False)
     if reopens:
-        bpy.ops.wm.save_as_mainfile(filepath=path)
-        bpy.ops.wm.open_mainfile(filepath=path)
-    settings = bpy.context.scene.stga
+        reopen(path)
+    settings = panel()
     anna = bpy.data.objects["Anna"]
     write_ball_avatar(worker.folder / "preview.npz")
     tick_until(monitor, lambda: len(splat_objects()) == 2)
@@ -92,7 +92,7 @@ def test_a_result_whose_head_is_gone_reaches_no_other(extension, worker, ben, he
     ben()
     bpy.data.objects.remove(head)
     avatar = end(worker)
-    settings = bpy.context.scene.stga
+    settings = panel()
     tick_until(extension.operators.monitor, lambda: settings.result_shown)
     assert not splat_objects()
     assert not settings.head.hide_render
@@ -106,10 +106,10 @@ def test_a_head_that_was_imported_again_is_found(extension, worker, ben, head, t
     run = Run(tmp_path / "capture", None, "vhap", make_settings("global", iterations=5))
     write_run(worker.run, run)
     bpy.data.objects.remove(head)
-    bpy.ops.stga.import_capture(directory=str(tmp_path / "capture"))
+    ops.import_capture(directory=tmp_path / "capture")
     ben()
     end(worker)
-    tick_until(extension.operators.monitor, lambda: bpy.context.scene.stga.result_shown)
+    tick_until(extension.operators.monitor, lambda: panel().result_shown)
     (shown,) = splat_objects()
     assert get_input(shown, splat_nodes.HEAD)[tags.CAPTURE] == str(tmp_path / "capture")
 
@@ -117,7 +117,7 @@ def test_a_head_that_was_imported_again_is_found(extension, worker, ben, head, t
 def test_a_head_is_found_after_undo(extension, worker, head):
     """Catches a training that undo detaches from its head."""
     monitor = extension.operators.monitor
-    settings = bpy.context.scene.stga
+    settings = panel()
     settings.training_head = None  # as before the training began
     settings.training_run = ""
     monitor.tick()
@@ -131,9 +131,8 @@ def test_a_run_that_was_cancelled_early_replaces_nothing(
     """Catches the gray fog of a few iterations in the place of a good avatar, in viewport and
     panel; and a run kept back that may replace one."""
     monitor = extension.operators.monitor
-    settings = bpy.context.scene.stga
-    write_ball_avatar(tmp_path / "good.npz", order=1)
-    bpy.ops.stga.show_avatar(filepath=str(tmp_path / "good.npz"))
+    settings = panel()
+    show_ball(tmp_path / "good.npz", order=1)
     shown = settings.splats
     count = len(settings.splats.data.vertices)
     worker.report(Progress(0.01, "Starting up", figures=lambda: {"iteration": 2.0}))
@@ -160,12 +159,11 @@ def identifiers(modifier):
 def test_show_avatar_again_changes_the_object(head, tmp_path):
     """Catches splats that stack, lost display choices and keyframes, keyframes of one input on
     another, and the neutral mesh or attributes of the avatar before."""
-    first = write_ball_avatar(tmp_path / "a.npz")
-    bpy.ops.stga.show_avatar(filepath=str(tmp_path / "a.npz"))
-    shown = bpy.context.scene.stga.splats
-    settings = bpy.context.scene.stga
+    first = show_ball(tmp_path / "a.npz")
+    shown = panel().splats
+    settings = panel()
     modifier = splat_modifier(shown)
-    bpy.ops.stga.choose_display(display=splat_nodes.POINTS)
+    ops.choose_display(display=splat_nodes.POINTS)
     named = identifiers(modifier)
     for name, value in ((splat_nodes.SIZE, 0.5), (splat_nodes.SELECTED_ONLY, True)):
         set_input(shown, name, value)
@@ -178,8 +176,7 @@ def test_show_avatar_again_changes_the_object(head, tmp_path):
     objects = len(bpy.data.objects)
     meshes = len(bpy.data.meshes)
     moved = first.neutral + np.float32(0.01)
-    second = write_ball_avatar(tmp_path / "b.npz", neutral=moved, sh_degree=0)
-    bpy.ops.stga.show_avatar(filepath=str(tmp_path / "b.npz"))
+    second = show_ball(tmp_path / "b.npz", neutral=moved, sh_degree=0)
     assert (settings.splats, splat_objects()) == (shown, [shown])
     assert (len(bpy.data.objects), len(bpy.data.meshes)) == (objects, meshes)
     assert (shown.name, shown.visible_get(), shown.location.x) == ("mine", True, 0.5)
@@ -227,16 +224,15 @@ def test_a_head_hidden_by_its_splats_is_still_moved(extension, head, tmp_path):
             shapes.append(evaluated_vertices(head))
         return not np.array_equal(*shapes)
 
-    write_ball_avatar(tmp_path / "a.npz")
-    bpy.ops.stga.show_avatar(filepath=str(tmp_path / "a.npz"))
+    show_ball(tmp_path / "a.npz")
     assert not head.visible_get()
     assert moves()
-    bpy.context.scene.stga.splats.hide_viewport = True
+    panel().splats.hide_viewport = True
     bpy.context.view_layer.update()
     assert not head.visible_get()
     assert moves()
-    bpy.ops.stga.show_avatar(filepath=str(tmp_path / "a.npz"))
-    bpy.data.objects.remove(bpy.context.scene.stga.splats)
+    ops.show_avatar(filepath=tmp_path / "a.npz")
+    bpy.data.objects.remove(panel().splats)
     bpy.context.view_layer.update()
     assert head.visible_get()
     assert moves()
@@ -247,14 +243,14 @@ def saved_head(folder):
     run = folder / "run"
     run.mkdir()
     write_ball_avatar(run / "avatar.npz")
-    bpy.ops.wm.save_as_mainfile(filepath=str(folder / "head.blend"))
-    bpy.ops.stga.show_avatar(filepath="//run/avatar.npz")
+    save(folder / "head.blend")
+    ops.show_avatar(filepath="//run/avatar.npz")
     bpy.ops.wm.save_mainfile()
     return folder / "head.blend"
 
 
 def bring(file, how):
-    name = bpy.context.scene.stga.head.parent.name
+    name = panel().head.parent.name
     bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
     operator = bpy.ops.wm.append if how == "append" else bpy.ops.wm.link
     within = f"{file}/Collection/"
@@ -275,26 +271,26 @@ def test_what_is_brought_into_another_file_is_shown_alike(extension, head, tmp_p
         return
     visible = bpy.context.visible_objects
     assert [tags.CONVENTION in each for each in visible if each.type != "EMPTY"] == [True]
-    settings = bpy.context.scene.stga
+    settings = panel()
     assert settings.head.name.endswith(" head")
     assert Path(bpy.path.abspath(settings.avatar)) == tmp_path / "run/avatar.npz"
     bpy.context.scene.frame_set(1)
     assert not np.array_equal(
         evaluated_vertices(settings.head), np.array([v.co for v in settings.head.data.vertices])
     )
-    bpy.ops.stga.export_avatar(filepath=str(tmp_path / "x.ply"), format="ply")
+    ops.export_avatar(filepath=tmp_path / "x.ply", format="ply")
     (tmp_path / "shots").mkdir()
-    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "shots/shot.blend"))
+    save(tmp_path / "shots/shot.blend")
     if how == "append":
         bring(tmp_path / "shots/shot.blend", "append")
-        settings = bpy.context.scene.stga
+        settings = panel()
     assert Path(bpy.path.abspath(settings.avatar)) == tmp_path / "run/avatar.npz"
 
 
 def test_heads_of_files_from_before_are_hidden_as_well(extension, head, tmp_path):
     """Catches a gray head from a file in which only a view layer hides it."""
     file = saved_head(tmp_path)
-    neutral = get_input(bpy.context.scene.stga.splats, splat_nodes.NEUTRAL)
+    neutral = get_input(panel().splats, splat_nodes.NEUTRAL)
     head.hide_viewport = False
     neutral.hide_viewport = neutral.hide_render = False
     head.hide_set(True)
@@ -306,11 +302,10 @@ def test_heads_of_files_from_before_are_hidden_as_well(extension, head, tmp_path
 
 def test_a_file_says_what_is_missing_without_the_extension(extension, head, tmp_path):
     """Catches a file that shows nothing where the avatar was, and a note where it is drawn."""
-    write_ball_avatar(tmp_path / "avatar.npz")
-    bpy.ops.stga.show_avatar(filepath=str(tmp_path / "avatar.npz"))
+    show_ball(tmp_path / "avatar.npz")
     names = set(bpy.data.objects.keys())
     file = str(tmp_path / "head.blend")
-    bpy.ops.wm.save_as_mainfile(filepath=file, copy=True)
+    save(file, copy=True)
     assert set(bpy.data.objects.keys()) == names
     with bpy.data.libraries.load(file) as (stored, taken):
         (note,) = set(stored.objects) - names
@@ -318,7 +313,7 @@ def test_a_file_says_what_is_missing_without_the_extension(extension, head, tmp_
     (text,) = taken.objects
     assert "STGA" in text.data.body
     assert text.hide_render
-    bpy.ops.wm.open_mainfile(filepath=file)
+    open_file(file)
     assert set(bpy.data.objects.keys()) == names
     assert not [each for each in bpy.data.curves if "STGA" in each.name]
 
@@ -326,8 +321,7 @@ def test_a_file_says_what_is_missing_without_the_extension(extension, head, tmp_
 def test_what_the_engine_leaves_out_is_said(extension, head, tmp_path):
     """Catches F12 by the engine that drops meshes and depth of field without a warning, and a
     button that leaves it at that."""
-    write_ball_avatar(tmp_path / "avatar.npz")
-    bpy.ops.stga.show_avatar(filepath=str(tmp_path / "avatar.npz"))
+    show_ball(tmp_path / "avatar.npz")
     scene = bpy.context.scene
     hint = extension.ui.show_panel.left_out_hint
     scene.render.engine = extension.ui.show_panel.ENGINE
@@ -344,7 +338,7 @@ def test_what_the_engine_leaves_out_is_said(extension, head, tmp_path):
         bpy.context.object.hide_render = scene.camera.data.dof.use_dof
         scene.render.engine = extension.ui.show_panel.ENGINE
         assert compat.NATIVE_SPLATS or ("Cycles" in hint(scene)) == bpy.context.object.hide_render
-        bpy.ops.stga.preview_images(with_engine=True)
+        ops.preview_images(with_engine=True)
         assert hint(scene) is None
         engines.add(scene.render.engine)
     assert engines == ({compat.EEVEE} if compat.NATIVE_SPLATS else {"CYCLES", compat.EEVEE})

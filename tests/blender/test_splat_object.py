@@ -7,6 +7,7 @@ import bpy
 import mathutils
 import numpy as np
 import pytest
+from avatar.conftest import splats_of
 from numpy.linalg import norm
 from numpy.random import default_rng
 from numpy.testing import assert_allclose, assert_array_equal
@@ -15,13 +16,17 @@ from refusal import refusal
 from stga_addon.avatar.embedding import CONVENTIONS, face_areas, to_world
 from stga_addon.avatar.file import Avatar
 from stga_addon.avatar.offsets import COLOR, OFFSETS, POSITION, SCALE
-from stga_addon.avatar.splats import SH_C0, Splats
+from stga_addon.avatar.splats import SH_C0
 from stga_addon.avatar.strain import at_rest, edge_neighbors
 from stga_addon.scene import compat
 from stga_addon.scene.arrays import evaluated_vertices
 from stga_addon.scene.display import splat_nodes
 from stga_addon.scene.display.node_builder import find_tree
-from stga_addon.scene.display.splat_attributes import DISPLAY_COLOR, avatar_attributes
+from stga_addon.scene.display.splat_attributes import (
+    DISPLAY_COLOR,
+    avatar_attributes,
+    read_attribute,
+)
 from stga_addon.scene.display.splat_nodes import EXTENT, POINTS, QUADS
 from stga_addon.scene.display.splat_object import (
     can_update,
@@ -33,6 +38,8 @@ from stga_addon.scene.display.splat_object import (
     stored_avatar,
     update_splats,
 )
+
+from .session import placed, point_clouds, reopen
 
 FRAMES = (1, 5, 9)
 
@@ -55,14 +62,13 @@ def sphere(rings=12, segments=16):
 
 def random_splats(faces, count, degree=1, extent=0.01):
     rng = default_rng(1)
-    return Splats(
-        xyz=rng.normal(0, extent, (count, 3)).astype(np.float32),
-        rotation=(rng.normal(0, 1, (count, 4)) * 3).astype(np.float32),
-        log_scale=rng.normal(-7, 0.5, (count, 3)).astype(np.float32),
-        opacity=rng.normal(0, 2, count).astype(np.float32),
-        sh=rng.normal(0, 0.4, (count, (degree + 1) ** 2, 3)).astype(np.float32),
-        face=rng.integers(0, faces, count).astype(np.int32),
-        unbound=np.zeros(count, bool),
+    return splats_of(
+        rng.normal(0, extent, (count, 3)),
+        rotation=rng.normal(0, 1, (count, 4)) * 3,
+        log_scale=rng.normal(-7, 0.5, (count, 3)),
+        opacity=rng.normal(0, 2, count),
+        sh=rng.normal(0, 0.4, (count, (degree + 1) ** 2, 3)),
+        face=rng.integers(0, faces, count),
     )
 
 
@@ -86,6 +92,12 @@ def animated_head(neutral, faces):
             key.value = value
             key.keyframe_insert("value", frame=frame)
     return head
+
+
+def show_on_head(avatar):
+    """Its splats on an animated head, and the head."""
+    head = animated_head(avatar.neutral, avatar.faces)
+    return show_avatar(avatar, head), head
 
 
 def avatar_of(convention, count=3000, **grid):
@@ -126,8 +138,7 @@ def test_splats_follow_the_animated_head(convention, tmp_path):
         bpy.context.scene.frame_set(frame)
         at[frame] = assert_follows(shown, head, avatar)
     assert np.abs(at[1] - at[9]).max() > 1e-3, "the head did not move, so nothing was tested"
-    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "a.blend"))
-    bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "a.blend"))
+    reopen(tmp_path / "a.blend")
     shown = bpy.data.objects["head splats"]
     head = bpy.data.objects["head"]
     for frame in reversed(FRAMES):
@@ -138,12 +149,8 @@ def test_splats_follow_the_animated_head(convention, tmp_path):
 def displayed_colors(shown):
     """(N, 3) scene-linear colors of the splats as points."""
     set_input(shown, splat_nodes.DISPLAY, POINTS)
-    depsgraph = bpy.context.evaluated_depsgraph_get()
-    shown = [each.object for each in depsgraph.object_instances]
-    points = next(each.data for each in shown if each.type == "POINTCLOUD")
-    color = np.empty(4 * len(points.points), np.float32)
-    points.attributes[DISPLAY_COLOR].data.foreach_get("color", color)
-    return color.reshape(-1, 4)[:, :3]
+    (points,) = point_clouds()
+    return read_attribute(points, DISPLAY_COLOR)[:, :3]
 
 
 def linear(srgb):
@@ -152,9 +159,8 @@ def linear(srgb):
 
 
 def active_camera(location=(0.0, 0.0, 0.0)):
-    camera = bpy.data.objects.new("camera", bpy.data.cameras.new("camera"))
+    camera = placed("camera", bpy.data.cameras.new("camera"))
     camera.location = location
-    bpy.context.scene.collection.objects.link(camera)
     bpy.context.scene.camera = camera
     return camera
 
@@ -166,8 +172,7 @@ def test_colors_follow_the_active_camera(degree):
     avatar = avatar_of("stga", 400)
     sh = default_rng(3).normal(0, 0.3, (400, (degree + 1) ** 2, 3)).astype(np.float32)
     avatar = replace(avatar, splats=replace(avatar.splats, sh=sh))
-    head = animated_head(avatar.neutral, avatar.faces)
-    shown = show_avatar(avatar, head)
+    shown, _ = show_on_head(avatar)
     camera = active_camera((-0.8, 0.5, 0.9))
     camera.keyframe_insert("location", frame=1)
     camera.location = (0.3, -0.9, 1.2)
@@ -233,10 +238,8 @@ def test_splats_follow_the_deformation(convention, names, tmp_path):
     avatar = replace(avatar, splats=splats, antialiased=is_all)
     # at a boundary, inside, an edge of three
     assert {2, 3, 4} <= set(edge_neighbors(avatar.faces).counts.tolist())
-    head = animated_head(avatar.neutral, avatar.faces)
-    shown = show_avatar(avatar, head)
-    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "a.blend"))
-    bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "a.blend"))
+    shown, head = show_on_head(avatar)
+    reopen(tmp_path / "a.blend")
     shown = bpy.data.objects["head splats"]
     head = bpy.data.objects["head"]
     stored = stored_avatar(shown)
@@ -271,8 +274,7 @@ def test_updated_splats_follow_strain_anew():
     """Catches new splats shown with the strain coefficients of the first ones."""
     first, second = (driven_avatar("stga", ("strain_position",), seed) for seed in (6, 7))
     second = replace(second, neutral=first.neutral, faces=first.faces)
-    head = animated_head(first.neutral, first.faces)
-    shown = show_avatar(first, head)
+    shown, head = show_on_head(first)
     bpy.context.scene.frame_set(5)
     assert_follows(shown, head, first)
     assert can_update(shown, second)

@@ -5,7 +5,6 @@ from math import radians
 
 import bpy
 import numpy as np
-import pytest
 from capture.factory import ball, write_flame_capture, write_mesh_capture
 from flame.small_head import small_head
 from mathutils import Quaternion
@@ -17,13 +16,15 @@ from stga_addon.scene import tags
 from stga_addon.scene.arrays import evaluated_vertices
 from stga_addon.tracking.head_model import HeadModel, read_head_model
 
+from .session import failure, open_file, ops, panel, save, viewport
+
 HEAD = HeadModel(small_head(0), "flame")
 
 
 def track(take, out, **more):
     paths = {"footage": "footage", "landmarks": "points", "model": "head.npz"}
-    paths = {name: str(take / path) for name, path in paths.items()} | {"directory": str(out)}
-    return bpy.ops.stga.track_footage(**paths | more, python=sys.executable)
+    paths = {name: str(take / path) for name, path in paths.items()} | {"directory": out}
+    return ops.track_footage(**paths | more, python=sys.executable)
 
 
 def asked(extension, take, out):
@@ -35,22 +36,21 @@ def asked(extension, take, out):
 
 def mesh_at(frame):
     bpy.context.scene.frame_set(frame)
-    return evaluated_vertices(bpy.context.scene.stga.head).astype(float)
+    return evaluated_vertices(panel().head).astype(float)
 
 
 def look_through(cameras):
     """Catches a view without the image that it is compared with, or of another size."""
-    window = bpy.context.window_manager.windows[0]
-    area = next(area for area in window.screen.areas if area.type == "VIEW_3D")
+    window, area = viewport()
     with bpy.context.temp_override(window=window, area=area, region=area.regions[-1]):
         bpy.context.scene.camera = cameras[4]
-        bpy.ops.stga.view_footage(step=1)
+        ops.view_footage(step=1)
         assert bpy.context.scene.camera == cameras[0]
         space = area.spaces.active
         assert (space.region_3d.view_perspective, space.shading.show_xray) == ("CAMERA", True)
         assert cameras[0].data.show_background_images
         assert cameras[0].visible_get()  # else Blender draws no background
-        bpy.ops.stga.view_footage()
+        ops.view_footage()
         assert (space.region_3d.view_perspective, space.shading.show_xray) == ("PERSP", False)
 
 
@@ -60,7 +60,7 @@ def test_the_whole_way_of_the_panel(extension, take, tmp_path, monkeypatch):
     tracked = tmp_path / "capture"
     assert track(take, tracked) == {"FINISHED"}
     scene = bpy.context.scene
-    settings = bpy.context.scene.stga
+    settings = panel()
     head = settings.head
     assert list(head[tags.TIMESTEPS]) == [0, 1, 2, 3, 4]
     assert settings.tracking_capture == str(tracked)
@@ -79,11 +79,11 @@ def test_the_whole_way_of_the_panel(extension, take, tmp_path, monkeypatch):
     bpy.context.view_layer.update()
     posed = evaluated_vertices(head).astype(float)
     assert np.abs(posed - before[1]).max() > 0.003
-    bpy.ops.stga.mark_key()
+    ops.mark_key()
     assert_allclose(mesh_at(4), before[4], atol=1e-6)  # a key is of its frame alone
     assert_allclose(mesh_at(1), posed, atol=2e-5)
 
-    bpy.ops.stga.solve_again()
+    ops.solve_again()
     head = settings.head
     assert_allclose(mesh_at(1), posed, atol=5e-5)
     assert np.abs(mesh_at(2) - before[2]).max() > 1e-4  # without landmarks: it follows
@@ -91,12 +91,12 @@ def test_the_whole_way_of_the_panel(extension, take, tmp_path, monkeypatch):
     assert list(extension.operators.track.tracking_keys(head)) == [1]
 
     scene.frame_set(1)
-    bpy.ops.stga.mark_key()
-    bpy.ops.stga.solve_again()
+    ops.mark_key()
+    ops.solve_again()
     for frame in range(5):
         assert_allclose(mesh_at(frame), before[frame], atol=2e-6)
 
-    bpy.ops.stga.dismiss(request="tracking")
+    ops.dismiss(request="tracking")
     assert not (tracked / "job").exists()
     assert settings.tracking_capture == ""
 
@@ -106,12 +106,12 @@ def test_exported_shape_keys_as_head_model(extension, take, tmp_path):
     model = HEAD.model
     shapes = model.shapedirs[:, :, [0, -1]]
     blender_head(model.v_template, model.faces, ["identity 0", "smile"], shapes)
-    assert bpy.ops.stga.export_head_model.poll()
-    bpy.ops.stga.export_head_model(filepath=str(tmp_path / "exported.npz"))
+    assert ops.export_head_model.poll()
+    ops.export_head_model(filepath=tmp_path / "exported.npz")
     found = read_head_model(tmp_path / "exported.npz").model
     assert_allclose(found.v_template, model.v_template, atol=1e-6)
     assert track(take, tmp_path / "capture", model=str(tmp_path / "exported.npz")) == {"FINISHED"}
-    assert list(bpy.context.scene.stga.head[tags.TIMESTEPS]) == [0, 1, 2, 3, 4]
+    assert list(panel().head[tags.TIMESTEPS]) == [0, 1, 2, 3, 4]
 
 
 def test_mistakes_are_one_sentence(extension, take, tmp_path):
@@ -120,32 +120,32 @@ def test_mistakes_are_one_sentence(extension, take, tmp_path):
         ({"model": "/nowhere/head.npz"}, "/nowhere/head.npz: cannot be read"),
         ({"footage": "/nowhere"}, "/nowhere: does not exist"),
     ):
-        with pytest.raises(RuntimeError, match=expected):
+        with failure(expected):
             track(take, tmp_path / "tracked", **more)
-    assert bpy.context.scene.stga.head is None
-    assert not bpy.ops.stga.cancel.poll()
-    assert bpy.ops.stga.track_footage.poll()
+    assert panel().head is None
+    assert not ops.cancel.poll()
+    assert ops.track_footage.poll()
     folder, model = write_flame_capture(tmp_path / "capture")
-    bpy.ops.stga.import_capture(directory=str(folder), flame=str(model))
-    assert not bpy.ops.stga.solve_again.poll()
+    ops.import_capture(directory=folder, flame=model)
+    assert not ops.solve_again.poll()
 
 
 def test_what_was_tracked_meanwhile_is_imported(extension, take, tmp_path, monkeypatch):
     """Catches a result lost where Blender was closed, or its file saved, meanwhile."""
     out = tmp_path / "capture"
-    settings = bpy.context.scene.stga
+    settings = panel()
     asked(extension, take, out)
     settings.tracking_capture = str(out)
-    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "a.blend"))
+    save(tmp_path / "a.blend")
     perform_in_folder(out / "job")
     monkeypatch.setattr(extension.operators.timers, "has_timer", lambda: True)
     # bpy 5.0 crashes now and then where a thread works while it opens a file
     for part in (extension.operators.pose, extension.operators.import_capture):
         monkeypatch.setattr(part, "begin_sliders", lambda head: None)
-    bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "a.blend"))
+    open_file(tmp_path / "a.blend")
     extension.operators.monitor.tick()
-    assert list(bpy.context.scene.stga.head[tags.TIMESTEPS]) == [0, 1, 2, 3, 4]
-    assert bpy.context.scene.stga.tracking_shown
+    assert list(panel().head[tags.TIMESTEPS]) == [0, 1, 2, 3, 4]
+    assert panel().tracking_shown
 
 
 def test_the_head_is_shown_while_it_is_tracked(extension, tmp_path):
@@ -168,7 +168,7 @@ def test_the_head_is_shown_while_it_is_tracked(extension, tmp_path):
         assert_allclose(found, expected, atol=1e-6)
     assert scene.objects["Cube"].hide_render
     name = head.name
-    bpy.ops.stga.import_capture(directory=str(capture))
+    ops.import_capture(directory=capture)
     assert name not in bpy.data.objects
     show(scene, capture, tmp_path / "picture.npz")  # the last picture, read late
     assert name not in bpy.data.objects

@@ -16,13 +16,14 @@ from stga_addon.jobs.table import Kind
 from stga_addon.progress import Progress
 from stga_addon.scene.display.splat_object import evaluated_splats
 
+from .session import failure, open_file, ops, panel, save
 from .test_operators import write_ball_avatar
 
 
 @pytest.fixture
 def head(head):
     """With a selection."""
-    bpy.ops.stga.select(threshold=0.0005)
+    ops.select(threshold=0.0005)
     return head
 
 
@@ -53,38 +54,38 @@ def test_resume_of_another_capture_is_refused(extension, tmp_path):
     other = write_mesh_capture(tmp_path / "other", timesteps=(0, 5))
     run = tmp_path / "run"
     folder = str(tmp_path / "run")
-    bpy.ops.stga.import_capture(directory=str(one), principal_point="opencv")
-    bpy.ops.stga.train(directory=folder, iterations=3, device="cpu")
+    ops.import_capture(directory=one, principal_point="opencv")
+    ops.train(directory=folder, iterations=3, device="cpu")
     before = {path.name: path.read_bytes() for path in run.iterdir() if path.is_file()}
     mistakes = (
         (other, "opencv", rf"^Error: .*run: was trained on {one} .*{other}"),
         (one, "vhap", "was trained with principal point 'opencv', not 'vhap'"),
     )
     for capture, principal_point, sentence in mistakes:
-        bpy.ops.stga.import_capture(directory=str(capture), principal_point=principal_point)
-        with pytest.raises(RuntimeError, match=sentence):
-            bpy.ops.stga.train(directory=folder, resume=True)
+        ops.import_capture(directory=capture, principal_point=principal_point)
+        with failure(sentence):
+            ops.train(directory=folder, resume=True)
         assert {path.name: path.read_bytes() for path in run.iterdir() if path.is_file()} == before
-    bpy.ops.stga.import_capture(directory=str(one), principal_point="opencv")
-    bpy.ops.stga.train(directory=folder, resume=True)
+    ops.import_capture(directory=one, principal_point="opencv")
+    ops.train(directory=folder, resume=True)
 
 
 def test_an_occupied_folder_and_more_training(head, tmp_path, monkeypatch, extension):
     """Catches a run that is overwritten or refused where the next folder is free, a panel that
     still names the one before, and *More* that asks for the budget of before."""
     asked = ask_only(monkeypatch, extension)
-    settings = bpy.context.scene.stga
+    settings = panel()
     run = tmp_path / "run"
     run.mkdir()
     monkeypatch.setattr(extension.operators.train, "has_run", run.__eq__)
     for given, expected in ((run, tmp_path / "run_2"), (tmp_path / "b", tmp_path / "b")):
         settings.run_folder = str(given)
-        bpy.ops.stga.train(directory=str(given), iterations=3)
+        ops.train(directory=given, iterations=3)
         assert asked.pop().run == Path(settings.run_folder) == expected
     stored = SimpleNamespace(takes=())
     monkeypatch.setattr(extension.operators.train, "read_run", lambda _: stored)
-    bpy.ops.stga.train(directory=str(run), minutes=3, more=True)
-    bpy.ops.stga.train(directory=str(run), minutes=3, resume=True)
+    ops.train(directory=run, minutes=3, more=True)
+    ops.train(directory=run, minutes=3, resume=True)
     assert [(request.run, request.more_s) for request in asked] == [(run, 180), (run, None)]
 
 
@@ -97,7 +98,7 @@ def test_device_reaches_the_request(head, tmp_path, monkeypatch, extension):
         ("gpu", "Card (Vulkan)", "gpu:Card (Vulkan)"),
         ("cpu", "Card", "cpu"),
     ):
-        bpy.ops.stga.train(directory=str(tmp_path / "run"), device=device, adapter=adapter)
+        ops.train(directory=tmp_path / "run", device=device, adapter=adapter)
         assert asked[-1].device == wanted
     for adapters in ((), ("Card (Vulkan)", "Card (Vulkan) #2")):
         checked = extension.operators.training_python.Checked("", adapters) if adapters else None
@@ -112,22 +113,22 @@ def test_mistakes_of_training_are_sentences(extension, head, tmp_path, monkeypat
     for arguments, sentence in (
         ({"directory": ""}, "run folder: no path given"),
         ({"directory": "//run"}, "relative to the .blend file, which has not been saved yet"),
-        ({"directory": str(tmp_path / "file")}, "cannot be written"),
+        ({"directory": tmp_path / "file"}, "cannot be written"),
         ({"resume": True}, "holds no run"),
-        ({"python": str(tmp_path / "no_python")}, "no_python: cannot be started as a Python"),
+        ({"python": tmp_path / "no_python"}, "no_python: cannot be started as a Python"),
     ):
-        with pytest.raises(RuntimeError, match=f"^Error: .*{sentence}"):
-            bpy.ops.stga.train(**{"directory": run, "iterations": 2, **arguments})
+        with failure(f"^Error: .*{sentence}"):
+            ops.train(**{"directory": run, "iterations": 2, **arguments})
     monkeypatch.setattr(extension.stga_addon.worker.training_python, "find_spec", lambda name: None)
     monkeypatch.setattr(extension.operators.train, "missing_packages", lambda: ["torch"])
     expected = r"^Error: .* \(Python .*\) lacks numpy, torch, numba, scipy, pillow, "
-    with pytest.raises(RuntimeError, match=expected):
-        bpy.ops.stga.train(directory=str(tmp_path / "new"), minutes=0.1)
+    with failure(expected):
+        ops.train(directory=tmp_path / "new", minutes=0.1)
     assert not (tmp_path / "new").exists()
-    assert bpy.ops.stga.train.poll()
+    assert ops.train.poll()
     (tmp_path / "capture").rename(tmp_path / "elsewhere")
-    with pytest.raises(RuntimeError, match=r"capture: is not a folder"):
-        bpy.ops.stga.train(directory=run)
+    with failure(r"capture: is not a folder"):
+        ops.train(directory=run)
 
 
 def test_a_cancelled_training_that_is_waited_for(head, tmp_path):
@@ -136,24 +137,24 @@ def test_a_cancelled_training_that_is_waited_for(head, tmp_path):
 
     body = "(FOLDER.parent / 'avatar.npz').touch(); end('cancelled')"
     python = write_interpreter(tmp_path / "python", body)
-    bpy.ops.stga.train(directory=str(tmp_path / "run"), iterations=2, python=python)
-    assert bpy.context.scene.stga.avatar == str(tmp_path / "run/avatar.npz")
+    ops.train(directory=tmp_path / "run", iterations=2, python=python)
+    assert panel().avatar == str(tmp_path / "run/avatar.npz")
 
 
 def test_running_worker_cannot_be_replaced_or_dismissed(worker):
     """Catches a second worker, a dismissed one that goes on, and a user's files deleted."""
-    assert not bpy.ops.stga.train.poll()
-    assert not bpy.ops.stga.dismiss.poll()
-    bpy.ops.stga.cancel(request="training")
+    assert not ops.train.poll()
+    assert not ops.dismiss.poll()
+    ops.cancel(request="training")
     assert worker.report(Progress(0.5, "Training"))
     (worker.folder / "notes.txt").write_text("mine")
     worker.leave()
-    assert not bpy.ops.stga.cancel.poll()
-    assert bpy.ops.stga.train.poll()
-    bpy.ops.stga.dismiss(request="training")
+    assert not ops.cancel.poll()
+    assert ops.train.poll()
+    ops.dismiss(request="training")
     assert [path.name for path in worker.folder.iterdir()] == ["notes.txt"]
-    assert bpy.context.scene.stga.training_run == ""
-    assert not bpy.ops.stga.dismiss.poll()
+    assert panel().training_run == ""
+    assert not ops.dismiss.poll()
 
 
 def test_dismiss_follows_no_path_to_other_folders(extension, tmp_path):
@@ -163,11 +164,11 @@ def test_dismiss_follows_no_path_to_other_folders(extension, tmp_path):
     names = ["preview.npz", "result.json", "selection.npz", "status.json", "worker.log"]
     for name in names:
         (folder / name).write_text("[]")
-    bpy.context.scene.stga.training_run = str(tmp_path / "documents")
+    panel().training_run = str(tmp_path / "documents")
     extension.operators.monitor.tick()
-    bpy.ops.stga.dismiss(request="training")
+    ops.dismiss(request="training")
     assert sorted(path.name for path in folder.iterdir()) == names
-    assert bpy.context.scene.stga.training_run == ""
+    assert panel().training_run == ""
 
 
 def test_live_preview_refreshes_one_object(extension, worker, tmp_path):
@@ -223,23 +224,23 @@ def test_save_and_reopen_while_it_trains(extension, worker, tmp_path):
     """Catches a training that a saved file or undo forgets, or that cannot be cancelled at once."""
     monitor = extension.operators.monitor
     path = str(tmp_path / "head.blend")
-    bpy.ops.wm.save_as_mainfile(filepath=path)
+    save(path)
     bpy.ops.wm.read_factory_settings(use_empty=True)
     assert monitor.tick() is None
-    bpy.ops.wm.open_mainfile(filepath=path)
-    bpy.ops.stga.cancel(request="training")
+    open_file(path)
+    ops.cancel(request="training")
     assert worker.report(Progress(0.5, "Training"))
     assert monitor.tick() is not None
-    assert not bpy.ops.stga.train.poll()
-    bpy.context.scene.stga.training_run = ""
+    assert not ops.train.poll()
+    panel().training_run = ""
     assert monitor.tick() is not None
-    assert bpy.context.scene.stga.training_run == str(worker.run)
+    assert panel().training_run == str(worker.run)
     bpy.ops.wm.read_factory_settings(use_empty=True)
     write_ball_avatar(worker.run / "avatar.npz")
     worker.leave()
-    bpy.ops.wm.open_mainfile(filepath=path)
-    tick_until(monitor, lambda: bpy.context.scene.stga.result_shown)
-    assert bpy.context.scene.stga.splats is not None
+    open_file(path)
+    tick_until(monitor, lambda: panel().result_shown)
+    assert panel().splats is not None
 
 
 def test_moved_blend_file(extension, worker, tmp_path):
@@ -249,25 +250,25 @@ def test_moved_blend_file(extension, worker, tmp_path):
     worker.leave()
     scene.stga.run_folder = "//run"
     scene.stga.show_result = False
-    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "head.blend"))
+    save(tmp_path / "head.blend")
     moved = tmp_path / "moved"
     moved.mkdir()
     (tmp_path / "run").rename(moved / "run")
-    bpy.ops.wm.save_as_mainfile(filepath=str(moved / "head.blend"))
+    save(moved / "head.blend")
     assert monitor.state_of(bpy.context.scene, Kind.TRAINING).place == moved / "run"
-    tick_until(monitor, lambda: bpy.context.scene.stga.result_shown)
+    tick_until(monitor, lambda: panel().result_shown)
     (moved / "run").rename(moved / "gone")
     assert monitor.state_of(bpy.context.scene, Kind.TRAINING).snapshot.state == "none"
     assert monitor.state_of(bpy.context.scene, Kind.TRAINING).place == tmp_path / "run"
-    bpy.ops.stga.dismiss(request="training")
+    ops.dismiss(request="training")
 
 
 @pytest.mark.slow
 def test_python_is_tested_without_a_window(extension):
     """Catches a test of a Python that a script cannot make, or that finds nothing wrong."""
-    with pytest.raises(RuntimeError, match="is not a Python that runs this add-on"):
-        bpy.ops.stga.test_python(python="false")
-    bpy.ops.stga.test_python(python=sys.executable)
+    with failure("is not a Python that runs this add-on"):
+        ops.test_python(python="false")
+    ops.test_python(python=sys.executable)
     assert extension.operators.training_python.test.found.line.startswith(
         f"Python {sys.version.split()[0]}, torch "
     )

@@ -1,10 +1,9 @@
 """The engine's colors through view transforms, inverses of several of which are kept."""
 
-from dataclasses import replace
-
 import bpy
 import numpy as np
 import pytest
+from avatar.conftest import splats_of
 
 from stga_addon.avatar.splats import SH_C0
 from stga_addon.scene.compat import choose_format
@@ -13,7 +12,7 @@ from stga_addon.scene.render import view_transform
 from stga_addon.scene.render.view_transform import inverse_view, measure
 
 from .test_engine import HEIGHT, WIDTH, _engine  # noqa: F401
-from .test_splat_object import active_camera, random_splats
+from .test_splat_object import active_camera
 
 
 def scene_with(view, exposure=0.0):
@@ -68,16 +67,10 @@ def sheet(color=None):
     rng = np.random.default_rng(8)
     count = 600
     skin = rng.uniform(0.3, 0.75, (count, 1)) * [1, 0.8, 0.68] + rng.normal(0, 0.02, (count, 3))
-    colors = skin if color is None else np.tile(color, (count, 1))
+    colors = skin if color is None else np.array([color])
     xyz = np.column_stack([rng.uniform(-0.35, 0.35, (count, 2)), np.zeros(count)])
-    splats = replace(
-        random_splats(1, count, degree=0),
-        xyz=xyz.astype(np.float32),
-        log_scale=np.full((count, 3), -3.2, np.float32),
-        opacity=np.full(count, 3, np.float32),
-        sh=((colors - 0.5) / SH_C0).astype(np.float32).reshape(count, 1, 3),
-    )
-    show_world_splats(splats, "skin")
+    sh = (colors[:, None] - 0.5) / SH_C0
+    show_world_splats(splats_of(xyz, log_scale=-3.2, opacity=3, sh=sh), "skin")
     active_camera((0, 0, 1))
 
 

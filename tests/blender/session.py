@@ -1,0 +1,95 @@
+"""A session in Blender as tests carry it out: operators, the panel, files, objects."""
+
+from pathlib import Path
+
+import bpy
+import numpy as np
+import pytest
+from PIL import Image
+
+from stga_addon.scene.render.scene_splats import SplatCache, visible_layers
+
+
+class Operator:
+    """One of Blender's that takes paths as well."""
+
+    def __init__(self, operator):
+        self.operator = operator
+
+    def __call__(self, *how, **options):
+        paths = {name: str(value) for name, value in options.items() if isinstance(value, Path)}
+        return self.operator(*how, **options | paths)
+
+    def __getattr__(self, name):
+        return getattr(self.operator, name)
+
+
+class Operators:
+    """Those of the extension."""
+
+    def __getattr__(self, name):
+        return Operator(getattr(bpy.ops.stga, name))
+
+
+ops = Operators()
+
+
+def failure(sentence):
+    """A block that ends with an operator's error, in whose message the sentence is found."""
+    return pytest.raises(RuntimeError, match=sentence)
+
+
+def panel():
+    """What the panel holds: the settings of the scene."""
+    return bpy.context.scene.stga
+
+
+def save(path, **options):
+    bpy.ops.wm.save_as_mainfile(filepath=str(path), **options)
+
+
+def open_file(path):
+    bpy.ops.wm.open_mainfile(filepath=str(path))
+
+
+def reopen(path):
+    save(path)
+    open_file(path)
+
+
+def placed(name, data=None):
+    """A new object in the scene."""
+    made = bpy.data.objects.new(name, data)
+    bpy.context.scene.collection.objects.link(made)
+    return made
+
+
+def viewport():
+    """The first window, and its 3D viewport."""
+    window = bpy.context.window_manager.windows[0]
+    return window, next(area for area in window.screen.areas if area.type == "VIEW_3D")
+
+
+def shown_layers(cache=None):
+    """What a render engine draws."""
+    depsgraph = bpy.context.evaluated_depsgraph_get()
+    return visible_layers(depsgraph, SplatCache() if cache is None else cache)
+
+
+def point_clouds():
+    """Splats as points, or as native ones, as they are evaluated."""
+    instances = bpy.context.evaluated_depsgraph_get().object_instances
+    return [each.object.data for each in instances if each.object.type == "POINTCLOUD"]
+
+
+def picture(path, engine, size_px=None, samples=1):
+    """(H, W, 4) 0 to 255 of the scene by an engine, without noise that denoising would take."""
+    scene = bpy.context.scene
+    scene.render.engine = engine
+    if size_px is not None:
+        scene.render.resolution_x = scene.render.resolution_y = size_px
+    scene.cycles.samples = scene.eevee.taa_render_samples = samples
+    scene.cycles.use_denoising = False
+    scene.render.filepath = str(path)
+    bpy.ops.render.render(write_still=True)
+    return np.asarray(Image.open(path)).astype(int)
