@@ -103,6 +103,16 @@ def worker(extension, head, tmp_path):
         yield writer
 
 
+@pytest.fixture
+def asked(extension, monkeypatch):
+    """What operators that train ask for; nothing is trained."""
+    requests = []
+    start = lambda scene, wanted, *_, **__: requests.append(wanted)  # noqa: E731
+    monkeypatch.setattr(extension.operators.train, "missing_packages", list)
+    monkeypatch.setattr(extension.operators.train, "start", start)
+    return requests
+
+
 @pytest.fixture(scope="session")
 def zip_file(tmp_path_factory):
     """The built zip of the small edition."""

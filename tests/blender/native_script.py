@@ -22,17 +22,11 @@ if not compat.NATIVE_SPLATS:
     compat.native_splats = lambda tree, points, left_out: points
 
 from stga_addon.scene.display import splat_nodes
-from stga_addon.scene.display.splat_attributes import RELIT_COLOR
+from stga_addon.scene.display.splat_attributes import RELIT_COLOR, read_attribute
 from stga_addon.scene.display.splat_nodes import NATIVE
 from stga_addon.scene.display.splat_object import set_input, show_avatar, store_linear_base
 
 AVATAR, HEAD, OUT = sys.argv[sys.argv.index("--") + 1 :]
-FIELDS = {
-    "FLOAT4": ("vector", 4),
-    "FLOAT_COLOR": ("color", 4),
-    "FLOAT_VECTOR": ("vector", 3),
-    "QUATERNION": ("value", 4),
-}
 found = {}
 
 
@@ -43,11 +37,8 @@ def read(case):
     ]
     found[f"{case}/type"] = getattr(cloud, "type", "")
     for attribute in cloud.attributes:
-        if attribute.data_type in FIELDS:
-            field, size = FIELDS[attribute.data_type]
-            values = np.empty(size * len(cloud.points), np.float32)
-            attribute.data.foreach_get(field, values)
-            found[f"{case}/{attribute.name}"] = values.reshape(-1, size)
+        if attribute.data_type in ("FLOAT4", "FLOAT_COLOR", "FLOAT_VECTOR", "QUATERNION"):
+            found[f"{case}/{attribute.name}"] = read_attribute(cloud, attribute.name)
 
 
 avatar = read_avatar(Path(AVATAR))

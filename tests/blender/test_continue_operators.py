@@ -10,12 +10,12 @@ from capture.factory import write_mesh_capture
 from stga_addon.avatar.file import read_avatar
 from stga_addon.jobs.monitor_state import RequestState
 from stga_addon.jobs.table import Kind
+from stga_addon.scene.display.splat_attributes import read_attribute
 from stga_addon.training.run.folder import read_run
 
 from .session import failure, ops, panel
 from .test_analyze_operator import error_of, tick_until_done, write_interpreter
 from .test_operators import write_ball_avatar
-from .test_train_operators import ask_only
 
 
 @pytest.fixture
@@ -26,12 +26,6 @@ def head(head):
     group.add(np.unique(corners[:40]).tolist(), 0.8, "REPLACE")
     head.vertex_groups.new(name="faint").add(np.unique(corners[:40]).tolist(), 0.3, "REPLACE")
     return head
-
-
-@pytest.fixture
-def asked(extension, monkeypatch):
-    """What operators that train ask for; nothing is trained."""
-    return ask_only(monkeypatch, extension)
 
 
 @pytest.fixture
@@ -112,12 +106,11 @@ def test_residuals_are_shown_on_the_head(head, run, extension):
     residual[9] = np.nan
     extension.stga_addon.training.run.folder.write_residuals(run, residual)
     ops.heat_map(of="RESIDUAL", directory=run)
-    shown = np.array([item.value for item in head.data.attributes["stga_residual"].data])
+    shown = read_attribute(head.data, "stga_residual")
     assert shown.argmax() == 7
     assert shown[9] == 0
-    red = np.array([item.color[0] for item in head.data.attributes["stga_heat"].data])
-    red = red.reshape(-1, 3)
-    assert red[7] == pytest.approx(0.9, abs=0.01)
+    red = read_attribute(head.data, "stga_heat")[:, 0]
+    assert red.reshape(-1, 3)[7] == pytest.approx(0.9, abs=0.01)
     ops.heat_map(show=False)
     assert not {"stga_residual", "stga_heat"} & set(head.data.attributes.keys())
     with failure(r"^Error: .*residuals\.npz"):

@@ -19,6 +19,7 @@ from stga_addon.capture.open import open_capture
 from stga_addon.export.ply import read_ply, write_ply
 from stga_addon.scene import compat
 from stga_addon.scene.display.node_builder import Nodes, new_socket, new_tree
+from stga_addon.scene.display.splat_attributes import read_attribute
 
 from .session import failure, ops, panel, placed
 from .test_operators import expected_world, show_ball, write_ball_avatar
@@ -77,12 +78,6 @@ def seen(splats, linear, move=(0, 0, 0)):
     )
 
 
-def values(cloud, name, field, width):
-    found = np.empty(len(cloud.points) * width, np.float32)
-    cloud.attributes[name].data.foreach_get(field, found)
-    return found.reshape(-1, width)
-
-
 def imported():
     """What the only native splats in the scene are, as Blender evaluates them."""
     depsgraph = bpy.context.evaluated_depsgraph_get()
@@ -91,12 +86,12 @@ def imported():
         if instance.object.type == "POINTCLOUD":
             cloud = instance.object.data
             assert cloud.type == "GAUSSIAN_SPLAT"
-            base = values(cloud, "radiance:base", "vector", 4)
-            rest = [values(cloud, f"radiance:sh_{n}", "vector", 3) for n in range(15)]
+            base = read_attribute(cloud, "radiance:base")
+            rest = [read_attribute(cloud, f"radiance:sh_{n}") for n in range(15)]
             splats = world_splats(
-                values(cloud, "position", "vector", 3),
-                values(cloud, "rotation", "value", 4),
-                np.log(values(cloud, "scale", "vector", 3)),
+                read_attribute(cloud, "position"),
+                read_attribute(cloud, "rotation"),
+                np.log(read_attribute(cloud, "scale")),
                 base[:, 3].astype(np.float64),
                 np.stack([base[:, :3], *rest], 1),
             )

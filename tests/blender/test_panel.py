@@ -12,35 +12,27 @@ import numpy as np
 import pytest
 from gui.layouts import filled
 
-from stga_addon.jobs.table import Kind
 from stga_addon.progress import Progress
 from stga_addon.report import CURVE_COLOR, DETAIL_COLOR, FORECAST_COLOR, MARGIN, SIZE, curve_image
 
 from .session import ops, panel
 from .test_operators import write_ball_avatar
+from .test_train_operators import tick_until
 
 
 @pytest.fixture
-def trained(extension, head, tmp_path, monkeypatch):
+def trained(extension, worker, monkeypatch):
     """A scene whose run has finished, with curve and refined tracking, as the timer has read it."""
     ops.select(threshold=0.0005)
-    run = tmp_path / "run"
-    jobs = extension.stga_addon.jobs
+    run = worker.run
     monitor = extension.operators.monitor
-    folder = jobs.perform.request_folder(run)
-    settings = extension.stga_addon.training.settings.make_settings("global", iterations=5)
-    jobs.perform.write_request(folder, jobs.train.Train(run, tmp_path / "capture", settings))
-    with extension.stga_addon.worker.status.status_writer(folder) as writer:
-        monitor.follow(bpy.context.scene, Kind.TRAINING, run, folder)
-        figures = {"psnr": 27.0, "splats": 5.0, "left_s": 70.0}
-        writer.report(Progress(0.5, "Training", figures=lambda: figures))
-        (run / "metrics.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines()))
-        (run / "tracking.npz").write_bytes(b"")
+    figures = {"psnr": 27.0, "splats": 5.0, "left_s": 70.0}
+    worker.report(Progress(0.9, "Ending", figures=lambda: figures))
+    (run / "metrics.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines()))
+    (run / "tracking.npz").write_bytes(b"")
+    worker.leave()
     write_ball_avatar(run / "avatar.npz")
-    for _ in range(300):
-        monitor.tick()
-        if panel().result_shown:
-            break
+    tick_until(monitor, lambda: panel().result_shown)
     monkeypatch.setattr(extension.operators.timers, "has_timer", lambda: True)
     monkeypatch.setattr(monitor, "start_timer", lambda: None)
     return run

@@ -9,6 +9,7 @@ from refusal import refusal
 from stga_addon.capture.open import open_capture
 from stga_addon.scene import tags
 from stga_addon.scene.arrays import evaluated_vertices, mesh_triangles, read_values
+from stga_addon.scene.display.splat_attributes import read_attribute
 from stga_addon.scene.rig.head import import_head
 from stga_addon.scene.vertex_groups import HEAT, SHARE, read_selection, write_selection
 from stga_addon.selection import SelectionOptions, select_capture
@@ -92,13 +93,6 @@ def materials_of(head):
     return {mesh.materials[polygon.material_index].name for polygon in mesh.polygons}
 
 
-def heat(head, name, kind, size):
-    attribute = head.data.attributes[name].data
-    values = np.empty(len(attribute) * size, np.float32)
-    attribute.foreach_get(kind, values)
-    return values
-
-
 def test_heat_map(head, tmp_path):
     """Catches colors of other triangles or an old selection, and a head left changed."""
     with failure("no frame selects a triangle yet"):
@@ -108,9 +102,9 @@ def test_heat_map(head, tmp_path):
     ops.heat_map()
     ops.select(threshold=0.0015)
     expected = np.mean(list(read_selection(head).values()), axis=0)
-    assert_allclose(heat(head, SHARE, "value", 1), expected, atol=1e-6)
+    assert_allclose(read_attribute(head.data, SHARE), expected, atol=1e-6)
     assert head.data.color_attributes.active_color.name == HEAT
-    color = heat(head, HEAT, "color", 4).reshape(-1, 3, 4)
+    color = read_attribute(head.data, HEAT).reshape(-1, 3, 4)
     assert (color == color[:, :1]).all(), "a triangle's corners differ"
     hottest = color[expected.argmax(), 0]
     never = color[expected.argmin(), 0]

@@ -27,16 +27,6 @@ def head(head):
     return head
 
 
-def ask_only(monkeypatch, extension):
-    """Let the operators that train do nothing but ask; what they ask."""
-    asked = []
-    monkeypatch.setattr(extension.operators.train, "missing_packages", list)
-    monkeypatch.setattr(
-        extension.operators.train, "start", lambda scene, wanted, *_, **__: asked.append(wanted)
-    )
-    return asked
-
-
 def tick_until(monitor, done):
     for _ in range(200):
         monitor.tick()
@@ -70,10 +60,9 @@ def test_resume_of_another_capture_is_refused(extension, tmp_path):
     ops.train(directory=folder, resume=True)
 
 
-def test_an_occupied_folder_and_more_training(head, tmp_path, monkeypatch, extension):
+def test_an_occupied_folder_and_more_training(extension, head, asked, tmp_path, monkeypatch):
     """Catches a run that is overwritten or refused where the next folder is free, a panel that
     still names the one before, and *More* that asks for the budget of before."""
-    asked = ask_only(monkeypatch, extension)
     settings = panel()
     run = tmp_path / "run"
     run.mkdir()
@@ -89,9 +78,8 @@ def test_an_occupied_folder_and_more_training(head, tmp_path, monkeypatch, exten
     assert [(request.run, request.more_s) for request in asked] == [(run, 180), (run, None)]
 
 
-def test_device_reaches_the_request(head, tmp_path, monkeypatch, extension):
+def test_device_reaches_the_request(extension, head, asked, tmp_path, monkeypatch):
     """Catches a device or GPU's name that training does not get, and another Python's list."""
-    asked = ask_only(monkeypatch, extension)
     test = extension.operators.training_python.test
     for device, adapter, wanted in (
         ("gpu", "", "gpu"),
