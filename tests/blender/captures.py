@@ -12,7 +12,7 @@ from stga_addon.capture.model import Capture
 from stga_addon.flame.sequence import FlameSequence, expression_mesh, neutral_mesh, sequence_mesh
 from stga_addon.scene.arrays import evaluated_vertices
 
-from .session import ops
+from .session import ops, panel
 
 
 def at_frame(head, frame):
@@ -20,6 +20,11 @@ def at_frame(head, frame):
     whole = int(np.floor(frame))
     bpy.context.scene.frame_set(whole, subframe=frame - whole)
     return evaluated_vertices(head)
+
+
+def mesh_at(frame):
+    """That of the panel's head."""
+    return at_frame(panel().head, frame)
 
 
 def strip(vertices):

@@ -16,31 +16,30 @@ from stga_addon.jobs.table import Kind
 from stga_addon.progress import Progress
 from stga_addon.worker.training_python import missing_packages
 
-from .session import ops, panel
-
 collect_ignore_glob = [] if importlib.util.find_spec("bpy") else ["test_*.py"]
+if not collect_ignore_glob:
+    import bpy
+
+    from .session import ops, panel, write_interpreter
+
 ROOT = Path(__file__).resolve().parents[2]
 
 
 @pytest.fixture(autouse=True, scope="session")
 def _factory_settings():
-    bpy = pytest.importorskip("bpy")
+    pytest.importorskip("bpy")
     bpy.ops.wm.read_factory_settings(use_empty=True)
 
 
 @pytest.fixture(autouse=True)
 def empty_scene(_factory_settings):
     """As after factory settings, in a fifth of the time: Blender's add-ons stay registered."""
-    import bpy
-
     bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
 
 
 @pytest.fixture
 def lighting(empty_scene):
     """The scene's settings of light, whether or not the extension is registered, too."""
-    import bpy
-
     from stga_addon.scene import light
 
     registered = light.lighting_settings(bpy.context.scene) is not None
@@ -86,8 +85,6 @@ def head(extension, tmp_path):
 @pytest.fixture
 def worker(extension, head, tmp_path):
     """A stand-in for a worker of the scene's training: the test says what it does."""
-    import bpy
-
     jobs = extension.stga_addon.jobs
     monitor = extension.operators.monitor
     with ExitStack() as stack:
@@ -101,6 +98,17 @@ def worker(extension, head, tmp_path):
         writer.run = run
         writer.leave = stack.close
         yield writer
+
+
+@pytest.fixture
+def stand_in(extension, monkeypatch, tmp_path):
+    """Let a program with this body stand in for the training Python."""
+
+    def replace(body):
+        python = write_interpreter(tmp_path / "python", body)
+        monkeypatch.setattr(extension.operators.train, "training_python", lambda context: python)
+
+    return replace
 
 
 @pytest.fixture

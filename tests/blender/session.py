@@ -1,5 +1,6 @@
 """A session in Blender as tests carry it out: operators, the panel, files, objects."""
 
+import sys
 from pathlib import Path
 
 import bpy
@@ -93,3 +94,22 @@ def picture(path, engine, size_px=None, samples=1):
     scene.render.filepath = str(path)
     bpy.ops.render.render(write_still=True)
     return np.asarray(Image.open(path)).astype(int)
+
+
+WORKER = """
+import json, pathlib, shutil, sys, time
+FOLDER = pathlib.Path(sys.argv[-1])
+def end(state, error=""):
+    (FOLDER / "status.json").write_text(json.dumps({"state": state, "error": error}))
+def answer(**values):
+    header = {"format": "stga-request", "version": 1}
+    (FOLDER / "result.json").write_text(json.dumps({**header, **values}))
+    end("finished")
+"""
+
+
+def write_interpreter(path, body):
+    """A program that stands in for the training Python, given the folder of a request."""
+    path.write_text(f"#!{sys.executable}\n{WORKER}{body}\n")
+    path.chmod(0o755)
+    return str(path)

@@ -2,7 +2,6 @@
 
 import json
 import re
-import sys
 import time
 
 import bpy
@@ -59,32 +58,12 @@ def test_effect_choices(chosen, extension, tmp_path):
     assert choices["strain-color"] == "on"
 
 
-WORKER = """
-import json, pathlib, shutil, sys, time
-FOLDER = pathlib.Path(sys.argv[-1])
-def end(state, error=""):
-    (FOLDER / "status.json").write_text(json.dumps({"state": state, "error": error}))
-def answer(**values):
-    header = {"format": "stga-request", "version": 1}
-    (FOLDER / "result.json").write_text(json.dumps({**header, **values}))
-    end("finished")
-"""
-
-
-def write_interpreter(path, body):
-    """A program that stands in for the training Python, given the folder of a request."""
-    path.write_text(f"#!{sys.executable}\n{WORKER}{body}\n")
-    path.chmod(0o755)
-    return str(path)
-
-
 @pytest.fixture
-def analyze(extension, monkeypatch, tmp_path):
+def analyze(extension, monkeypatch, stand_in):
     """Start an analysis by a stand-in for the worker, with a timer that the test calls."""
 
     def start(body):
-        python = write_interpreter(tmp_path / "python", body)
-        monkeypatch.setattr(extension.operators.train, "training_python", lambda context: python)
+        stand_in(body)
         ops.analyze_capture()
 
     monkeypatch.setattr(extension.operators.timers, "has_timer", lambda: True)

@@ -11,11 +11,11 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from stga_addon.capture.open import open_capture
 from stga_addon.flame.forward import FlameFrame, flame_forward
-from stga_addon.scene.arrays import evaluated_vertices
 from stga_addon.scene.rig.head import rig_of
 from stga_addon.training.optimize.avatar_tracking import RefinedTracking
 from stga_addon.training.run.folder import with_refined_tracking, write_tracking
 
+from .captures import mesh_at
 from .session import failure, ops, panel
 
 pytestmark = pytest.mark.usefixtures("extension")
@@ -58,15 +58,6 @@ def scene(tmp_path):
     return Reenacted(tmp_path)
 
 
-def the_head():
-    return panel().head
-
-
-def at(frame):
-    bpy.context.scene.frame_set(frame)
-    return evaluated_vertices(the_head())
-
-
 def write_refined(folder, capture, rng):
     """A run's file, whose parameters are disturbed."""
     tracking = RefinedTracking(capture, "stga")
@@ -89,27 +80,27 @@ def test_refined_tracking_keeps_the_offsets_of_each_frame(tmp_path, place):
     shown = with_refined_tracking(own, tmp_path)
     path = str(tmp_path / "tracking.npz")
     ops.apply_motion(filepath=path, start=0, place=place)
-    assert np.abs(at(3) - shown.mesh(3)).max() > 1e-3  # as anybody's motion: without
+    assert np.abs(mesh_at(3) - shown.mesh(3)).max() > 1e-3  # as anybody's motion: without
     ops.apply_motion(filepath=path, start=0, place=place, own_offsets=True)
     for timestep in own.timesteps:
-        assert_allclose(at(timestep), shown.mesh(timestep), atol=2 * TOLERANCE)
+        assert_allclose(mesh_at(timestep), shown.mesh(timestep), atol=2 * TOLERANCE)
     ops.apply_motion(filepath=path, start=10, speed=0.5, place=place, own_offsets=True)
     for timestep in own.timesteps:
-        assert_allclose(at(10 + 2 * timestep), shown.mesh(timestep), atol=2 * TOLERANCE)
+        assert_allclose(mesh_at(10 + 2 * timestep), shown.mesh(timestep), atol=2 * TOLERANCE)
 
 
 def test_undo(scene):
     """Catches a motion that undo leaves half of: actions, bindings, frame range."""
     actions = sorted(bpy.data.actions.keys())
-    before = at(1)
+    before = mesh_at(1)
     bpy.ops.ed.undo_push(message="before")
     ops.apply_motion(filepath=scene.file, start=1, place="strip")
     bpy.ops.ed.undo_push(message="after")
-    assert np.abs(at(1) - before).max() > 1e-3
+    assert np.abs(mesh_at(1) - before).max() > 1e-3
     bpy.ops.ed.undo()
     assert sorted(bpy.data.actions.keys()) == actions
-    assert not rig_of(the_head()).animation_data.nla_tracks
-    assert_array_equal(at(1), before)
+    assert not rig_of(panel().head).animation_data.nla_tracks
+    assert_array_equal(mesh_at(1), before)
 
 
 def test_a_file_its_parts_and_its_frames(scene):
@@ -117,30 +108,30 @@ def test_a_file_its_parts_and_its_frames(scene):
     chosen = {"jaw": False, "eyes": False, "neck": False, "head": False, "strength": 0.5}
     ops.apply_motion(filepath=scene.file, start=0, **chosen)
     own = vars(scene.own.frame(1)) | {"expr": scene.other["expr"][1] / 2}
-    assert_allclose(at(1), scene.mesh(**own), atol=TOLERANCE)
+    assert_allclose(mesh_at(1), scene.mesh(**own), atol=TOLERANCE)
     with failure("no part is chosen"):
         ops.apply_motion(filepath=scene.file, **chosen, expression=False)
     ops.apply_motion(filepath=scene.file, start=10)
     for row in range(5):
-        assert_allclose(at(10 + row), scene.mesh(**scene.theirs(row)), atol=TOLERANCE)
+        assert_allclose(mesh_at(10 + row), scene.mesh(**scene.theirs(row)), atol=TOLERANCE)
     assert bpy.context.scene.frame_end == 14
     bpy.context.scene.render.fps = 24
     ops.apply_motion(filepath=scene.file, start=1, fps=48)
     for frame, row in ((1, 0), (2, 2), (3, 4)):
-        assert_allclose(at(frame), scene.mesh(**scene.theirs(row)), atol=TOLERANCE)
+        assert_allclose(mesh_at(frame), scene.mesh(**scene.theirs(row)), atol=TOLERANCE)
     ops.apply_motion(filepath=scene.file, start=1, fps=48, speed=0.5)
-    assert_allclose(at(4), scene.mesh(**scene.theirs(3)), atol=TOLERANCE)
+    assert_allclose(mesh_at(4), scene.mesh(**scene.theirs(3)), atol=TOLERANCE)
 
 
 def test_a_capture_and_another_head(scene, tmp_path):
     """Catches a folder not taken as a motion, and a hand-made animation that is not applied."""
     folder, model = write_flame_capture(tmp_path / "second", timesteps=(0, 1, 2))
-    name = the_head().name
+    name = panel().head.name
     ops.apply_motion(filepath=folder, start=20)
     expected = {**vars(scene.own.frame(1)), **read_row(2)}
-    assert_allclose(at(22), scene.mesh(**expected), atol=TOLERANCE)
+    assert_allclose(mesh_at(22), scene.mesh(**expected), atol=TOLERANCE)
     ops.import_capture(directory=folder, flame=model)
-    second = the_head()
+    second = panel().head
     rig_of(second).animation_data.action = None
     rig_of(second).pose.bones["neck"].rotation_quaternion = (np.cos(0.2), 0, np.sin(0.2), 0)
     rig_of(second).pose.bones["neck"].keyframe_insert("rotation_quaternion", frame=0)
@@ -148,7 +139,7 @@ def test_a_capture_and_another_head(scene, tmp_path):
     ops.apply_motion(source=second.name, start=40, head=False, jaw=False, eyes=False)
     # What is not taken stays: frame 42 lies behind the last keyframe of before, which holds.
     own = expected | {"expr": read_row(2)["expr"], "neck_pose": np.array([0, 0.4, 0])}
-    assert_allclose(at(42), scene.mesh(**own), atol=TOLERANCE)
+    assert_allclose(mesh_at(42), scene.mesh(**own), atol=TOLERANCE)
 
 
 def read_row(timestep):
@@ -160,7 +151,7 @@ def read_row(timestep):
 def test_wrong_sources_change_nothing(scene, tmp_path):
     """Catches half a motion, and messages that do not say what is needed."""
     actions = sorted(bpy.data.actions.keys())
-    before = at(1)
+    before = mesh_at(1)
     np.savez(tmp_path / "wide.npz", expr=np.zeros((2, 50)))
     np.savez(tmp_path / "long.npz", expr=np.zeros((3, 2)))
     (tmp_path / "take.bvh").write_text("HIERARCHY\n")
@@ -173,13 +164,13 @@ def test_wrong_sources_change_nothing(scene, tmp_path):
         ({"filepath": meshes}, "was not tracked with FLAME"),
         ({}, "no path given"),
         ({"source": "nobody"}, "nobody: is not an imported head"),
-        ({"source": the_head().name}, "is this head itself"),
+        ({"source": panel().head.name}, "is this head itself"),
         ({"filepath": tmp_path / "long.npz", "start": 1_048_573}, "Blender's last frame is"),
     ):
         with failure(message):
             ops.apply_motion(**arguments)
     assert sorted(bpy.data.actions.keys()) == actions
-    assert_array_equal(at(1), before)
+    assert_array_equal(mesh_at(1), before)
     scene.model_file.rename(tmp_path / "elsewhere.npz")
     with failure(r"model\.npz: cannot be read"):
         ops.apply_motion(filepath=scene.file)

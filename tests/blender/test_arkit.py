@@ -18,7 +18,7 @@ from stga_addon.scene.rig.head import rig_of
 from stga_addon.scene.rig.keyframes import Placement
 from stga_addon.scene.rig.motion import apply_motion, sample_pose
 
-from .captures import at_frame, import_small_head
+from .captures import import_small_head, mesh_at
 from .session import failure, ops, panel
 
 pytestmark = [pytest.mark.usefixtures("extension"), pytest.mark.slow]
@@ -40,14 +40,6 @@ def scene(tmp_path):
     return SimpleNamespace(own=own, map=head_map(own, "demo"), **given)
 
 
-def the_head():
-    return panel().head
-
-
-def at(frame):
-    return at_frame(the_head(), frame)
-
-
 def posed(scene, weights, turn=None):
     take = Performance(np.zeros(1), weights[None], None if turn is None else turn[None], 30.0)
     return flame_forward(scene.own.model, scene.own.shape, scene.map.frames(take)[0])
@@ -61,23 +53,23 @@ def test_apply_a_performance(scene):
     """Catches a performance at another rate or place than asked for, or on another identity."""
     assert ops.apply_motion(filepath=scene.take, start=10) == {"FINISHED"}
     for row in (0, 3, 6):
-        assert_allclose(at(10 + row), expected(scene, row), atol=TOLERANCE_M)
+        assert_allclose(mesh_at(10 + row), expected(scene, row), atol=TOLERANCE_M)
     assert bpy.context.scene.frame_end >= 16
     ops.apply_motion(filepath=scene.take, start=10, speed=0.5, place="strip")
-    assert_allclose(at(16), expected(scene, 3), atol=TOLERANCE_M)
+    assert_allclose(mesh_at(16), expected(scene, 3), atol=TOLERANCE_M)
 
 
 def test_sliders(scene):
     """Catches a slider other than the map's, that stops own motion or needs Python."""
-    before = [at(frame) for frame in range(3)]
+    before = [mesh_at(frame) for frame in range(3)]
     assert ops.add_arkit_controls() == {"FINISHED"}
-    head = the_head()
+    head = panel().head
     model = scene.own.model
     keys = head.data.shape_keys
     assert set(ARKIT_SHAPES) <= set(keys.key_blocks.keys())
     assert all(driver.driver.is_simple_expression for driver in keys.animation_data.drivers)
     for frame in range(3):
-        assert_allclose(at(frame), before[frame], atol=1e-7)
+        assert_allclose(mesh_at(frame), before[frame], atol=1e-7)
     zero = np.zeros(3)
     neutral = FlameFrame(np.zeros(10), zero, zero, zero, zero, np.zeros(6))
     apply_motion(head, [neutral], Placement(1, "neutral"))
@@ -104,7 +96,7 @@ def test_sliders(scene):
 def test_a_performance_on_sliders(scene):
     """Catches keyframes that add up with the head's own, or stay after another motion."""
     ops.add_arkit_controls()
-    keys = the_head().data.shape_keys.key_blocks
+    keys = panel().head.data.shape_keys.key_blocks
     for start, place in ((10, "action"), (20, "strip")):
         options = {"start": start, "place": place, "sliders": True}
         assert ops.apply_motion(filepath=scene.take, **options) == {"FINISHED"}
@@ -112,11 +104,11 @@ def test_a_performance_on_sliders(scene):
         for name in ("jawOpen", "mouthFunnel", "browInnerUp"):
             assert keys[name].value == pytest.approx(scene.weights[3, COLUMN[name]], abs=1e-5)
         assert not any(abs(keys[f"expr_{k:03d}"].value) > 1e-6 for k in range(10))
-        found = sample_pose(the_head(), scene.own.model)
+        found = sample_pose(panel().head, scene.own.model)
         turned = flame_forward(scene.own.model, scene.own.shape, found)
         assert_allclose(turned, expected(scene, 3), atol=1e-5)
     assert ops.apply_motion(filepath=scene.take, start=10) == {"FINISHED"}
-    assert_allclose(at(13), expected(scene, 3), atol=TOLERANCE_M)
+    assert_allclose(mesh_at(13), expected(scene, 3), atol=TOLERANCE_M)
 
 
 def test_curves_come_back_from_an_action(scene, tmp_path):
@@ -144,7 +136,7 @@ def test_a_head_with_shape_keys(scene, tmp_path):
 
     ops.import_capture(directory=write_mesh_capture(tmp_path / "ball"))
     bpy.context.scene.render.fps = 30
-    head = the_head()
+    head = panel().head
     if head.data.shape_keys is None:
         head.shape_key_add(name="Basis")
     for name in ("JawOpen", "mouthSmile_L"):

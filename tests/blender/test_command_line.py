@@ -13,9 +13,9 @@ from stga_addon.avatar.embedding import to_world
 from stga_addon.avatar.file import read_avatar
 from stga_addon.capture.open import open_capture
 from stga_addon.export.ply import read_ply
-from stga_addon.scene.arrays import evaluated_vertices
 from stga_addon.scene.vertex_groups import read_selection
 
+from .captures import mesh_at
 from .session import open_file, ops, panel, save
 from .test_operators import show_ball
 
@@ -77,8 +77,7 @@ def test_what_the_open_head_plays(stga, here, tmp_path):
     assert stga("export", tmp_path / "a.npz", *pair) == 0
     written = sorted(path.name for path in (tmp_path / "plys").glob("*.ply"))
     assert written == [f"{timestep:05d}.ply" for timestep in range(4)]
-    bpy.context.scene.frame_set(2)  # not among the tracked timesteps
-    frames = avatar.frames(evaluated_vertices(panel().head))
+    frames = avatar.frames(mesh_at(2))  # not among the tracked timesteps
     expected = to_world(avatar.splats, frames).xyz
     assert_allclose(read_ply(tmp_path / "plys/00002.ply").xyz, expected, atol=1e-6)
     with np.load(tmp_path / "pair/flame_param.npz") as pair:

@@ -13,9 +13,9 @@ from stga_addon.jobs.table import Kind
 from stga_addon.scene.display.splat_attributes import read_attribute
 from stga_addon.training.run.folder import read_run
 
-from .session import failure, ops, panel
-from .test_analyze_operator import error_of, tick_until_done, write_interpreter
-from .test_operators import write_ball_avatar
+from .session import failure, ops, panel, write_interpreter
+from .test_analyze_operator import error_of, tick_until_done
+from .test_operators import write_ball_run
 
 
 @pytest.fixture
@@ -30,10 +30,7 @@ def head(head):
 
 @pytest.fixture
 def run(tmp_path):
-    folder = tmp_path / "run"
-    folder.mkdir()
-    write_ball_avatar(folder / "avatar.npz")
-    return folder
+    return write_ball_run(tmp_path / "run")
 
 
 def test_what_is_painted_or_selected_becomes_the_region(head, asked, run, extension):
@@ -126,22 +123,11 @@ def answer(extension, tmp_path, selection):
     return f"shutil.copytree({str(given)!r}, FOLDER, dirs_exist_ok=True)\nend('finished')"
 
 
-@pytest.fixture
-def worker(extension, monkeypatch, tmp_path):
-    """Let this program stand in for the worker that selects triangles."""
-
-    def stand_in(body):
-        program = write_interpreter(tmp_path / "python", body)
-        monkeypatch.setattr(extension.operators.train, "training_python", lambda context: program)
-
-    return stand_in
-
-
-def test_what_an_extension_would_train_is_selected(head, run, extension, worker, tmp_path):
+def test_what_an_extension_would_train_is_selected(head, run, extension, stand_in, tmp_path):
     """Catches other frames or triangles than the worker found, and a silent failure."""
     selection = {timestep: np.arange(len(head.data.polygons)) < 40 for timestep in (0, 3)}
     selection[3] = ~selection[3]
-    worker(answer(extension, tmp_path, selection))
+    stand_in(answer(extension, tmp_path, selection))
     ops.select_extension(directory=run)
     shown = extension.stga_addon.scene.vertex_groups.read_selection(head)
     for timestep, faces in selection.items():
@@ -150,14 +136,14 @@ def test_what_an_extension_would_train_is_selected(head, run, extension, worker,
     assert not shown[1].any()
     rows = panel().selected_frames
     assert [row.frame for row in rows if row.triangles] == [0, 3]
-    worker("end('failed', 'no such run')")
+    stand_in("end('failed', 'no such run')")
     with failure("no such run"):
         ops.select_extension(directory=run)
     assert error_of(extension, Kind.SELECTION) == "no such run"
 
 
 def test_selection_of_another_head_or_cancelled_changes_nothing(
-    head, run, extension, worker, monkeypatch, tmp_path
+    head, run, extension, stand_in, monkeypatch, tmp_path
 ):
     """Catches a selection of a head imported meanwhile, and files that a cancel leaves."""
     temporary = tmp_path / "temporary"
@@ -165,7 +151,7 @@ def test_selection_of_another_head_or_cancelled_changes_nothing(
     monkeypatch.setattr(tempfile, "tempdir", str(temporary))
     given = answer(extension, tmp_path, {0: np.ones(len(head.data.polygons), bool)})
     wait = f"while not pathlib.Path({str(tmp_path / 'go')!r}).exists(): time.sleep(0.02)\n"
-    worker(wait + given)
+    stand_in(wait + given)
     settings = panel()
     monkeypatch.setattr(extension.operators.timers, "has_timer", lambda: True)
     ops.select_extension(directory=run)
@@ -184,10 +170,10 @@ def test_selection_of_another_head_or_cancelled_changes_nothing(
 
 
 def test_selection_waits_for_the_end_of_edit_mode(
-    head, run, extension, worker, monkeypatch, tmp_path
+    head, run, extension, stand_in, monkeypatch, tmp_path
 ):
     """Catches a result lost in Edit Mode, a failure held back, and an old error."""
-    worker(answer(extension, tmp_path, {0: np.ones(len(head.data.polygons), bool)}))
+    stand_in(answer(extension, tmp_path, {0: np.ones(len(head.data.polygons), bool)}))
     monitor = extension.operators.monitor
     monkeypatch.setattr(extension.operators.timers, "has_timer", lambda: True)
     bpy.context.view_layer.objects.active = head
@@ -206,7 +192,7 @@ def test_selection_waits_for_the_end_of_edit_mode(
     assert error_of(extension, Kind.SELECTION) == ""
     assert extension.stga_addon.scene.vertex_groups.read_selection(head)[0].all()
     bpy.ops.object.mode_set(mode="EDIT")
-    worker("end('failed', 'no such run')")
+    stand_in("end('failed', 'no such run')")
     ops.select_extension(directory=run)
     tick_until_done(extension, Kind.SELECTION)
     assert error_of(extension, Kind.SELECTION) == "no such run"

@@ -60,13 +60,9 @@ def live(tmp_path, extension):
     sender.close()
 
 
-def the_head():
-    return panel().head
-
-
 def mesh():
     bpy.context.view_layer.update()
-    return evaluated_vertices(the_head())
+    return evaluated_vertices(panel().head)
 
 
 TURN = (0.1, 0.2, -0.1)
@@ -103,7 +99,7 @@ def test_the_head_follows_and_comes_back(live):
     assert live.sessions.session() is None
     assert not ops.stop_live.poll()
     ops.add_arkit_controls()
-    slider = the_head().data.shape_keys.key_blocks["jawOpen"]
+    slider = panel().head.data.shape_keys.key_blocks["jawOpen"]
     slider.value = 0.25
     ops.drive_live()
     weights = half(1)
@@ -122,7 +118,7 @@ def test_a_rendered_animation_keeps_its_own_pose(live):
         bl_label = "Recorder"
 
         def render(self, depsgraph):
-            vertices = the_head().evaluated_get(depsgraph).data.vertices
+            vertices = panel().head.evaluated_get(depsgraph).data.vertices
             rendered[depsgraph.scene.frame_current] = np.array([vertex.co for vertex in vertices])
 
     ops.drive_live()
@@ -202,7 +198,7 @@ def test_a_take_that_cannot_be_written_is_not_lost(live, tmp_path, end):
     live.settings.takes = str(live.takes)
     getattr(ops, end)()
     assert taken(live.takes) == [60]
-    assert rig_of(the_head()).animation_data.action.name.endswith("take_001")
+    assert rig_of(panel().head).animation_data.action.name.endswith("take_001")
 
 
 def test_a_take_follows_new_names_and_its_own_head(live, tmp_path):
@@ -210,34 +206,35 @@ def test_a_take_follows_new_names_and_its_own_head(live, tmp_path):
     panel().drive.takes = str(live.takes)
     record(live, 30)
     bpy.context.scene.name = "Shot 12"
-    the_head().name = "Anna"
+    panel().head.name = "Anna"
     for number in range(30, 60):
         assert live.send({"jawOpen": 0.5}, number) is not None
     ops.stop_live()
     assert taken(live.takes) == [60]
-    anna = the_head()
+    anna = panel().head
     assert rig_of(anna).animation_data.action.name.endswith("take_001")
     record(live)
     (tmp_path / "ben").mkdir()
     import_small_head(tmp_path / "ben", expr=np.zeros((5, 10)))
-    assert the_head() != anna
+    assert panel().head != anna
     with failure(r"Recorded .*take_002.csv, but it was not applied"):
         ops.stop_live()
     assert taken(live.takes) == [60, 60]
-    assert "take_002" not in rig_of(the_head()).animation_data.action.name
+    assert "take_002" not in rig_of(panel().head).animation_data.action.name
 
 
 @pytest.mark.parametrize("end", ["head", "scene", "file", "unsaved", "disabled", "error"])
 def test_a_take_is_kept_however_driving_ends(live, extension, tmp_path, monkeypatch, capsys, end):
-    """Catches a take that is lost, or kept nobody knows where, as its head or scene is removed, a
-    file opened, the extension disabled, as when Blender quits, or a step fails."""
+    """Catches a take that is lost, or kept nobody knows where, and a socket that stays open, as
+    head or scene is removed, a file opened, the extension disabled, as when Blender quits, or a
+    step fails."""
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     if end == "unsaved":  # where Blender's own folder of temporary files would go with it
         live.settings.takes = "//stga_takes"
     record(live)
     running = live.sessions.session()
     if end == "head":
-        bpy.data.objects.remove(the_head())
+        bpy.data.objects.remove(panel().head)
     elif end == "scene":
         driven = bpy.context.scene
         bpy.context.window_manager.windows[0].scene = bpy.data.scenes.new("other")
@@ -255,6 +252,7 @@ def test_a_take_is_kept_however_driving_ends(live, extension, tmp_path, monkeypa
     if live.sessions.session() is not None:
         assert running.tick() is None
     assert live.sessions.session() is None
+    assert running.receiver._socket.fileno() == -1
     folder = tmp_path / "stga_takes" if end in ("scene", "unsaved") else live.takes
     assert taken(folder) == [60]
     said = f"{folder}/take_001.csv"
@@ -280,7 +278,7 @@ def test_a_recording_is_a_step_to_undo(live):
 def test_sliders_that_are_moved_meanwhile(live):
     """Catches components by place in Blender's list of shape keys, a session that ends where one is
     added, and sliders of others that are held."""
-    head = the_head()
+    head = panel().head
     keys = head.data.shape_keys.key_blocks
 
     def move(name, way):
@@ -314,8 +312,8 @@ def test_the_trained_range(live):
     ops.measure_range()
     from stga_addon.scene.rig.motion import outside_now, stored_range
 
-    head = the_head()
-    rig = rig_of(the_head())
+    head = panel().head
+    rig = rig_of(panel().head)
     trained = stored_range(head)
     assert_allclose(trained.middle["jaw"][0], 0.1, atol=0.01)
     assert outside_now(head, rig, trained)["jaw"] == 0
@@ -343,24 +341,6 @@ def test_another_address_needs_online_access(live):
     live.settings.phone = "192.168.0.7"
     with failure("online access is off"):
         ops.drive_live()
-
-
-def test_it_ends_with_file_head_and_extension(live, extension):
-    """Catches a socket that stays open, or a head of another file that is posed."""
-    for end in (
-        lambda: bpy.data.objects.remove(the_head()),
-        lambda: bpy.ops.wm.read_homefile(use_empty=True),
-    ):
-        if the_head() is None:
-            return
-        ops.drive_live()
-        running = live.sessions.session()
-        live.send({}, 1)
-        end()
-        if live.sessions.session() is not None:
-            assert running.tick() is None
-        assert live.sessions.session() is None
-        assert running.receiver._socket.fileno() == -1
 
 
 def test_a_minute_without_growth(live):

@@ -163,10 +163,15 @@ def test_image_equals_render_avatar(make, background, tmp_path):
     avatar = make()
     shown, head = show(avatar)
     camera = expected_camera(camera_at(), shown)
-    mesh = evaluated_vertices(head)
-    expected = render_avatar(avatar, mesh, camera, (background,) * 3)
+    expected = assert_renders(tmp_path, avatar, head, camera, background)
     assert np.abs(expected - background).max(0).mean() > 0.02, "nothing to compare"
-    assert np.abs(displayed(render(tmp_path), background) - expected).max() < TOLERANCE
+
+
+def assert_renders(folder, avatar, head, camera, background=0.0, what=""):
+    """Whether the image is that of `render_avatar`, which is returned."""
+    expected = render_avatar(avatar, evaluated_vertices(head), camera, (background,) * 3)
+    assert np.abs(displayed(render(folder), background) - expected).max() < TOLERANCE, what
+    return expected
 
 
 def no_context():
@@ -235,9 +240,7 @@ def test_camera_settings_are_applied(changes, portrait, tmp_path):
     avatar = textured(avatar_of("stga"))
     shown, head = show(avatar)
     camera = expected_camera(camera_at(45.0, **changes), shown, width, height)
-    expected = render_avatar(avatar, evaluated_vertices(head), camera, (0.0,) * 3)
-    assert expected.max() > 0.3
-    assert np.abs(displayed(render(tmp_path), 0.0) - expected).max() < TOLERANCE
+    assert assert_renders(tmp_path, avatar, head, camera).max() > 0.3
 
 
 @pytest.mark.parametrize("crop", [False, True])
@@ -310,8 +313,6 @@ def test_display_settings_apply_to_renders(tmp_path):
     frozen = ~np.isin(avatar.faces, vertices).all(1)[avatar.splats.face]
     constant = replace(avatar.splats, sh=avatar.splats.sh[:, :1])
     larger = replace(avatar.splats, log_scale=avatar.splats.log_scale + np.float32(np.log(2)))
-    mesh = evaluated_vertices(head)
-    black = (0.0,) * 3
     cases = {
         splat_nodes.OPACITY_THRESHOLD: (0.5, 0.0, avatar.splats.rows(~faint)),
         splat_nodes.SELECTED_ONLY: (True, False, avatar.splats.rows(~frozen)),
@@ -322,12 +323,11 @@ def test_display_settings_apply_to_renders(tmp_path):
     }
     for name, (value, default, splats) in cases.items():
         set_input(shown, name, value)
-        expected = render_avatar(replace(avatar, splats=splats), mesh, camera, black)
-        assert np.abs(displayed(render(tmp_path), 0.0) - expected).max() < TOLERANCE, name
+        assert_renders(tmp_path, replace(avatar, splats=splats), head, camera, what=name)
         set_input(shown, name, default)
     set_input(shown, splat_nodes.SHOW_SELECTION, True)
     gray = displayed(render(tmp_path), 0.0)
-    colored = render_avatar(avatar, mesh, camera, black)
+    colored = render_avatar(avatar, evaluated_vertices(head), camera, (0.0,) * 3)
     assert np.ptp(gray, axis=0).mean() < np.ptp(colored, axis=0).mean()
 
 

@@ -3,41 +3,39 @@
 import bpy
 import numpy as np
 import pytest
-from capture.factory import write_flame_capture
 from export.web.web_data import posed_mesh, read_web_data
-from flame.small_head import small_head, write_flame
+from numpy.random import default_rng
 from numpy.testing import assert_allclose, assert_array_equal
 
 from stga_addon.avatar.file import Avatar, read_avatar, write_avatar
 from stga_addon.avatar.lattice import lattice_splats
-from stga_addon.capture.open import open_capture
 from stga_addon.flame.forward import FlameFrame, flame_forward
 from stga_addon.flame.model import JOINTS
+from stga_addon.flame.sequence import neutral_mesh
 from stga_addon.scene.arrays import evaluated_vertices
 from stga_addon.scene.rig.head import rig_of
 
-from .session import ops, panel
+from .captures import import_small_head, mesh_at
+from .session import ops
+from .test_splat_object import active_camera
 
 BLENDER_TOLERANCE_M = 2e-4
 """What the file's blend shapes leave out, times their weights."""
 
 
 def demo_head(tmp_path):
-    """The small FLAME head in the scene with an avatar; the capture it was imported from."""
-    folder, _ = write_flame_capture(tmp_path / "capture", timesteps=(0, 1, 2))
-    model = folder / "demo.npz"
-    write_flame(small_head(0), model)
-    for file in [*folder.glob("flame_param/*.npz"), folder / "canonical_flame_param.npz"]:
-        with np.load(file) as found:  # its offsets are those of another mesh
-            kept = {name: found[name] for name in found.files if name != "static_offset"}
-        np.savez(file, **kept)
-    ops.import_capture(directory=folder, flame=model)
-    capture = open_capture(folder, model)
-    neutral = capture.neutral.astype(np.float32)
-    splats = lattice_splats(neutral, capture.faces, sh_degree=0, convention="stga")
-    write_avatar(tmp_path / "anna.npz", Avatar(splats, "stga", neutral, capture.faces))
+    """The small FLAME head in the scene, moving, with an avatar and a camera; its identity."""
+    motion = {name: default_rng(1).normal(0, 0.05, (3, 3)) for name in ("rotation", "jaw_pose")}
+    expressions = default_rng(2).normal(0, 0.5, (3, 10))
+    flame = import_small_head(tmp_path, expr=expressions, **motion)
+    active_camera((0.1, -1, 0.2)).rotation_euler = (1.5, 0, 0.1)
+    neutral = neutral_mesh(flame)
+    faces = flame.model.faces
+    splats = lattice_splats(neutral, faces, sh_degree=0)
+    avatar = Avatar(splats, "stga", neutral.astype(np.float32), faces)
+    write_avatar(tmp_path / "anna.npz", avatar)
     ops.show_avatar(filepath=tmp_path / "anna.npz")
-    return capture
+    return flame
 
 
 def exported(folder, **options):
@@ -50,19 +48,18 @@ def assert_plays(header, arrays):
     """The page's mesh is that of the scene's head at each frame."""
     scene = bpy.context.scene
     for index, frame in enumerate(range(scene.frame_start, scene.frame_end + 1)):
-        scene.frame_set(frame)
         moved = arrays["coefficients"][index], arrays["pose"][index]
         found = posed_mesh(header, arrays, *moved, index)
-        assert np.abs(found - evaluated_vertices(scene.stga.head)).max() < BLENDER_TOLERANCE_M
+        assert np.abs(found - mesh_at(frame)).max() < BLENDER_TOLERANCE_M
 
 
 def test_sliders_motion_and_camera(extension, tmp_path):
     """Catches another slider, joint, motion or camera, and blend shapes in a page without."""
-    flame = demo_head(tmp_path).flame
+    flame = demo_head(tmp_path)
     header, arrays = exported(tmp_path)
     names = [f"expr_{component:03d}" for component in range(flame.model.n_expression)]
     assert sorted(slider["name"] for slider in header["sliders"]) == names
-    rng = np.random.default_rng(0)
+    rng = default_rng(0)
     expressions = rng.normal(0, 0.7, flame.model.n_expression)
     pose = rng.normal(0, 0.2, (len(JOINTS), 3))
     turns = (pose[0], pose[1], pose[2], arrays["translation"][0], pose[3:].ravel())
@@ -104,11 +101,7 @@ def test_an_avatar_comes_back(extension, tmp_path):
     frames = range(scene.frame_start, scene.frame_end + 1)
 
     def meshes():
-        found = []
-        for frame in frames:
-            bpy.context.scene.frame_set(frame)
-            found.append(evaluated_vertices(panel().head))
-        return np.array(found)
+        return np.array([mesh_at(frame) for frame in frames])
 
     before = meshes()
     splats = read_avatar(tmp_path / "anna.npz").splats

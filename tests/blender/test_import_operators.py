@@ -18,9 +18,9 @@ from capture.factory import (
 from numpy.testing import assert_allclose
 
 from stga_addon.capture.open import open_capture
-from stga_addon.scene.arrays import evaluated_vertices
 from stga_addon.scene.display.splat_object import evaluated_splats
 
+from .captures import mesh_at
 from .session import failure, ops, panel, placed, save
 from .test_operators import show_ball, write_ball_avatar
 
@@ -84,8 +84,7 @@ def test_importing_again_doubles_nothing(tmp_path, model, kind):
         meshes = {timestep: capture.mesh(timestep) for timestep in capture.timesteps}
     assert (scene.frame_start, scene.frame_end) == (0, max(meshes))
     for timestep, mesh in meshes.items():
-        scene.frame_set(timestep)
-        assert_allclose(evaluated_vertices(scene.stga.head), mesh, atol=2e-6)
+        assert_allclose(mesh_at(timestep), mesh, atol=2e-6)
     ops.select(threshold=0.001)
 
 
@@ -102,8 +101,7 @@ def test_importing_again_keeps_what_an_artist_painted(tmp_path):
     assert head.vertex_groups["dimple"].weight(4) == 1.0
     assert head.vertex_groups["stga_3"].weight(7) == pytest.approx(0.7)
     assert [material.name for material in head.data.materials] == ["skin"]
-    bpy.context.scene.frame_set(3)
-    assert_allclose(evaluated_vertices(head), moved(3, ball()[0]), atol=1e-6)
+    assert_allclose(mesh_at(3), moved(3, ball()[0]), atol=1e-6)
     mesh = bpy.data.meshes.new("other")
     other = placed("other", mesh)
     bpy.context.view_layer.objects.active = other

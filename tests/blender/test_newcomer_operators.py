@@ -18,7 +18,7 @@ from stga_addon.scene.display.splat_nodes import POINTS
 from stga_addon.scene.display.splat_object import display_mode, show_avatar
 
 from .session import open_file, ops, panel, reopen, save, shown_layers, viewport
-from .test_operators import show_ball
+from .test_operators import show_ball, write_ball_run
 from .test_panel import draw
 
 LACKS = (
@@ -65,9 +65,7 @@ def test_the_file_knows_its_run(extension, head, tmp_path):
     """Catches a run lost when an avatar is shown, or the file moved with it or saved elsewhere."""
     settings = panel()
     folder = tmp_path / "work"
-    (folder / "run").mkdir(parents=True)
-    (folder / "run/run.json").write_text("{}")
-    show_ball(folder / "run/avatar.npz")
+    ops.show_avatar(filepath=write_ball_run(folder / "run") / "avatar.npz")
     assert settings.run_folder == str(folder / "run")
     save(folder / "head.blend")
     assert (settings.run_folder, settings.avatar) == ("//run", "//run/avatar.npz")
@@ -88,9 +86,7 @@ def test_the_file_knows_its_run(extension, head, tmp_path):
 def test_a_run_made_after_its_head(extension, head, tmp_path):
     """Catches no Train More after Avatar from Video, whose head is there before its run."""
     settings = panel()
-    settings.run_folder = str(tmp_path / "run")
-    (tmp_path / "run").mkdir()
-    (tmp_path / "run/run.json").write_text("{}")
+    settings.run_folder = str(write_ball_run(tmp_path / "run"))
     results = extension.operators.results
     making = extension.operators.monitor.RequestState(results.Kind.AVATAR, tmp_path, tmp_path)
     results.store_avatar(bpy.context.scene, making, tmp_path / "run/avatar.npz")
@@ -99,9 +95,7 @@ def test_a_run_made_after_its_head(extension, head, tmp_path):
 
 def test_a_file_made_without_the_panel(extension, head, tmp_path):
     """Catches demo.blend with an empty panel, and a chosen head replaced at loading."""
-    (tmp_path / "run").mkdir()
-    (tmp_path / "run/run.json").write_text("{}")
-    show_ball(tmp_path / "run/avatar.npz")
+    ops.show_avatar(filepath=write_ball_run(tmp_path / "run") / "avatar.npz")
     settings = panel()
     name = head.name
     path = str(tmp_path / "demo.blend")

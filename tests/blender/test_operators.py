@@ -21,12 +21,11 @@ from stga_addon.capture.open import open_capture
 from stga_addon.export.formats import export_avatar
 from stga_addon.export.ply import read_ply, write_ply
 from stga_addon.jobs.track import Track
-from stga_addon.scene.arrays import evaluated_vertices
 from stga_addon.scene.display.splat_object import evaluated_splats
 from stga_addon.scene.vertex_groups import read_selection
 from stga_addon.selection import SelectionOptions, select_capture
 
-from .captures import closure
+from .captures import closure, mesh_at
 from .session import failure, ops, panel, reopen
 
 pytestmark = pytest.mark.usefixtures("extension")
@@ -73,6 +72,14 @@ def write_ball_avatar(path, neutral=None, **options):
     avatar = Avatar(splats, "stga", vertices.astype(np.float32), faces)
     write_avatar(path, avatar)
     return avatar
+
+
+def write_ball_run(folder):
+    """A run's folder with such an avatar."""
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "run.json").write_text("{}")
+    write_ball_avatar(folder / "avatar.npz")
+    return folder
 
 
 def show_ball(path, neutral=None, **options):
@@ -171,9 +178,8 @@ def test_from_import_to_show(tmp_path, layout):
     assert scene.stga.head.hide_render
     assert not scene.stga.head.visible_get()
     for timestep in (3, 0, 1):
-        scene.frame_set(timestep)
         mesh = capture.mesh(timestep)
-        assert_allclose(evaluated_vertices(scene.stga.head), mesh, atol=2e-6)
+        assert_allclose(mesh_at(timestep), mesh, atol=2e-6)
         xyz, _, _ = evaluated_splats(scene.stga.splats)
         assert_allclose(xyz, expected_world(avatar, mesh).xyz, atol=1e-5)
 

@@ -16,7 +16,7 @@ from stga_addon.progress import Progress
 from stga_addon.report import CURVE_COLOR, DETAIL_COLOR, FORECAST_COLOR, MARGIN, SIZE, curve_image
 
 from .session import ops, panel
-from .test_operators import write_ball_avatar
+from .test_operators import write_ball_avatar, write_ball_run
 from .test_train_operators import tick_until
 
 
@@ -117,9 +117,7 @@ def test_a_word_for_the_quality_and_more_training(extension, trained, tmp_path):
     settings.avatar = ""
     texts = draw(extension, "STGA_PT_train")
     assert ("Train" in texts, "Resume" in texts) == (True, False)
-    another.mkdir()
-    (another / "run.json").write_text("{}")
-    settings.run_folder = str(another)
+    settings.run_folder = str(write_ball_run(another))
     assert {"Train", "Resume"} <= set(draw(extension, "STGA_PT_train"))
 
 

@@ -4,14 +4,13 @@ from types import SimpleNamespace
 
 import bpy
 import numpy as np
-import pytest
 
 from stga_addon.scene import tags, vertex_groups
 from stga_addon.scene.display import splat_nodes
 from stga_addon.scene.display.splat_object import set_input
 from stga_addon.scene.render.scene_splats import SplatCache, visible_layers
 
-from .session import placed, shown_layers
+from .session import shown_layers
 from .test_splat_object import avatar_of, show_on_head
 
 
@@ -93,20 +92,3 @@ def test_a_selection_is_read_once(monkeypatch):
         assert (~frozen()).any()
     finally:
         bpy.app.handlers.depsgraph_update_post.remove(changed)
-
-
-@pytest.mark.parametrize("kind", ["SPLATS", "COLLECTION"])
-def test_splats_are_found_among_many_objects(kind):
-    """Catches splats, or instances of their collection, that the first look at objects misses."""
-    shown, _ = shown_avatar()
-    expected = 1
-    if kind == "COLLECTION":
-        inside = bpy.data.collections.new("inside")
-        inside.objects.link(shown)
-        empty = placed("empty", None)
-        empty.instance_type = "COLLECTION"
-        empty.instance_collection = inside
-        expected = 2
-    bpy.context.view_layer.update()
-    depsgraph = bpy.context.evaluated_depsgraph_get()
-    assert len(visible_layers(depsgraph, SplatCache())) == expected

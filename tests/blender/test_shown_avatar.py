@@ -14,7 +14,7 @@ from stga_addon.export.ply import write_ply
 from stga_addon.jobs.table import Kind
 from stga_addon.progress import Progress
 from stga_addon.scene import tags
-from stga_addon.scene.arrays import evaluated_vertices
+from stga_addon.scene.arrays import evaluated_vertices, mesh_vertices
 from stga_addon.scene.compat import modifier_input, modifier_input_owner
 from stga_addon.scene.display import splat_nodes
 from stga_addon.scene.display.splat_object import (
@@ -27,8 +27,9 @@ from stga_addon.scene.display.splat_object import (
 from stga_addon.training.run.folder import Run, write_run
 from stga_addon.training.settings import make_settings
 
+from .captures import mesh_at
 from .session import open_file, ops, panel, reopen, save
-from .test_operators import expected_world, show_ball, write_ball_avatar
+from .test_operators import expected_world, show_ball, write_ball_avatar, write_ball_run
 from .test_train_operators import tick_until
 
 
@@ -218,11 +219,7 @@ def test_a_head_hidden_by_its_splats_is_still_moved(extension, head, tmp_path):
     """Catches a head that stands still, in exports, once its splats are disabled or deleted."""
 
     def moves():
-        shapes = []
-        for frame in (0, 1):
-            bpy.context.scene.frame_set(frame)
-            shapes.append(evaluated_vertices(head))
-        return not np.array_equal(*shapes)
+        return not np.array_equal(*map(mesh_at, (0, 1)))
 
     show_ball(tmp_path / "a.npz")
     assert not head.visible_get()
@@ -240,9 +237,7 @@ def test_a_head_hidden_by_its_splats_is_still_moved(extension, head, tmp_path):
 
 def saved_head(folder):
     """A file with a head and its splats, whose run lies beside it."""
-    run = folder / "run"
-    run.mkdir()
-    write_ball_avatar(run / "avatar.npz")
+    write_ball_run(folder / "run")
     save(folder / "head.blend")
     ops.show_avatar(filepath="//run/avatar.npz")
     bpy.ops.wm.save_mainfile()
@@ -274,10 +269,7 @@ def test_what_is_brought_into_another_file_is_shown_alike(extension, head, tmp_p
     settings = panel()
     assert settings.head.name.endswith(" head")
     assert Path(bpy.path.abspath(settings.avatar)) == tmp_path / "run/avatar.npz"
-    bpy.context.scene.frame_set(1)
-    assert not np.array_equal(
-        evaluated_vertices(settings.head), np.array([v.co for v in settings.head.data.vertices])
-    )
+    assert not np.array_equal(mesh_at(1), mesh_vertices(settings.head.data))
     ops.export_avatar(filepath=tmp_path / "x.ply", format="ply")
     (tmp_path / "shots").mkdir()
     save(tmp_path / "shots/shot.blend")

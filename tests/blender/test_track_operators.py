@@ -16,6 +16,7 @@ from stga_addon.scene import tags
 from stga_addon.scene.arrays import evaluated_vertices
 from stga_addon.tracking.head_model import HeadModel, read_head_model
 
+from .captures import mesh_at
 from .session import failure, open_file, ops, panel, save, viewport
 
 HEAD = HeadModel(small_head(0), "flame")
@@ -32,11 +33,6 @@ def asked(extension, take, out):
     jobs = extension.stga_addon.jobs
     wanted = jobs.track.Track(take / "footage", take / "head.npz", out, landmarks=take / "points")
     jobs.perform.write_request(jobs.perform.request_folder(out), wanted)
-
-
-def mesh_at(frame):
-    bpy.context.scene.frame_set(frame)
-    return evaluated_vertices(panel().head).astype(float)
 
 
 def look_through(cameras):
@@ -77,7 +73,7 @@ def test_the_whole_way_of_the_panel(extension, take, tmp_path, monkeypatch):
     bone.rotation_quaternion = bone.rotation_quaternion @ Quaternion((1, 0, 0), radians(12))
     head.data.shape_keys.key_blocks["expr_001"].value += 0.5
     bpy.context.view_layer.update()
-    posed = evaluated_vertices(head).astype(float)
+    posed = evaluated_vertices(head)
     assert np.abs(posed - before[1]).max() > 0.003
     ops.mark_key()
     assert_allclose(mesh_at(4), before[4], atol=1e-6)  # a key is of its frame alone

@@ -16,7 +16,7 @@ from stga_addon.jobs.table import Kind
 from stga_addon.progress import Progress
 from stga_addon.scene.display.splat_object import evaluated_splats
 
-from .session import failure, open_file, ops, panel, save
+from .session import failure, open_file, ops, panel, save, write_interpreter
 from .test_operators import write_ball_avatar
 
 
@@ -121,8 +121,6 @@ def test_mistakes_of_training_are_sentences(extension, head, tmp_path, monkeypat
 
 def test_a_cancelled_training_that_is_waited_for(head, tmp_path):
     """Catches a cancel told as a failure, and an avatar so far that is not stored."""
-    from .test_analyze_operator import write_interpreter
-
     body = "(FOLDER.parent / 'avatar.npz').touch(); end('cancelled')"
     python = write_interpreter(tmp_path / "python", body)
     ops.train(directory=tmp_path / "run", iterations=2, python=python)
