@@ -1,6 +1,7 @@
 """The picture of the GPU renderer against that of the CPU rasterizer, in the module bpy."""
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -81,6 +82,7 @@ def unembedded(of):
     return SceneLayer(world, WORLD, TURNED)
 
 
+@cache
 def cases():
     size = float(np.ptp(avatar(0).neutral))
     near = look_at((0.3 * size, 0.2 * size, 1.5 * size), (0, 0, 0), 160, 200, 220)

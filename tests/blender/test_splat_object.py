@@ -27,7 +27,7 @@ from stga_addon.scene.display.splat_attributes import (
     avatar_attributes,
     read_attribute,
 )
-from stga_addon.scene.display.splat_nodes import EXTENT, POINTS, QUADS
+from stga_addon.scene.display.splat_nodes import POINTS, QUADS
 from stga_addon.scene.display.splat_object import (
     can_update,
     evaluated_splats,
@@ -344,7 +344,6 @@ def test_quads_face_the_camera_and_cover_the_splat():
     axes = to_world[:3, :3] @ turned * 2 * scale[:, None]
     shapes = [m @ m.transpose(0, 2, 1) for m in (quads[:, :3, :3], axes)]
     assert_allclose(shapes[0], shapes[1], rtol=2e-3, atol=1e-10)
-    assert EXTENT == 3.0
 
 
 def test_selection_grays_out_frozen_splats():
