@@ -5,7 +5,6 @@ FOLDER/own.npz, a head of FLAME, FOLDER/demo, a capture, and FOLDER/anna.mp4, a 
 writes FOLDER/result.json with what was seen, and pictures.
 """
 
-import shutil
 import socket
 import struct
 import subprocess
@@ -29,7 +28,6 @@ FIRST = FOLDER / "first.blend"
 NECK_ANGLE = 0.3
 MOUTH = 0.6
 MINUTES = 0.1
-MAX_MOUTH = 6.0
 FRONT = Quaternion((1.0, 0.0, 0.0), np.pi / 2)
 DISTANCE_M = 0.7
 """How the viewport looks at a head."""
@@ -349,10 +347,7 @@ def drive(head):
     ended.set()
     click(f"Set Neutral, {head}", bpy.ops.stga.calibrate_live)
     shot(f"driven {head}")
-    window, _, region = viewport()
-    x = region.x + region.width // 2
-    y = window.height - region.y - region.height // 2
-    subprocess.run(["xdotool", "mousemove", str(x), str(y)], check=True)
+    point_at_the_head()
     yield 0.5
     subprocess.run(["xdotool", "key", "Escape"], check=True)
     yield lambda: module("operators.drive").session() is None
@@ -566,62 +561,24 @@ def shown():
     return [each for each in bpy.context.scene.objects if each.get(tags.KIND) == tags.SPLATS]
 
 
-def show_again():
-    """Show the avatar twice, look at its sliders, and click on it."""
-    yield opened(FIRST)
-    for _ in range(2):
-        click("Show Avatar", bpy.ops.stga.show_avatar, filepath=chosen().avatar)
-    seen["splat objects"] = len(shown())
-    keys = chosen().head.data.shape_keys.key_blocks
-    names = ("jawOpen", "identity_000")
-    seen["ranges"] = {n: [keys[n].slider_min, keys[n].slider_max] for n in names if n in keys}
-    keys["jawOpen"].value = MAX_MOUTH  # as far as a drag goes
-    seen["dragged"] = keys["jawOpen"].value
-    yield 0.3
-    shot("dragged")
-    parts = (chosen().head, chosen().splats)
-    seen["locked"] = [all((*part.lock_location, *part.lock_rotation)) for part in parts]
-    with in_viewport():
-        bpy.ops.object.select_all(action="DESELECT")
+def point_at_the_head():
+    """Move the mouse to the middle of the viewport."""
     window, _, region = viewport()
     x = region.x + region.width // 2
     y = window.height - region.y - region.height // 2
     subprocess.run(["xdotool", "mousemove", str(x), str(y)], check=True)
+
+
+def click_on_the_head():
+    yield opened(FIRST)
+    with in_viewport():
+        bpy.ops.object.select_all(action="DESELECT")
+    point_at_the_head()
     yield 0.5
     subprocess.run(["xdotool", "click", "1"], check=True)
     yield 1.0
     seen["clicked"] = [thing.type for thing in bpy.context.selected_objects]
     shot("clicked")
-
-
-def second_head():
-    """Import another head beside the first."""
-    yield opened(FIRST)
-    scene = bpy.context.scene
-    settings = lambda: [  # noqa: E731
-        scene.frame_end,
-        scene.render.fps,
-        scene.render.resolution_x,
-        scene.camera.name,
-    ]
-    before = settings()
-    first = chosen().head.parent
-    shutil.copytree(FOLDER / "demo", FOLDER / "ben")
-    click("Import Capture", bpy.ops.stga.import_capture, directory=str(FOLDER / "ben"))
-    yield 1.0
-    seen["settings kept"] = settings() == before
-    second = chosen().head.parent
-    gap = second.matrix_world.translation - first.matrix_world.translation
-    seen["beside"] = gap.length
-    seen["names"] = [first.name, second.name]
-    shot("second head")
-    folders = [chosen().run_folder]
-    with in_viewport():
-        select_only(first)
-    yield lambda: chosen().head.parent == first
-    folders.append(chosen().run_folder)
-    seen["folders"] = len({*folders})
-    shot("first head again")
 
 
 def left_out():
@@ -642,21 +599,7 @@ def left_out():
         options = {option: value for option, value in options.items() if option == "with_engine"}
         click("Show All", getattr(bpy.ops.stga, name.split(".")[1]), **options)
         seen["shows all"].append(what in said and scene.render.engine != engine)
-    cube = bpy.context.view_layer.objects.active
     scene.camera.data.dof.use_dof = False
-    settings = scene.render
-    settings.resolution_y = IMAGE_PX * settings.resolution_y // settings.resolution_x
-    settings.resolution_x = IMAGE_PX
-    scene.cycles.samples = SAMPLES
-    scene.cycles.use_denoising = False
-    pictures = []
-    for how, cube.hide_render in (("whole", False), ("without", True)):
-        path = FOLDER / f"F12 {how}.png"
-        bpy.ops.render.render()
-        bpy.data.images["Render Result"].save_render(str(path))
-        pictures.append(np.array(bpy.data.images.load(str(path)).pixels))
-    seen["mesh in the picture"] = float(np.abs(pictures[0] - pictures[1]).mean())
-    cube.hide_render = False
     scene.render.engine = engine
     bpy.context.preferences.view.render_display_type = "WINDOW"
     with in_viewport():
@@ -666,20 +609,6 @@ def left_out():
     shot("F12 says what it leaves out")
     with bpy.context.temp_override(window=bpy.context.window_manager.windows[-1]):
         bpy.ops.wm.window_close()
-
-
-def motion():
-    """What Apply Motion asks."""
-    yield opened(FIRST)
-    click("Apply Motion", bpy.ops.stga.apply_motion, "INVOKE_DEFAULT", True)
-    yield browser
-    yield 1.0  # for what is asked at its side
-    shot("Apply Motion")
-    window, area = browser()
-    with bpy.context.temp_override(window=window, area=area, region=area.regions[0]):
-        bpy.ops.file.cancel()
-    yield lambda: browser() is None
-    seen["asked by Apply Motion"] = len(module("operators.apply_motion").FIRST_OPTIONS)
 
 
 def without_addon():
@@ -723,7 +652,7 @@ def german():
 
 
 STEPS = """fresh open_demo misunderstand train pose live display pressed duplicate delete append
-render drop disable train_more occupied show_again second_head left_out motion without_addon german
+render drop disable train_more occupied click_on_the_head left_out without_addon german
 quick_look"""
 
 
