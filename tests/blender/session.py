@@ -1,4 +1,4 @@
-"""A session in Blender as tests carry it out: operators, the panel, files, objects."""
+"""A session in Blender as tests carry it out: operators, panel, files, objects, pictures."""
 
 import sys
 from pathlib import Path
@@ -12,7 +12,7 @@ from stga_addon.scene.render.scene_splats import SplatCache, visible_layers
 
 
 class Operator:
-    """One of Blender's that takes paths as well."""
+    """An operator of Blender that takes paths as well."""
 
     def __init__(self, operator):
         self.operator = operator
@@ -26,7 +26,7 @@ class Operator:
 
 
 class Operators:
-    """Those of the extension."""
+    """`bpy.ops.stga`, of such operators."""
 
     def __getattr__(self, name):
         return Operator(getattr(bpy.ops.stga, name))
@@ -41,7 +41,7 @@ def failure(sentence):
 
 
 def panel():
-    """What the panel holds: the settings of the scene."""
+    """The settings of the scene, which the panel shows."""
     return bpy.context.scene.stga
 
 
@@ -84,7 +84,8 @@ def point_clouds():
 
 
 def picture(path, engine, size_px=None, samples=1):
-    """(H, W, 4) 0 to 255 of the scene by an engine, without noise that denoising would take."""
+    """(H, W, 4) 0 to 255 of the scene by an engine, square where a size is given; not denoised,
+    which not every build of Blender can."""
     scene = bpy.context.scene
     scene.render.engine = engine
     if size_px is not None:
