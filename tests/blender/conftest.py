@@ -20,7 +20,7 @@ collect_ignore_glob = [] if importlib.util.find_spec("bpy") else ["test_*.py"]
 if not collect_ignore_glob:
     import bpy
 
-    from .session import ops, panel, write_interpreter
+    from .session import CHECKOUT, ops, panel, write_interpreter
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -58,16 +58,15 @@ def extension():
     Its kernels are those of `stga_addon`: under another name they would be compiled again, which
     takes a minute.
     """
-    name = "stga_checkout"
     if not missing_packages():
         kernels = importlib.import_module("stga_addon.raster.cpu")
-        sys.modules[f"{name}.{kernels.__name__}"] = kernels
+        sys.modules[f"{CHECKOUT}.{kernels.__name__}"] = kernels
         for _, part, _ in pkgutil.iter_modules(kernels.__path__, f"{kernels.__name__}."):
-            sys.modules[f"{name}.{part}"] = importlib.import_module(part)
+            sys.modules[f"{CHECKOUT}.{part}"] = importlib.import_module(part)
     spec = importlib.util.spec_from_file_location(
-        name, ROOT / "__init__.py", submodule_search_locations=[str(ROOT)]
+        CHECKOUT, ROOT / "__init__.py", submodule_search_locations=[str(ROOT)]
     )
-    module = sys.modules[name] = importlib.util.module_from_spec(spec)
+    module = sys.modules[CHECKOUT] = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     module.register()
     yield module

@@ -10,6 +10,9 @@ from PIL import Image
 
 from stga_addon.scene.render.scene_splats import SplatCache, visible_layers
 
+CHECKOUT = "stga_checkout"
+"""The package that the checkout is as an extension."""
+
 
 class Operator:
     """An operator of Blender that takes paths as well."""
@@ -43,6 +46,12 @@ def failure(sentence):
 def panel():
     """The settings of the scene, which the panel shows."""
     return bpy.context.scene.stga
+
+
+def state_of(kind):
+    """How a request of the scene stands."""
+    monitor = sys.modules[f"{CHECKOUT}.operators.monitor"]
+    return monitor.state_of(bpy.context.scene, kind)
 
 
 def save(path, **options):

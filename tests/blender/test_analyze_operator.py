@@ -4,14 +4,13 @@ import json
 import re
 import time
 
-import bpy
 import pytest
 
 from stga_addon.jobs.table import Kind
 from stga_addon.training.run.folder import read_run
 from stga_addon.training.settings import PRESETS
 
-from .session import failure, ops, panel
+from .session import failure, ops, panel, state_of
 
 
 @pytest.fixture
@@ -27,8 +26,8 @@ def test_effect_choices(chosen, extension, tmp_path):
     row.choice = "on"
     with failure(r"jaw=on: .* no parameters of FLAME"):
         ops.analyze_capture()
-    assert error_of(extension, Kind.ANALYSIS).startswith("jaw=on: ")
-    assert "Traceback" not in error_of(extension, Kind.ANALYSIS)
+    assert state_of(Kind.ANALYSIS).error.startswith("jaw=on: ")
+    assert "Traceback" not in state_of(Kind.ANALYSIS).error
     chosen.preset_timing = '{"draft": 1}'
     chosen.head = chosen.head
     assert not chosen.effects
@@ -71,14 +70,10 @@ def analyze(extension, monkeypatch, stand_in):
     extension.operators.monitor._close()
 
 
-def error_of(extension, kind):
-    return extension.operators.monitor.state_of(bpy.context.scene, kind).error
-
-
 def tick_until_done(extension, kind=Kind.ANALYSIS):
     for _ in range(300):
         extension.operators.monitor.tick()
-        if not extension.operators.monitor.state_of(bpy.context.scene, kind).is_running:
+        if not state_of(kind).is_running:
             return
         time.sleep(0.02)
     raise AssertionError("the analysis did not end")
@@ -99,7 +94,7 @@ def test_failed_analysis_is_a_sentence(chosen, extension, analyze, body, sentenc
     chosen.effects.add().name = "jaw"
     analyze(body)
     tick_until_done(extension)
-    assert re.match(sentence, error_of(extension, Kind.ANALYSIS))
+    assert re.match(sentence, state_of(Kind.ANALYSIS).error)
     assert extension.operators.monitor.tick() is None
 
 
@@ -113,7 +108,7 @@ def test_analysis_can_be_cancelled(chosen, extension, analyze, monkeypatch, tmp_
     assert time.monotonic() - begin < 60
     assert ops.analyze_capture.poll()
     assert extension.operators.monitor.tick() is None
-    assert error_of(extension, Kind.ANALYSIS) == ""
+    assert state_of(Kind.ANALYSIS).error == ""
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
     python = str(tmp_path / "none")
     monkeypatch.setattr(extension.operators.train, "training_python", lambda context: python)

@@ -13,8 +13,8 @@ from stga_addon.jobs.table import Kind
 from stga_addon.scene.display.splat_attributes import read_attribute
 from stga_addon.training.run.folder import read_run
 
-from .session import failure, ops, panel, write_interpreter
-from .test_analyze_operator import error_of, tick_until_done
+from .session import failure, ops, panel, state_of, write_interpreter
+from .test_analyze_operator import tick_until_done
 from .test_operators import write_ball_run
 
 
@@ -73,9 +73,9 @@ def test_the_panel_stays_at_the_run_until_another_continues_it(
     for state, body in ends.items():
         python = write_interpreter(tmp_path / "python", body)
         ops.refine(directory=settings.run_folder, group="cheek", python=python)
-        monitor._processes[monitor.state_of(bpy.context.scene, Kind.TRAINING).folder].wait(60)
+        monitor._processes[state_of(Kind.TRAINING).folder].wait(60)
         tick_until_done(extension, Kind.TRAINING)
-        assert monitor.state_of(bpy.context.scene, Kind.TRAINING).snapshot.state == state
+        assert state_of(Kind.TRAINING).snapshot.state == state
         new = settings.training_run if state == "finished" else str(run)
         assert (settings.run_folder, settings.avatar) == (new, f"{new}/avatar.npz")
 
@@ -139,7 +139,7 @@ def test_what_an_extension_would_train_is_selected(head, run, extension, stand_i
     stand_in("end('failed', 'no such run')")
     with failure("no such run"):
         ops.select_extension(directory=run)
-    assert error_of(extension, Kind.SELECTION) == "no such run"
+    assert state_of(Kind.SELECTION).error == "no such run"
 
 
 def test_selection_of_another_head_or_cancelled_changes_nothing(
@@ -163,7 +163,7 @@ def test_selection_of_another_head_or_cancelled_changes_nothing(
     ops.import_capture(directory=write_mesh_capture(tmp_path / "other"))
     (tmp_path / "go").touch()
     tick_until_done(extension, Kind.SELECTION)
-    assert error_of(extension, Kind.SELECTION).endswith("its head is no longer that of the scene")
+    assert state_of(Kind.SELECTION).error.endswith("its head is no longer that of the scene")
     assert "stga_0" not in head.vertex_groups
     assert "stga_0" not in settings.head.vertex_groups
     assert not any(temporary.iterdir())
@@ -181,21 +181,20 @@ def test_selection_waits_for_the_end_of_edit_mode(
     state = RequestState(Kind.SELECTION, error="of last time")
     monitor._states[bpy.context.scene.session_uid, Kind.SELECTION] = state
     ops.select_extension(directory=run)
-    assert error_of(extension, Kind.SELECTION) == ""
-    state = monitor.state_of(bpy.context.scene, Kind.SELECTION)
-    monitor._processes[state.folder].wait(60)
+    assert state_of(Kind.SELECTION).error == ""
+    monitor._processes[state_of(Kind.SELECTION).folder].wait(60)
     assert monitor.tick() is not None
-    assert monitor.state_of(bpy.context.scene, Kind.SELECTION).loading is not None
+    assert state_of(Kind.SELECTION).loading is not None
     assert "stga_0" not in head.vertex_groups
     bpy.ops.object.mode_set(mode="OBJECT")
     tick_until_done(extension, Kind.SELECTION)
-    assert error_of(extension, Kind.SELECTION) == ""
+    assert state_of(Kind.SELECTION).error == ""
     assert extension.stga_addon.scene.vertex_groups.read_selection(head)[0].all()
     bpy.ops.object.mode_set(mode="EDIT")
     stand_in("end('failed', 'no such run')")
     ops.select_extension(directory=run)
     tick_until_done(extension, Kind.SELECTION)
-    assert error_of(extension, Kind.SELECTION) == "no such run"
+    assert state_of(Kind.SELECTION).error == "no such run"
     bpy.ops.object.mode_set(mode="OBJECT")
 
 

@@ -28,7 +28,7 @@ from stga_addon.training.run.folder import Run, write_run
 from stga_addon.training.settings import make_settings
 
 from .captures import mesh_at
-from .session import open_file, ops, panel, reopen, save
+from .session import open_file, ops, panel, reopen, save, state_of
 from .test_operators import expected_world, show_ball, write_ball_avatar, write_ball_run
 from .test_train_operators import tick_until
 
@@ -98,7 +98,7 @@ def test_a_result_whose_head_is_gone_reaches_no_other(extension, worker, ben, he
     assert not splat_objects()
     assert not settings.head.hide_render
     assert settings.avatar == str(avatar)
-    error = extension.operators.monitor.state_of(bpy.context.scene, Kind.TRAINING).error
+    error = state_of(Kind.TRAINING).error
     assert error.endswith("is no longer in the scene; choose a head, then Show Avatar")
 
 
@@ -143,7 +143,7 @@ def test_a_run_that_was_cancelled_early_replaces_nothing(
     assert len(shown.data.vertices) == count
     avatar = end(worker, iterations, cancel=True)
     tick_until(monitor, lambda: settings.result_shown)
-    error = monitor.state_of(bpy.context.scene, Kind.TRAINING).error
+    error = state_of(Kind.TRAINING).error
     assert splat_objects() == [shown]
     is_kept = iterations < 300
     assert (len(shown.data.vertices) == count) == is_kept

@@ -16,7 +16,7 @@ from stga_addon.jobs.table import Kind
 from stga_addon.progress import Progress
 from stga_addon.scene.display.splat_object import evaluated_splats
 
-from .session import failure, open_file, ops, panel, save, write_interpreter
+from .session import failure, open_file, ops, panel, save, state_of, write_interpreter
 from .test_operators import write_ball_avatar
 
 
@@ -241,11 +241,11 @@ def test_moved_blend_file(extension, worker, tmp_path):
     moved.mkdir()
     (tmp_path / "run").rename(moved / "run")
     save(moved / "head.blend")
-    assert monitor.state_of(bpy.context.scene, Kind.TRAINING).place == moved / "run"
+    assert state_of(Kind.TRAINING).place == moved / "run"
     tick_until(monitor, lambda: panel().result_shown)
     (moved / "run").rename(moved / "gone")
-    assert monitor.state_of(bpy.context.scene, Kind.TRAINING).snapshot.state == "none"
-    assert monitor.state_of(bpy.context.scene, Kind.TRAINING).place == tmp_path / "run"
+    assert state_of(Kind.TRAINING).snapshot.state == "none"
+    assert state_of(Kind.TRAINING).place == tmp_path / "run"
     ops.dismiss(request="training")
 
 
