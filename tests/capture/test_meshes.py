@@ -20,7 +20,6 @@ from stga_addon.capture.meshes import (
     cached_meshes,
     find_region,
     read_mesh,
-    read_regions,
     tracked_meshes,
 )
 from stga_addon.files import write_npz
@@ -43,15 +42,6 @@ def test_order_is_kept(tmp_path, suffix):
     assert_allclose(read, vertices, atol=1e-7)
     assert_array_equal(triangles, faces)
     assert (read.dtype, triangles.dtype) == (np.float64, np.int32)
-
-
-def test_obj_as_trimesh_reads_it(shared_data):
-    """Catches an error of the OBJ parser, against trimesh on a real tracked mesh."""
-    path = shared_data / "studio_head/meshes/00003.obj"
-    reference = trimesh.load(path, process=False, maintain_order=True)
-    vertices, faces = read_mesh(path)
-    assert_array_equal(vertices, reference.vertices)
-    assert_array_equal(faces, reference.faces)
 
 
 def test_obj_dialects(tmp_path):
@@ -214,15 +204,6 @@ def test_meshes_are_kept_within_bounds():
     assert calls == [0, 1, 2, 3, 0]
     with pytest.raises(ValueError, match="read-only"):
         mesh(0)[0] = 1
-
-
-def test_region_holds_triangles_with_all_corners_in_it(tmp_path):
-    """Catches a region that takes triangles with one or two corners in it."""
-    path = tmp_path / "regions.json"
-    path.write_text(json.dumps({"nose": [2, 1, 0], "none": []}))
-    regions = read_regions(path, np.array([[0, 1, 2], [1, 2, 3]]), 4)
-    assert regions["nose"].tolist() == [True, False]
-    assert regions["none"].tolist() == [False, False]
 
 
 def test_procrustes_as_scipy_has_it():

@@ -62,16 +62,6 @@ def test_round_trip_is_exact(tmp_path, count, sh_degree):
         assert_array_equal(getattr(back, name), want, err_msg=name)
 
 
-def test_real_file_is_rewritten_byte_for_byte(shared_data, tmp_path):
-    """Catches any departure from the layout that the original trainer writes."""
-    source = shared_data / "real_splats" / "train-1000.ply"
-    splats = read_ply(source)
-    assert len(splats) == 1000
-    assert splats.sh_degree == 3
-    write_ply(tmp_path / "again.ply", splats)
-    assert (tmp_path / "again.ply").read_bytes() == source.read_bytes()
-
-
 def test_file_is_the_standard_layout(tmp_path):
     """Catches column order and channel-major f_rest, read back by plain arithmetic on the bytes,
     and a header that only our own reader understands."""
