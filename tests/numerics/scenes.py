@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import torch
+from numpy.testing import assert_allclose
 from raster import reference
 from raster.test_kernels import (
     NAMES,
@@ -136,15 +137,13 @@ def assert_close(errors, image, gradient):
     assert not bad, bad
 
 
-__all__ = [
-    "NAMES",
-    "Scene",
-    "assert_close",
-    "compare",
-    "facing",
-    "kernel_gradients",
-    "random_cotangents",
-    "reference_gradients",
-    "rows",
-    "steady_pixels",
-]
+def assert_agree(found, expected, image=5e-6, gradient=2e-5):
+    """Images and gradients are the expected ones; image: absolute tolerance, relative to the
+    largest above one; gradient: over the largest of the quantity."""
+    (images, gradients), (expected_images, expected_gradients) = found, expected
+    assert expected_images[1].max() > 0.3
+    for one, want in zip(images, expected_images, strict=True):
+        assert_allclose(one, want, atol=image * max(1, want.max()))
+    for name, want in expected_gradients.items():
+        largest = np.abs(want).max()
+        assert_allclose(gradients[name], want, atol=gradient * largest, err_msg=name)

@@ -14,7 +14,14 @@ from stga_addon.capture.camera import Camera
 from stga_addon.flame.quaternions import from_matrices
 
 from .meshes import DEGENERATE, WHOLE, mesh_of
-from .scenes import NAMES, Scene, kernel_gradients, random_cotangents, reference_gradients
+from .scenes import (
+    NAMES,
+    Scene,
+    assert_agree,
+    kernel_gradients,
+    random_cotangents,
+    reference_gradients,
+)
 
 FACES = np.array([[0, 1, 2]])
 
@@ -31,32 +38,20 @@ def assert_proper(rotation):
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 @pytest.mark.parametrize("name", DEGENERATE)
 @pytest.mark.parametrize("convention", CONVENTIONS)
-def test_a_line_in_the_neutral_mesh_does_not_grow(convention, name, dtype):
-    """Catches a ratio of areas whose denominator is rounding: three corners on a line, in float32
-    as in a file, have 1e-13 m², and when the triangle opens its splats would be rendered 20,000
-    times too large, a hundred meters away."""
-    neutral = DEGENERATE[name].astype(dtype).astype(float)
-    splats = lattice_splats(neutral, FACES, convention=convention)
-    frames = face_frames(WHOLE, FACES, neutral, convention)
+@pytest.mark.parametrize(("collapses", "largest"), [("posed", 0.02), ("neutral", 0.04)])
+def test_a_triangle_that_collapses_keeps_its_splats(collapses, largest, convention, name, dtype):
+    """Catches an improper rotation, splats that leave the triangle, an inverse that divides by a
+    zero scale, and, of a line in the neutral mesh, a ratio of areas whose denominator is rounding:
+    three corners on a line, in float32 as in a file, have 1e-13 m², and when the triangle opens its
+    splats would be rendered 20,000 times too large, a hundred meters away."""
+    meshes = {"posed": WHOLE, "neutral": WHOLE}
+    meshes[collapses] = DEGENERATE[name].astype(dtype).astype(float)
+    splats = lattice_splats(meshes["neutral"], FACES, convention=convention)
+    frames = face_frames(meshes["posed"], FACES, meshes["neutral"], convention)
     assert_proper(frames.rotation)
     world = to_world(splats, frames)
-    assert norm(world.xyz - frames.origin, axis=1).max() < 0.04
+    assert norm(world.xyz - frames.origin, axis=1).max() < largest
     assert np.exp(world.log_scale).max() < 0.02
-    for field in ("xyz", "rotation", "log_scale"):
-        assert np.isfinite(getattr(world, field)).all(), field
-
-
-@pytest.mark.parametrize("name", DEGENERATE)
-@pytest.mark.parametrize("convention", CONVENTIONS)
-def test_a_triangle_that_collapses_in_one_frame(convention, name):
-    """Catches an improper rotation, splats that leave the triangle, and an inverse that divides by
-    a zero scale."""
-    splats = lattice_splats(WHOLE, FACES, convention=convention)
-    posed = DEGENERATE[name].astype(np.float32).astype(float)
-    frames = face_frames(posed, FACES, WHOLE, convention)
-    assert_proper(frames.rotation)
-    world = to_world(splats, frames)
-    assert norm(world.xyz - frames.origin, axis=1).max() < 0.02
     back = to_local(world, frames, splats.face)
     for field in ("xyz", "rotation", "log_scale"):
         assert np.isfinite(getattr(world, field)).all(), field
@@ -97,15 +92,9 @@ def test_collapsed_triangles_render_and_train_in_float32():
         pose[:3, 3] = [-0.09, -0.09, 0.5]
         scene = Scene(values, Camera(40, 40, 80.0, 80.0, 20.0, 20.0, pose), 1)
         cotangents = random_cotangents(scene.camera)
-        images, gradients = kernel_gradients(scene, cotangents, frames, splats.face)
+        found = kernel_gradients(scene, cotangents, frames, splats.face)
         frames.scale[:] = np.maximum(frames.scale, 1e-30)  # the reference wants its logarithm
-        expected_images, expected = reference_gradients(scene, cotangents, frames, splats.face)
-        assert expected_images[1].max() > 0.3
-        for image, want in zip(images, expected_images, strict=True):
-            assert_allclose(image, want, atol=5e-6)
-        for name, want in expected.items():
-            largest = np.abs(want).max()
-            assert_allclose(gradients[name], want, atol=2e-5 * largest, err_msg=name)
+        assert_agree(found, reference_gradients(scene, cotangents, frames, splats.face))
 
 
 def test_quaternions_near_half_turns_from_float32_matrices():

@@ -17,9 +17,7 @@ from numpy.testing import assert_allclose
 from raster import reference
 from stga_addon.capture.camera import Camera
 from stga_addon.raster.cpu.autograd import render_differentiable
-from stga_addon.raster.cpu.layout import (
-    Parameters,
-)
+from stga_addon.raster.cpu.layout import Parameters
 
 from .test_kernels import NAMES
 
@@ -28,37 +26,12 @@ CAMERA = Camera(*DATA["size"].tolist(), *DATA["intrinsics"].tolist(), DATA["worl
 TOLERANCE = 2e-5  # of float32 kernels, and of gsplat's images in shared data, which are float32
 
 
-def splats(dtype):
-    return [torch.from_numpy(DATA[name]).to(dtype) for name in NAMES]
-
-
-def conics(covariance):
-    """Inverse of 2D covariances (N, 2, 2) as gsplat stores it: xx, xy, yy."""
-    inverse = np.linalg.inv(covariance)
-    return np.stack([inverse[:, 0, 0], inverse[:, 0, 1], inverse[:, 1, 1]], axis=-1)
-
-
-def test_reference_stages_are_gsplats():
-    """Catches a difference of convention in one stage: axes, pixel centers, low-pass, harmonics'
-    signs, compensation."""
-    xyz, rotation, log_scale, _, sh = splats(torch.float64)
-    center, covariance, depth, compensation = reference.project(xyz, rotation, log_scale, CAMERA)
-    color = reference.sh_color(sh, xyz - torch.from_numpy(CAMERA.position), 3)
-    found = {
-        "means2d": center,
-        "conics": conics(covariance.numpy()),
-        "depths": depth,
-        "compensations": compensation,
-        "colors": color,
-    }
-    for name, values in found.items():
-        assert_allclose(values, DATA[name], rtol=1e-6, atol=1e-6, err_msg=name)
-
-
 @pytest.mark.parametrize("antialiased", [False, True])
 def test_reference_image_is_gsplats(antialiased):
-    """Catches a wrong density, cut or blending order."""
-    rgb, alpha, _ = reference.render(*splats(torch.float64), CAMERA, antialiased=antialiased)
+    """Catches a difference of convention, axes, pixel centers, low-pass, harmonics' signs or
+    compensation, and a wrong density, cut or blending order."""
+    splats = (torch.from_numpy(DATA[name]).double() for name in NAMES)
+    rgb, alpha, _ = reference.render(*splats, CAMERA, antialiased=antialiased)
     kind = "antialiased" if antialiased else "classic"
     assert_allclose(rgb, DATA[f"image_{kind}"], atol=1e-6)
     assert_allclose(alpha, DATA[f"alpha_{kind}"], atol=1e-6)

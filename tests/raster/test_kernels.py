@@ -170,35 +170,37 @@ def assert_gradients_agree(gradients, expected):
         assert error < GRADIENT_TOLERANCE[name], f"{name}: {error:.2e} of {largest:.2e}"
 
 
+def assert_reference_agrees(scene, *given, **options):
+    """The kernels' images, which are the reference's, as their gradients are."""
+    images, gradients = kernel_gradients(scene, *given, **options)
+    expected_images, expected_gradients = reference_gradients(scene, *given, **options)
+    assert_images_agree(images, expected_images)
+    assert_gradients_agree(gradients, expected_gradients)
+    return images
+
+
 @pytest.mark.parametrize("name", SCENES)
 def test_image_and_gradients_are_the_references(back_end, name):
     """Catches any error in projection, harmonics, tile bounds, blending or their derivatives, one
     scene a trap."""
-    scene = SCENES[name]
-    cotangents = random_cotangents(scene.camera)
-    images, gradients = kernel_gradients(scene, cotangents)
-    expected_images, expected_gradients = reference_gradients(scene, cotangents)
-    assert any(image.any() for image in expected_images), "the scene shows nothing"
-    assert_images_agree(images, expected_images)
-    assert_gradients_agree(gradients, expected_gradients)
+    images = assert_reference_agrees(SCENES[name], random_cotangents(SCENES[name].camera))
+    assert any(image.any() for image in images), "the scene shows nothing"
 
 
 @pytest.mark.parametrize("convention", ["stga", "gaussian_avatars"])
 def test_embedded_splats_render_and_train_in_their_frames(back_end, convention):
-    """Catches a kernel that turns, scales or differentiates in the wrong frame."""
-    scene = cloud(1)
+    """Catches a kernel that turns, scales or differentiates in the wrong frame, color of the wrong
+    triangle or in the wrong unit, and a gradient that misses the clamp."""
+    scene = SCENES["dark"]
     rng = default_rng(30)
     vertices = rng.normal(size=(12, 3)) * 0.6
     faces = rng.permuted(np.tile(np.arange(12), (9, 1)), axis=1)[:, :3]
     neutral = vertices + rng.normal(size=vertices.shape) * 0.2
-    frames = face_frames(vertices, faces, neutral, convention)
+    color = rng.normal(0, 0.3, (len(faces), 3)).astype(np.float32)
+    frames = replace(face_frames(vertices, faces, neutral, convention), color=color)
     face = rng.integers(0, len(faces), len(scene.splats["xyz"])).astype(np.int32)
-    scene.splats["xyz"] *= 0.3
-    given = scene, random_cotangents(scene.camera, 2), frames, face
-    images, gradients = kernel_gradients(*given)
-    expected_images, expected = reference_gradients(*given)
-    assert_images_agree(images, expected_images)
-    assert_gradients_agree(gradients, expected)
+    scene = replace(scene, splats=scene.splats | {"xyz": 0.3 * scene.splats["xyz"]})
+    assert_reference_agrees(scene, random_cotangents(scene.camera, 2), frames, face)
 
 
 def raw_gradients(scene, fill=0.0, buffers=None, **options):
@@ -262,25 +264,6 @@ def test_screen_gradient_is_that_of_the_projected_center():
     assert_allclose(screen[rows], expected[rows], atol=GRADIENT_TOLERANCE["xyz"] * expected.max())
 
 
-def test_color_is_added_with_the_right_gradient(back_end):
-    """Catches color of the wrong triangle or in the wrong unit, and a gradient that misses the
-    clamp."""
-    scene = SCENES["dark"]
-    rng = default_rng(31)
-    count = len(scene.splats["xyz"])
-    neutral = rng.normal(size=(9, 3))
-    faces = rng.permuted(np.tile(np.arange(9), (7, 1)), axis=1)[:, :3]
-    posed = neutral + 0.1 * rng.normal(size=neutral.shape)
-    color = rng.normal(0, 0.3, (len(faces), 3)).astype(np.float32)
-    frames = replace(face_frames(posed, faces, neutral), color=color)
-    face = rng.integers(0, len(faces), count).astype(np.int32)
-    given = scene, random_cotangents(scene.camera, 5), frames, face
-    images, gradients = kernel_gradients(*given)
-    expected_images, expected = reference_gradients(*given)
-    assert_images_agree(images, expected_images)
-    assert_gradients_agree(gradients, {"sh": expected["sh"]})
-
-
 @pytest.mark.parametrize(
     "name", ["plain", "smaller than a pixel", "needles", "around the camera", "degree 1"]
 )
@@ -288,13 +271,10 @@ def test_antialiasing_takes_what_the_low_pass_adds(back_end, name):
     """Catches a compensation of the wrong determinant, and gradients that leave it out: scale,
     rotation, position."""
     scene = SCENES[name]
-    cotangents = random_cotangents(SCENES[name].camera, 6)
-    images, gradients = kernel_gradients(scene, cotangents, antialiased=True)
-    expected_images, expected = reference_gradients(scene, cotangents, antialiased=True)
+    cotangents = random_cotangents(scene.camera, 6)
+    images = assert_reference_agrees(scene, cotangents, antialiased=True)
     plain, _ = kernel_gradients(scene, cotangents)
     assert np.abs(plain[1] - images[1]).max() > 0.01, "antialiasing changes nothing"
-    assert_images_agree(images, expected_images)
-    assert_gradients_agree(gradients, expected)
 
 
 @pytest.mark.parametrize("count", [80, 900])
