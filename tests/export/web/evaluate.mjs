@@ -15,7 +15,6 @@ try {
   const camera = header.views[0]?.world_to_camera ?? [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1];
   const texels = new Float32Array(FACE_FLOATS * frames.count);
   const results = [];
-  const { signals } = frames;
   for (let frame = 0; frame < motion.frames; frame++) {
     motion.sample(frame);
     frames.update(rig.pose(motion));
@@ -25,9 +24,6 @@ try {
     results.push({
       vertices: Array.from(rig.vertices),
       frames: Array.from(frames.world),
-      strain: Array.from(signals.smoothed_strain?.strain.values ?? []),
-      smoothed: Array.from(signals.smoothed_strain?.values ?? []),
-      normal: Array.from(signals.normal?.values ?? []),
       texels: Array.from(texels),
       order: Array.from(order),
     });
