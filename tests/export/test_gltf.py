@@ -2,17 +2,17 @@
 
 import json
 import os
-import struct
-import subprocess
 from pathlib import Path
 
 import numpy as np
 import pytest
 import trimesh
 from avatar.conftest import random_splats, rendered, world_splats
+from blender.zips import output_of
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy.spatial.transform import Rotation
 
+from export.web.web_data import accessor, document_of
 from stga_addon.avatar.embedding import to_world
 from stga_addon.avatar.splats import SH_C0
 from stga_addon.export.formats import export_avatar
@@ -20,36 +20,18 @@ from stga_addon.export.formats import export_avatar
 PREFIX = "KHR_gaussian_splatting:"
 SHAPES = {"ROTATION": "VEC4", "SCALE": "VEC3", "OPACITY": "SCALAR"}
 FLOAT = 5126
-UNSIGNED_BYTE = 5121
-COMPONENTS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
 
 
 def parsed(path):
     """The document and the only primitive's attributes; checks the container."""
-    data = path.read_bytes()
-    magic, version, length, size, kind = struct.unpack("<4sIII4s", data[:20])
-    assert (magic, version, length, kind) == (b"glTF", 2, len(data), b"JSON")
-    assert size % 4 == 0
-    document = json.loads(data[20 : 20 + size])
-    binary_size, kind = struct.unpack("<I4s", data[20 + size : 28 + size])
-    assert kind == b"BIN\0"
-    assert binary_size % 4 == 0
-    assert binary_size == document["buffers"][0]["byteLength"] == len(data) - 28 - size
-    binary = data[28 + size :]
-    primitive = document["meshes"][0]["primitives"][0]
-    attributes = primitive["attributes"].items()
-    return document, {name: column(document, binary, index) for name, index in attributes}
-
-
-def column(document, binary, index):
-    accessor = document["accessors"][index]
-    view = document["bufferViews"][accessor["bufferView"]]
-    width = COMPONENTS[accessor["type"]]
-    dtype = np.dtype({FLOAT: "<f4", UNSIGNED_BYTE: "u1"}[accessor["componentType"]])
-    assert view["byteOffset"] % 4 == 0
-    assert view["byteLength"] == accessor["count"] * width * dtype.itemsize
-    flat = np.frombuffer(binary, dtype, accessor["count"] * width, view["byteOffset"])
-    return flat.reshape(-1, width)
+    document, binary = document_of(path.read_bytes())
+    assert len(binary) == document["buffers"][0]["byteLength"]
+    places = [view["byteOffset"] for view in document["bufferViews"]]
+    ends = [view["byteOffset"] + view["byteLength"] for view in document["bufferViews"]]
+    assert [*places, len(binary)] == [0, *ends]
+    assert not np.mod([*places, len(binary)], 4).any()
+    attributes = document["meshes"][0]["primitives"][0]["attributes"].items()
+    return document, {name: accessor(document, binary, index) for name, index in attributes}
 
 
 def harmonic_names(degree):
@@ -80,8 +62,8 @@ def test_keeps_the_specification(avatar, tmp_path, degree):
     expected = {PREFIX + name: kind for name, kind in (SHAPES | coefficients).items()}
     assert set(attributes) == {"POSITION", "COLOR_0", *expected}
     for name, kind in expected.items():
-        accessor = document["accessors"][primitive["attributes"][name]]
-        assert (accessor["type"], accessor["componentType"], accessor["count"]) == (kind, FLOAT, 50)
+        found = document["accessors"][primitive["attributes"][name]]
+        assert (found["type"], found["componentType"], found["count"]) == (kind, FLOAT, 50)
     position = document["accessors"][primitive["attributes"]["POSITION"]]
     assert_array_equal(position["min"], attributes["POSITION"].min(axis=0))
     assert_array_equal(position["max"], attributes["POSITION"].max(axis=0))
@@ -147,10 +129,7 @@ def test_three_reads_it(avatar, tmp_path):
     export_avatar(tmp_path / "a.glb", avatar, "gltf", [(0, avatar.neutral)])
     script = tmp_path / "load.mjs"
     script.write_text(LOAD)
-    run = ["node", str(script), str(modules.absolute()), str(tmp_path / "a.glb")]
-    done = subprocess.run(run, capture_output=True, text=True, timeout=60)
-    assert done.returncode == 0, done.stderr
-    found = json.loads(done.stdout)
+    found = json.loads(output_of(["node", script, modules.absolute(), tmp_path / "a.glb"]))
     world = to_world(avatar.splats, avatar.frames(avatar.neutral))
     assert found["extension"]["kernel"] == "ellipse"
     assert_allclose(np.reshape(found["position"], (-1, 3)), world.xyz)

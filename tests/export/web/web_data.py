@@ -36,6 +36,8 @@ def document_of(data):
     """Document and binary chunk of a .glb."""
     magic, version, length, size, kind = struct.unpack_from("<4sIII4s", data)
     assert (magic, version, length, kind) == (b"glTF", 2, len(data), b"JSON")
+    assert struct.unpack_from("<I4s", data, 20 + size) == (len(data) - 28 - size, b"BIN\0")
+    assert size % 4 == 0
     return json.loads(data[20 : 20 + size]), data[28 + size :]
 
 
