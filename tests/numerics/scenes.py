@@ -48,24 +48,18 @@ def steady_pixels(scene, margin=1e-3):
     They are alpha at 1/255 and at the clamp 0.999, and transmittance at the stop 1e-4. On which
     side a float32 lies there is chance, and both sides are right.
     """
-    tensors = [torch.from_numpy(scene.splats[name]).double() for name in NAMES]
-    xyz, rotation, log_scale, opacity, _ = tensors
-    z = reference.camera_space(xyz, scene.camera)[:, 2]
-    order = torch.argsort(z, stable=True)
-    order = order[z[order] >= 0.0099]
-    center, projected, _, _ = reference.project(
-        xyz[order], rotation[order], log_scale[order], scene.camera
-    )
+    *placed, opacity, _ = (torch.from_numpy(scene.splats[name]).double() for name in NAMES)
+
+    def alphas(factor):
+        """With the cut-offs moved, by making each splat a little more or less opaque."""
+        return reference.layers(*placed, factor * torch.sigmoid(opacity), scene.camera, 0.0099)[1]
+
     shape = (scene.camera.height, scene.camera.width)
     steady = torch.ones(shape, dtype=torch.bool)
     transmittance = torch.ones(shape, dtype=torch.float64)
     running = torch.ones(shape, dtype=torch.bool)
-    # The same with the cut-offs moved by the margin, by making each splat a little more or less
-    # opaque.
-    logit = torch.sigmoid(opacity[order])
-    kept = reference.splat_alpha(center, projected, logit, scene.camera)
-    for other in (logit * (1 - margin), logit * (1 + margin)):
-        moved = reference.splat_alpha(center, projected, other, scene.camera)
+    kept = alphas(1)
+    for moved in (alphas(1 - margin), alphas(1 + margin)):
         steady &= (((moved > 0) == (kept > 0)) & ((moved < 0.999) == (kept < 0.999))).all(0)
     for alpha in kept:
         after = transmittance * (1 - alpha)

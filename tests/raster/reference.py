@@ -2,8 +2,8 @@
 tested.
 
 Any dtype, gradients by autograd. Small scenes only: every splat is evaluated at every pixel.
-Stages: `embed` (triangles to world space), `project`, `sh_color`, `splat_alpha` and `blend`, which
-`render` chains, and `image_loss`.
+Stages: `embed` (triangles to world space), `layers` (by `project` and `splat_alpha`), `sh_color`
+and `blend`, which `render` chains, and `image_loss`.
 """
 
 from math import pi, sqrt
@@ -32,18 +32,29 @@ def render(
     filter). Splats closer than `near` are dropped; the rest are blended front to back by z, in
     input order where z ties. (3D Gaussian Splatting, sections 4 to 6, with gsplat's constants.)
     """
+    placed = xyz, rotation, log_scale, torch.sigmoid(opacity)
+    order, alpha, depth = layers(*placed, camera, near, antialiased)
+    position = torch.as_tensor(camera.position, dtype=xyz.dtype, device=xyz.device)
+    return blend(alpha, sh_color(sh[order], xyz[order] - position, sh_degree), depth)
+
+
+def layers(
+    xyz, rotation, log_scale, opacity, camera, near=NEAR_M, antialiased=False, moved_px=None
+):
+    """The splats of `render` front to back: their numbers, alpha (N, H, W) and depth (N,).
+
+    opacity (N,) 0 to 1; moved_px (N, 2): added to the projected centers.
+    """
     z = camera_space(xyz, camera)[:, 2].detach()
     order = torch.argsort(z, stable=True)
     order = order[z[order] >= near]
     center, covariance, depth, compensation = project(
         xyz[order], rotation[order], log_scale[order], camera
     )
-    position = torch.as_tensor(camera.position, dtype=xyz.dtype, device=xyz.device)
-    visible = torch.sigmoid(opacity[order])
-    if antialiased:
-        visible = visible * compensation
-    alpha = splat_alpha(center, covariance, visible, camera)
-    return blend(alpha, sh_color(sh[order], xyz[order] - position, sh_degree), depth)
+    if moved_px is not None:
+        center = center + moved_px[order]
+    visible = opacity[order] * compensation if antialiased else opacity[order]
+    return order, splat_alpha(center, covariance, visible, camera), depth
 
 
 def embed(xyz, rotation, log_scale, frames, face):

@@ -242,23 +242,16 @@ def test_screen_gradient_is_that_of_the_projected_center():
     """Catches density control fed with pixels, or with the gradient of something else: half images,
     by both axes."""
     scene = cloud(25, count=40, size=(60, 35))
-    xyz, rotation, log_scale, opacity, sh = (
-        torch.from_numpy(scene.splats[name]).double() for name in NAMES
+    *placed, opacity, sh = (torch.from_numpy(scene.splats[name]).double() for name in NAMES)
+    moved_px = torch.zeros(40, 2, dtype=torch.float64, requires_grad=True)
+    order, alphas, depth = reference.layers(
+        *placed, torch.sigmoid(opacity), scene.camera, moved_px=moved_px
     )
-    order = torch.argsort(reference.camera_space(xyz, scene.camera)[:, 2])
-    center, projected, depth, _ = reference.project(
-        xyz[order], rotation[order], log_scale[order], scene.camera
-    )
-    center.requires_grad_()
-    color = reference.sh_color(sh, xyz - torch.from_numpy(scene.camera.position), 3)[order]
-    opacity = torch.sigmoid(opacity[order])
-    rgb, alpha, _ = reference.blend(
-        reference.splat_alpha(center, projected, opacity, scene.camera), color, depth
-    )
+    color = reference.sh_color(sh, placed[0] - torch.from_numpy(scene.camera.position), 3)
+    rgb, alpha, _ = reference.blend(alphas, color[order], depth)
     v_image, v_alpha, _ = random_cotangents(scene.camera, 3)
-    gradient = torch.autograd.grad((rgb * v_image).sum() + (alpha * v_alpha).sum(), center)[0]
-    expected = np.zeros(40)
-    expected[order] = np.hypot(gradient[:, 0] * 60 / 2, gradient[:, 1] * 35 / 2)
+    gradient = torch.autograd.grad((rgb * v_image).sum() + (alpha * v_alpha).sum(), moved_px)[0]
+    expected = np.hypot(gradient[:, 0] * 60 / 2, gradient[:, 1] * 35 / 2)
     _, _, rows, screen = raw_gradients(scene)
     assert len(rows) > 20
     assert_allclose(screen[rows], expected[rows], atol=GRADIENT_TOLERANCE["xyz"] * expected.max())
