@@ -117,11 +117,11 @@ def write_mesh(path, vertices, faces):
         trimesh.Trimesh(vertices, faces, process=False).export(path)
 
 
-def write_flame_model(path, seed=0):
-    """A model file in FLAME's format with the ball as template, four identity and two expression
-    components."""
+def write_flame_model(path, seed=0, mesh=None):
+    """A model file in FLAME's format with the ball as template, or another mesh's vertices and
+    faces, four identity and two expression components."""
     random = default_rng(seed)
-    vertices, faces = ball()
+    vertices, faces = mesh or ball()
     weights = random.random((len(vertices), 5))
     regressor = random.random((5, len(vertices)))
     masks = {"masks/nose": np.flatnonzero(vertices[:, 2] > 0.07)}

@@ -250,22 +250,10 @@ def test_published_topology_gets_teeth(tmp_path, shared_data, rows):
     with np.load(shared_data / "flame_open/flame2023_open_basis.npz") as data:
         template = data["v_template"].astype(float)
         faces = data["faces"]
-    count = len(template)
     root, model_file = factory.write_flame_capture(tmp_path / "capture", timesteps=(0,))
-    weights = np.zeros((count, 5))
-    weights[:, 1] = 1
-    np.savez(
-        model_file,
-        v_template=template,
-        shapedirs=np.zeros((count, 3, 6)),
-        n_identity=4,
-        J_regressor=np.full((5, count), 1 / count),
-        weights=weights,
-        f=faces,
-        kintree_table=np.array([[-1, 0, 1, 1, 1], [0, 1, 2, 3, 4]]),
-    )
+    factory.write_flame_model(model_file, mesh=(template, faces))
     offset = np.full((1, rows, 3), 0.001, np.float32)
-    parameters = factory.flame_parameters(0) | {"static_offset": offset}
+    parameters = factory.flame_parameters(0) | {"static_offset": offset, "shape": np.zeros(4)}
     np.savez(root / "flame_param/00000.npz", **parameters)
     capture = open_capture(root, model_file)
     assert capture.neutral.shape == (5143, 3)

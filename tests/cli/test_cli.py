@@ -1,9 +1,7 @@
 """Commands of the command line, and their errors: one sentence, exit code 2."""
 
-import gzip
 import json
 import shutil
-import struct
 import subprocess
 import sys
 from dataclasses import replace
@@ -430,13 +428,7 @@ def test_what_no_camera_saw_is_left_out(tmp_path, capsys):
 
     expected = to_world(whole.splats, whole.frames(whole.neutral)).rows(kept)
     assert_array_equal(np.float32(trimesh.load(written("ply", "a.ply")).vertices), expected.xyz)
-    (cloud,) = trimesh.load(written("gltf", "a.glb")).geometry.values()
-    assert len(cloud.vertices) == count
-    spz = gzip.decompress(written("spz", "a.spz").read_bytes())
-    assert struct.unpack_from("<I", spz, 8) == (count,)
-    for format in ("web", "skinned-gltf"):
-        arrays = read_web_data(written(format, "b.glb").read_bytes())[1]
-        assert len(arrays["xyz"]) == count
+    assert len(read_web_data(written("web", "b.glb").read_bytes())[1]["xyz"]) == count
     usd = pytest.importorskip("pxr.Usd", reason="the package usd-core is not installed")
     words = f"--format usd --filmed-only --capture {capture.root} --out"
     assert stga("export", path, words, tmp_path / "a.usdc") == 0

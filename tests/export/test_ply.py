@@ -138,9 +138,6 @@ def head(body):
 GOOD = "".join(f"property float {name}\n" for name in layout(0))
 
 
-BEFORE = "element camera 2\nproperty float a\nproperty uchar b\n"  # 10 bytes of data
-
-
 def ascii_head(body):
     return head(body).replace(b"binary_little_endian", b"ascii")
 
@@ -149,21 +146,15 @@ def ascii_head(body):
     ("content", "complaint"),
     [
         (None, ""),
-        (b"", "not a PLY file"),
         (b"solid stl\nend_header\n", "not a PLY file"),
         (b"ply\nformat binary_little_endian 1.0\nelement vertex 1\n", "no complete header"),
-        (head("element vertex 1000000000000\n" + GOOD), "truncated"),
         (head("element vertex 1\n" + GOOD) + bytes(55), "truncated"),
-        (head(BEFORE + "element vertex 1\n" + GOOD) + bytes(10 + 55), "truncated"),
         (head("element vertex -1\n" + GOOD), "cannot be understood"),
-        (head("element vertex many\n" + GOOD), "cannot be understood"),
         (head("element vertex 0\nproperty half x\n"), "cannot be understood"),
         (head("element vertex 0\nproperty float x\nproperty float x\n"), "cannot be understood"),
         (head("element vertex 1\nproperty list uchar int x\n") + bytes(1), "no vertices"),
-        (head("element vertex 0\n"), "no vertices"),
         (head(""), "no vertices"),
         (head("element vertex 1\n" + GOOD.replace("opacity", "density")) + bytes(56), "'opacity'"),
-        (head("element vertex 1\n" + GOOD.replace("scale_1", "s1")) + bytes(56), "'scale_1'"),
         (head("element vertex 1\n" + GOOD + "property float f_rest_0\n") + bytes(60), "f_rest"),
         (head("element vertex 1\n" + GOOD) + b"\0\0\xc0\x7f" + bytes(52), "1 of 1 splats"),
         (head("element vertex 1\n" + GOOD + "property int binding_0\n") + bytes(60), "binding_0"),

@@ -337,10 +337,6 @@ def test_a_worker_renders_and_exports_what_the_command_line_would(tmp_path, capt
             f"render {given} {turned} --video",
             Render(avatar, tmp_path / "film.mp4", True, capture=capture, **turn),
         ),
-        "plys": (
-            f"export {given} --format ply-sequence --frames 1:3 --out",
-            Export(avatar, tmp_path / "plys", "ply-sequence", capture, frames=(1, 3)),
-        ),
         "page.glb": (
             f"export {given} --format web --fps 30 --out",
             Export(avatar, tmp_path / "page.glb", "web", capture, fps=30.0),
