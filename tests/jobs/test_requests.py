@@ -6,8 +6,7 @@ import re
 import subprocess
 import sys
 import time
-from collections.abc import Mapping
-from dataclasses import fields, replace
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import get_args
@@ -17,6 +16,7 @@ import pytest
 from capture.factory import edit, write_avatar_of, write_mesh_capture
 from cli.test_render_video import decoded
 from command_line import stga
+from equality import assert_same
 from refusal import refusal
 
 from stga_addon.avatar.file import read_avatar, write_avatar
@@ -53,19 +53,6 @@ from stga_addon.worker.status import (
 )
 
 from .tables import REQUESTS, RESULTS
-
-
-def same(a, b):
-    """Equality of plain values, types and arrays included."""
-    if isinstance(a, np.ndarray):
-        return isinstance(b, np.ndarray) and a.dtype == b.dtype and np.array_equal(a, b)
-    if isinstance(a, Mapping):
-        return dict(a).keys() == dict(b).keys() and all(same(a[key], b[key]) for key in a)
-    if hasattr(a, "__dataclass_fields__"):
-        return type(a) is type(b) and all(
-            same(getattr(a, f.name), getattr(b, f.name)) for f in fields(a)
-        )
-    return type(a) is type(b) and bool(a == b)
 
 
 @pytest.fixture
@@ -106,10 +93,10 @@ def test_round_trip(tmp_path, value):
     """Catches a field that is lost, or changes its type, between the panel and the worker."""
     if type(value) in JOBS:
         write_request(tmp_path, value)
-        assert same(jobs.read_request(tmp_path), value)
+        assert_same(jobs.read_request(tmp_path), value)
     else:
         jobs.write_result(tmp_path, value)
-        assert same(jobs.read_result(tmp_path), value)
+        assert_same(jobs.read_result(tmp_path), value)
 
 
 def test_the_next_request_forgets_the_last(tmp_path, capture):
