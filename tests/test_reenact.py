@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from capture import factory
-from command_line import refused, stga
+from command_line import stga
 from PIL import Image
 
 from stga_addon.avatar.file import read_avatar
@@ -57,19 +57,3 @@ def test_the_other_person_moves_the_avatar(parts, tmp_path):
     first, drawn = (np.asarray(Image.open(out / f"0000{t}_01.png")).astype(int) for t in (0, 1))
     assert np.abs(drawn - expected).max() <= 1
     assert np.abs(drawn - first).max() > 50
-
-
-def test_mistakes(parts, tmp_path, capsys):
-    """Catches tracebacks for what a person gets wrong first."""
-    meshes = factory.write_mesh_capture(tmp_path / "meshes")
-    scan = tmp_path / "scan.ply"
-    scan.write_bytes(b"ply\n")
-    flame = "--flame", parts["model"]
-    for other, more, message in (
-        ({}, (), "give the FLAME model file"),
-        ({"motion": meshes}, flame, "was not tracked with FLAME"),
-        ({"avatar": scan}, flame, "scan.ply: holds splats in the world"),
-    ):
-        words = RENDER.format(**parts | other), tmp_path / "out", *more
-        assert message in refused(capsys, *words)
-    assert not (tmp_path / "out").exists()

@@ -2,13 +2,13 @@
 
 import ast
 import re
-import subprocess
 import sys
 from functools import cache
 from pathlib import Path
 from typing import TypeVar
 
 import pytest
+from blender.zips import output_of
 
 T = TypeVar("T")
 ROOT = Path(__file__).resolve().parents[1]
@@ -246,9 +246,7 @@ OTHERS = {"torch", "numba", "wgpu", "trimesh", "scipy", "PIL", "tqdm", "smplx"}
 
 
 def run(script, *arguments):
-    command = [sys.executable, "-c", script, *arguments]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
+    output_of([sys.executable, "-c", script, *arguments], cwd=ROOT)
 
 
 def test_numpy_is_enough_to_import_the_engine():

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 from capture.factory import write_mesh_capture
-from command_line import refused, stga
+from command_line import stga
 
 from stga_addon.jobs.batch.engines import LocalEngine
 from stga_addon.jobs.batch.plan import read_plan
@@ -111,12 +111,6 @@ def test_captures_of_the_command(tmp_path, capsys, monkeypatch):
     run = read_run(tmp_path / "out/train-capture")
     found = run.principal_point, run.settings.iterations, run.settings.seed, run.device
     assert found == ("opencv", 2, 5, "cpu")
-    assert "--out: is missing" in refused(capsys, "batch", capture, "--preset draft")
-    assert "--preset: is missing" in refused(capsys, "batch", capture, "--out", out)
-    (tmp_path / "plan.toml").write_text("")
-    assert "--seed: has no effect with a plan" in refused(
-        capsys, "batch", tmp_path / "plan.toml", "--seed 2"
-    )
 
 
 def test_commands_carry_out_the_batch(tmp_path, capsys):

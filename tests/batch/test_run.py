@@ -4,7 +4,6 @@ import errno
 import json
 import multiprocessing
 import os
-import subprocess
 import sys
 import time
 from collections import Counter
@@ -12,6 +11,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
+from blender.zips import output_of
 from refusal import refusal
 
 from stga_addon.errors import StgaError
@@ -421,8 +421,8 @@ def test_a_job_costs_the_same_in_a_large_batch(tmp_path):
     path = os.pathsep.join([str(tests.parent), str(tests)])
     environment = os.environ | {"PYTHONPATH": path, "TMPDIR": str(tmp_path)}
     command = [sys.executable, "-c", COST, str(few), str(JOBS)]
-    run = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
-    small_s, small_kb, large_s, large_kb = map(float, run.stdout.split())
+    printed = output_of(command, env=environment)
+    small_s, small_kb, large_s, large_kb = map(float, printed.split())
     print(f"{JOBS} jobs: {JOBS * large_s:.1f} s of processor time, {large_kb / 1024:.0f} MB")
     assert large_s < 1.8 * small_s
     assert large_kb - small_kb < 30 * (JOBS - few)

@@ -42,9 +42,7 @@ def test_timesteps_follow_each_other(toy):
         assert timesteps == [view.timestep for view in views]
     for first, second, expected in (
         (60.0, 60.0, 60.0),
-        (None, 60.0, 60.0),
         (60.0, None, 60.0),
-        (None, None, None),
         (60.0, 25.0, None),
     ):
         joined = join_takes([replace(toy, fps=first), replace(moved(toy, 0.1), fps=second)])

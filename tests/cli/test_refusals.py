@@ -97,6 +97,24 @@ $ export {run} --capture {coarse} --format ply-sequence --out {o}
 {coarse}: its mesh has other triangles
 $ export {run} --format gaussian-avatars --out {o}
 needs the FLAME parameters of a FLAME capture
+$ render {avatar} --cameras {cameras} --motion {folder}/motion.npz --out {o}
+give the FLAME model file
+$ render {avatar} --cameras {cameras} --motion {root} --flame {model} --out {o}
+was not tracked with FLAME
+$ render {folder}/mesh.ply --cameras {cameras} --motion {folder}/motion.npz --out {o}
+mesh.ply: holds splats in the world
+$ benchmark {bare} --out {o}
+has no views to train on
+$ benchmark {root} --out {o} --only fast
+--only: 'fast' is not one of draft, standard
+$ benchmark {root} --out {o} --only draft --knobs
+--only: 'draft' is not one of standard, scale-0.5
+$ batch {root} --preset draft
+--out: is missing
+$ batch {root} --out {o}
+--preset: is missing
+$ batch {folder}/plan.toml --seed 2
+--seed: has no effect with a plan
 # Runs and avatars that are missing, broken, or there already
 $ train {root} --out {run} --iterations 3
 already holds a run; resume it
@@ -172,6 +190,9 @@ def refusable(root, trained, tmp_path_factory):
     whole = names["avatar"].read_bytes()
     (folder / "half.npz").write_bytes(whole[: len(whole) // 2])
     np.savez(folder / "foreign.npz", a=np.zeros(3))
+    np.savez(folder / "motion.npz", expr=np.zeros((2, 2)), pose=np.zeros((2, 15)))
+    (folder / "plan.toml").touch()
+    names["model"] = factory.write_flame_model(folder / "model.npz")
     (folder / "mesh.ply").write_text(
         "ply\nformat ascii 1.0\nelement vertex 0\nproperty float x\nend_header\n"
     )

@@ -152,15 +152,11 @@ raise SystemExit(main.main(["info", "capture"]))
 """
 
 
-def test_interruption_that_c_code_drops():
-    """Catches Ctrl-C without effect while kernels are loaded."""
-    done = shell(f"\"{sys.executable}\" -c '{DROPPED}'")
-    assert (done.returncode, done.stderr) == (130, "stga: interrupted\n")
-
-
-def test_interruption_says_nothing_of_what_was_half_made():
-    """Catches the traceback of a destructor where Ctrl-C came while a library made an object."""
-    done = shell(f"\"{sys.executable}\" -c '{HALF_MADE}'")
+@pytest.mark.parametrize("script", [DROPPED, HALF_MADE], ids=["dropped", "half made"])
+def test_interruption_says_nothing_else(script):
+    """Catches Ctrl-C without effect while kernels are loaded, and the traceback of a destructor
+    where it came while a library made an object."""
+    done = shell(f"\"{sys.executable}\" -c '{script}'")
     assert (done.returncode, done.stderr) == (130, "stga: interrupted\n")
 
 

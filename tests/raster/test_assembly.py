@@ -7,13 +7,13 @@ Numba runs.
 
 import json
 import re
-import subprocess
 import sys
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import pytest
+from blender.zips import output_of
 
 numba = pytest.importorskip("numba")
 
@@ -78,9 +78,7 @@ def assemblies(ir):
     asked = json.dumps(
         {"ir": ir, "targets": {cpu: kind.triple for cpu, kind in PROCESSORS.items()}}
     )
-    ran = subprocess.run([sys.executable, DRIVER], input=asked, capture_output=True, text=True)
-    assert ran.returncode == 0, ran.stderr
-    found = json.loads(ran.stdout)
+    found = json.loads(output_of([sys.executable, DRIVER], input=asked))
     missing = [cpu for cpu, text in found.items() if text is None]
     if missing:
         pytest.skip(f"this llvmlite was built without the target of {', '.join(missing)}")

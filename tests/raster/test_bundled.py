@@ -3,11 +3,11 @@ the cache against kernels that were just compiled."""
 
 import os
 import shutil
-import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+from blender.zips import output_of
 
 pytest.importorskip("numba")
 from stga_addon.development.package import KERNELS_FOLDER
@@ -34,9 +34,7 @@ def run(folder, cache, package="stga_addon", **variables):
     }
     command = [sys.executable, "-c", STEP.replace("stga_addon", package)]
     environment |= variables
-    return subprocess.run(
-        command, env=environment, cwd=folder, capture_output=True, text=True, check=True
-    ).stdout
+    return output_of(command, env=environment, cwd=folder)
 
 
 def loads(output):
@@ -91,9 +89,7 @@ def test_the_first_run_on_a_machine_has_the_bits_of_all_later_ones(kernel_bundle
     script = Path(__file__).with_name("kernel_bits.py")
     command = [sys.executable, "-c", f"import runpy; runpy.run_path({str(script)!r})"]
     files = sorted(folder.rglob("*"))
-    done = subprocess.run(
-        command, env=environment, cwd=script.parents[2], capture_output=True, text=True, check=True
-    )
+    found = output_of(command, env=environment, cwd=script.parents[2])
     assert sorted(folder.rglob("*")) == files  # nothing was compiled again
     assert len(compiled.split()) == 8
-    assert done.stdout == compiled
+    assert found == compiled

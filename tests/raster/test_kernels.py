@@ -95,10 +95,6 @@ SCENES = {
     "covering everything": cloud(14, count=12, log_scale=0.7, logit=-2.0),
     "opaque layers": cloud(15, count=100, log_scale=-1.0, logit=6.0),
     "smaller than a pixel": cloud(16, log_scale=-7.0, logit=3.0),
-    "needles": replace(
-        cloud(17),
-        splats=cloud(17).splats | {"log_scale": np.tile(np.float32([-1, -4, -5]), (60, 1))},
-    ),
     "faint": cloud(18, logit=-4.0),
     "dark": replace(cloud(19), splats=cloud(19).splats | {"sh": cloud(19).splats["sh"] - 0.5}),
     "single": cloud(20, count=1, spread=0.0, log_scale=-1.0, logit=2.0),
@@ -257,9 +253,7 @@ def test_screen_gradient_is_that_of_the_projected_center():
     assert_allclose(screen[rows], expected[rows], atol=GRADIENT_TOLERANCE["xyz"] * expected.max())
 
 
-@pytest.mark.parametrize(
-    "name", ["plain", "smaller than a pixel", "needles", "around the camera", "degree 1"]
-)
+@pytest.mark.parametrize("name", ["plain", "smaller than a pixel", "around the camera", "degree 1"])
 def test_antialiasing_takes_what_the_low_pass_adds(back_end, name):
     """Catches a compensation of the wrong determinant, and gradients that leave it out: scale,
     rotation, position."""

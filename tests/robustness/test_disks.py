@@ -2,10 +2,10 @@
 
 import errno
 import os
-import subprocess
 import sys
 
 import pytest
+from blender.zips import output_of
 from capture import factory
 from refusal import refusal
 from training.toys import quick_settings
@@ -116,7 +116,5 @@ def test_never_two_in_one_folder(tmp_path):
     with locked(tmp_path):
         pass
     (tmp_path / "run.lock").write_text("999999999")
-    done = subprocess.run(
-        [sys.executable, "-c", CROWD, str(tmp_path)], capture_output=True, text=True, timeout=60
-    )
-    assert done.stdout.strip() == str([0] * 8), done.stderr
+    codes = output_of([sys.executable, "-c", CROWD, tmp_path], timeout=60)
+    assert codes.strip() == str([0] * 8)

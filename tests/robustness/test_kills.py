@@ -1,11 +1,11 @@
 """A run that is killed with no chance to clean up: the folder always opens, and little is lost."""
 
 import os
-import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+from blender.zips import output_of
 
 KILLS = int(os.environ.get("STGA_KILLS", 32))
 
@@ -14,6 +14,5 @@ KILLS = int(os.environ.get("STGA_KILLS", 32))
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="children are forked and killed with SIGKILL")
 def test_a_run_outlives_its_kills(tmp_path):
     """Catches a file half written, a folder left locked, a lost checkpoint, and litter."""
-    command = [sys.executable, str(Path(__file__).with_name("kill_driver.py")), tmp_path, KILLS]
-    done = subprocess.run([*map(str, command)], capture_output=True, text=True, timeout=300)
-    assert done.returncode == 0, done.stderr
+    driver = Path(__file__).with_name("kill_driver.py")
+    output_of([sys.executable, driver, tmp_path, KILLS], timeout=300)

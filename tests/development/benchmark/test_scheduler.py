@@ -9,8 +9,7 @@ from dataclasses import replace
 
 import pytest
 from batch.simulated import InProcessEngine
-from capture import factory
-from command_line import refused, stga
+from command_line import stga
 from refusal import refusal
 
 import stga_addon.development.commands  # noqa: F401 (adds its requests)
@@ -168,21 +167,6 @@ def test_variants():
         assert len({str(replace(settings, preset=None)) for settings in made}) == len(table)
         assert "standard" in table
     assert list(select_variants(MAIN_VARIANTS, ["final", "draft"])) == ["draft", "final"]
-
-
-def test_impossible_benchmarks(toy_root, tmp_path, capsys):
-    """Catches a mistake found only after the first hour of training."""
-    blind = factory.write_mesh_capture(tmp_path / "one", (0,), range(2))
-    (blind / "transforms_val.json").unlink()
-    for capture, arguments, message in (
-        (toy_root, "--only fast", "--only: 'fast' is not one of draft, standard"),
-        (toy_root, "--only draft --knobs", "--only: 'draft' is not one of standard, scale-0.5"),
-        (blind, "", "has no views to"),
-    ):
-        assert message in refused(
-            capsys, "benchmark", capture, "--out", tmp_path / "out", arguments
-        )
-        assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.slow
