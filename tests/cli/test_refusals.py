@@ -103,8 +103,8 @@ $ render {avatar} --cameras {cameras} --motion {root} --flame {model} --out {o}
 was not tracked with FLAME
 $ render {folder}/mesh.ply --cameras {cameras} --motion {folder}/motion.npz --out {o}
 mesh.ply: holds splats in the world
-$ benchmark {bare} --out {o}
-has no views to train on
+$ benchmark {blind} --out {o}
+has no views to measure with
 $ benchmark {root} --out {o} --only fast
 --only: 'fast' is not one of draft, standard
 $ benchmark {root} --out {o} --only draft --knobs
@@ -166,16 +166,17 @@ ROWS = re.findall(r"^\$ (.*)\n(.*)$", REFUSALS, re.MULTILINE)
 def refusable(root, trained, tmp_path_factory):
     """What REFUSALS name, by name."""
     folder = tmp_path_factory.mktemp("refusals")
-    own = "broken", "bare", "coarse", "file", "none", "o", "run"
+    own = "broken", "bare", "blind", "coarse", "file", "none", "o", "run"
     names = {name: folder / name for name in own} | {"root": folder / "ball", "folder": folder}
     shutil.copytree(trained, names["run"])
     shutil.copytree(root, names["root"])
     inside = {"avatar": "run/avatar.npz", "later": "ball/a.json"}
     inside["cameras"] = "ball/transforms_val.json"
     names |= {name: folder / path for name, path in inside.items()}
-    for name in ("broken", "bare", "coarse"):
+    for name in ("broken", "bare", "blind", "coarse"):
         shutil.copytree(root, names[name])
 
+    (names["blind"] / "transforms_val.json").unlink()
     (names["broken"] / "transforms_val.json").write_text('{"frames": [')
     for split in ("train", "test"):
         (names["bare"] / f"transforms_{split}.json").unlink()
