@@ -5,12 +5,10 @@ import re
 import sys
 from functools import cache
 from pathlib import Path
-from typing import TypeVar
 
 import pytest
 from blender.zips import output_of
 
-T = TypeVar("T")
 ROOT = Path(__file__).resolve().parents[1]
 SHIPPED = ("__init__.py", "operators", "ui", "stga_addon")
 SOURCES = tuple(
@@ -107,7 +105,7 @@ def import_graph(sources):
 
 def reached(graph, path):
     """All files, or parts, that one imports, or that those import in turn."""
-    seen = set[T]()
+    seen = set()
     left = [path]
     while left:
         new = graph[left.pop()] - seen

@@ -1,16 +1,12 @@
 """What batches are compared with: the same requests, one after another in this process."""
 
-from collections.abc import Callable
 from functools import cache
 
 import pytest
 
-from stga_addon.jobs.batch.plan import Plan
 from stga_addon.jobs.perform import perform
 
 from .tiny import ITERATIONS, tiny_plan
-
-TrainedHere = Callable[..., Plan]
 
 
 @pytest.fixture(scope="session")

@@ -1,14 +1,10 @@
 """An engine that does no work, one without workers, and batches of jobs that ask for none."""
 
-from collections.abc import Callable
-
 from stga_addon.jobs.batch.folder import hold_batch
-from stga_addon.jobs.batch.plan import Ended, Engine, Job, make_plan
+from stga_addon.jobs.batch.plan import Ended, Engine, make_plan
 from stga_addon.jobs.batch.run import Batch, BatchRun
 from stga_addon.jobs.perform import perform_in_folder
 from stga_addon.worker.status import StatusWriter, WorkerState, inspect_worker
-
-Outcome = Callable[[Job], tuple[WorkerState | None, str]]
 
 
 def finished(job):
@@ -23,9 +19,9 @@ class SimulatedEngine(Engine):
     def __init__(self, outcome=finished, room=1 << 30):
         self.outcome = outcome
         self.room = room
-        self.submitted: list[str] = []
+        self.submitted = []
         self.most = 0
-        self.jobs: dict[str, Job] = {}
+        self.jobs = {}
 
     def has_room(self, job):
         return len(self.jobs) < self.room

@@ -65,8 +65,8 @@ def test_killed_workers_resume_to_the_same_bits(tmp_path, trained_here, monkeypa
     whole = trained_here(seeds, iterations)
     plan = tiny_plan(tmp_path, seeds, iterations)
     ended = threading.Event()
-    killed = list[str]()
-    resumable = list[str]()
+    killed = []
+    resumable = []
     thread = threading.Thread(target=killer, args=(plan.jobs, KILLS, ended, killed, resumable))
     thread.start()
     try:

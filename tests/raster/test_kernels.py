@@ -105,10 +105,6 @@ SCENES = {
 }
 
 
-Images = list[np.ndarray]
-Gradients = dict[str, np.ndarray]
-
-
 def reference_gradients(
     scene, cotangents, frames=None, face=None, antialiased=False, near=reference.NEAR_M
 ):

@@ -2,7 +2,7 @@
 sets how many."""
 
 import os
-from dataclasses import dataclass, field
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -21,19 +21,6 @@ MARK = 250
 RSS_GROWTH = 24 << 20
 
 
-@dataclass
-class Soak:
-    """What a run left behind: memory and splats every MARK iterations, losses of global iterations,
-    the number of local ones, and what was broken or thawed."""
-
-    losses: list[float] = field(default_factory=list)
-    memory: list[int] = field(default_factory=list)
-    counts: list[int] = field(default_factory=list)
-    local: int = 0
-    thawed: list[int] = field(default_factory=list)
-    broken: list[str] = field(default_factory=list)
-
-
 def resident():
     """Bytes of this process in memory; 0 where the system does not say."""
     if not os.path.exists("/proc/self/statm"):
@@ -43,7 +30,9 @@ def resident():
 
 
 def soak(capture):
-    """Train, in each step another view and another random choice of triangles."""
+    """Train, in each step another view and another random choice of triangles; what the run left
+    behind: memory and splats every MARK iterations, losses of global iterations, the number of
+    local ones, and what was broken or thawed."""
     settings = quick_settings(
         "selective",
         iterations=ITERATIONS,
@@ -57,8 +46,10 @@ def soak(capture):
         scale_limit=1.0,
     )
     rng = np.random.default_rng(0)
-    chosen = dict[int, np.ndarray]()
-    found = Soak()
+    chosen = {}
+    found = SimpleNamespace(local=0)
+    for name in ("losses", "memory", "counts", "thawed", "broken"):
+        setattr(found, name, [])
     trainer = Trainer(capture, settings, chosen)
     views = [read_view(view) for view in capture.views["train"]]
     for iteration in range(ITERATIONS):

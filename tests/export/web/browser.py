@@ -61,9 +61,9 @@ class Browser:
         os.close(in_write)
         self._buffer = b""
         self._number = 0
-        self._session: str | None = None
-        self.requests: list[str] = []
-        self.errors: list[str] = []
+        self._session = None
+        self.requests = []
+        self.errors = []
         targets = self.send("Target.getTargets")["targetInfos"]
         page = next(target["targetId"] for target in targets if target["type"] == "page")
         self._session = self.send("Target.attachToTarget", targetId=page, flatten=True)["sessionId"]
