@@ -7,9 +7,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-
-pytest.importorskip("numba")
-
 from blender.zips import output_of
 from capture.factory import write_avatar_of, write_mesh_capture
 from PIL import Image

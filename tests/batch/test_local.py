@@ -23,7 +23,6 @@ from stga_addon.worker.status import LOCK_FILE
 from .simulated import InProcessEngine, carry_out
 from .tiny import ITERATIONS, check_interrupted, interrupt_batch, splats_of, tiny_plan
 
-pytest.importorskip("torch")
 pytestmark = pytest.mark.slow
 ROOT = Path(__file__).resolve().parents[2]
 KILLS = int(os.environ.get("STGA_BATCH_KILLS", 2))

@@ -99,7 +99,6 @@ def run_script(script, *arguments, **variables):
 @pytest.mark.nightly
 def test_jobs_of_killed_nodes_resume_elsewhere(tmp_path, trained_here):
     """Catches a token that cannot be used, jobs lost or changed, and two workers on one."""
-    pytest.importorskip("torch")
     pytest.importorskip("ray", reason="Ray is not installed: pip install 'stga-addon[ray]'")
     seeds = max(1, KILLS // 2)
     iterations = max(ITERATIONS, 200 * KILLS)
@@ -128,7 +127,6 @@ def test_a_cluster_of_this_machine_is_its_users(tmp_path):
 @pytest.mark.nightly
 def test_ctrl_c_through_ray(tmp_path):
     """Catches Ctrl-C that tasks do not hear, or that takes the cluster before they have saved."""
-    pytest.importorskip("torch")
     pytest.importorskip("ray", reason="Ray is not installed: pip install 'stga-addon[ray]'")
     tiny_plan(tmp_path)
     check_interrupted(tmp_path, *interrupt_batch(tmp_path, "--engine", "ray"))

@@ -38,8 +38,6 @@ from stga_addon.training.run.folder import read_run
 from .arguments import REQUESTS, generate_arguments, tracked_footage
 from .damages import damage
 
-pytest.importorskip("torch")
-
 CASES = int(os.environ.get("STGA_FUZZ_CASES", 100))
 """Of every run of the tests; `make fuzz` tries 20,000."""
 PARTS = min(10, 1 + CASES // 200)

@@ -308,7 +308,6 @@ def test_what_follows_training_is_told_ahead(tmp_path, monkeypatch):
 @pytest.mark.slow
 def test_a_worker_renders_and_exports_what_the_command_line_would(tmp_path, capture):
     """Catches a farm whose files differ from those of `stga render` and `stga export`."""
-    pytest.importorskip("numba")
     avatar = write_avatar_of(open_capture(capture), tmp_path / "a.npz", is_colored=True)
     cameras = capture / "transforms_val.json"
     given = f"{avatar} --capture {capture}"
@@ -360,7 +359,6 @@ def contents(path):
 @pytest.mark.slow
 def test_a_cancelled_render_keeps_its_pictures_alone(tmp_path, capture):
     """Catches a worker that renders a whole film after it was cancelled, or leaves half a video."""
-    pytest.importorskip("numba")
     avatar = write_avatar_of(open_capture(capture), tmp_path / "a.npz")
     for name, kept in (("turn", 3), ("turn.mp4", 0)):
         folder = tmp_path / f"{name}_job"
@@ -382,7 +380,6 @@ def test_a_cancelled_render_keeps_its_pictures_alone(tmp_path, capture):
 @pytest.mark.slow
 def test_a_request_continues_what_it_began(tmp_path, capture):
     """Catches a cancel that throws work away, a job that trains anew, and lost figures."""
-    pytest.importorskip("torch")
     request = training(tmp_path / "run", capture, iterations=40)
     folder = asked(request)
 
@@ -424,7 +421,6 @@ def iteration_of(progress):
 @pytest.mark.slow
 def test_previews_while_it_trains(tmp_path, capture, monkeypatch):
     """Catches a preview that never comes, changes the training, or ends it where disks are full."""
-    pytest.importorskip("torch")
     monkeypatch.setattr("stga_addon.worker.status.PREVIEW_INTERVAL_S", 0.0)
     run = tmp_path / "run"
     quiet = tmp_path / "quiet"
@@ -454,7 +450,6 @@ def test_previews_while_it_trains(tmp_path, capture, monkeypatch):
 @pytest.mark.slow
 def test_mistakes_reach_the_folder_and_the_exit_code(tmp_path, capture, capsys):
     """Catches a failure that only the log shows, and a command that ends well in spite of it."""
-    pytest.importorskip("torch")
     assert stga("perform", tmp_path / "nothing") == 2
     assert "holds no request" in capsys.readouterr().err
     assert not (tmp_path / "nothing").exists()

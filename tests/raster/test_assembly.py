@@ -11,15 +11,13 @@ import sys
 from dataclasses import dataclass
 from pathlib import Path
 
+import numba
 import numpy as np
 import pytest
 from blender.zips import output_of
+from numba.core import config
 
-numba = pytest.importorskip("numba")
-
-from numba.core import config  # noqa: E402
-
-from stga_addon.raster.cpu import FASTMATH, blend, image_loss, optimizer, splat_block  # noqa: E402
+from stga_addon.raster.cpu import FASTMATH, blend, image_loss, optimizer, splat_block
 
 DRIVER = str(Path(__file__).with_name("compile_ir.py"))
 X86 = "x86_64-unknown-linux-gnu"

@@ -9,7 +9,6 @@ from pathlib import Path
 import pytest
 from blender.zips import output_of
 
-pytest.importorskip("numba")
 from stga_addon.development.package import KERNELS_FOLDER
 from stga_addon.raster.cpu.bundled import BUNDLE, PROCESSOR, kernel_folder
 

@@ -1,9 +1,6 @@
 """Exponential and logarithm of the kernels against numpy in float64."""
 
 import numpy as np
-import pytest
-
-pytest.importorskip("numba")
 
 from stga_addon.raster.cpu import jit
 from stga_addon.raster.cpu.elementary import exponential, logarithm

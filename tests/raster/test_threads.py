@@ -8,11 +8,9 @@ import time
 
 import numpy as np
 import pytest
-from numpy.testing import assert_array_equal, assert_equal
-
-pytest.importorskip("numba")
 from numba import types
 from numba.extending import intrinsic
+from numpy.testing import assert_array_equal, assert_equal
 
 from stga_addon.raster.cpu import jit
 from stga_addon.raster.cpu import threads as kernel_threads

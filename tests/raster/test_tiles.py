@@ -4,8 +4,6 @@ import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
 
-pytest.importorskip("numba")
-
 from stga_addon.raster.cpu.blend import RUN_TILES
 from stga_addon.raster.cpu.rasterize import BufferPool, new_projection, sort_into_tiles
 from stga_addon.raster.cpu.tiles import RUN_BUCKETS, SPLATS_PER_SORT, heaviest_first, whole_tiles
