@@ -251,17 +251,19 @@ def test_bits_that_are_no_number(tmp_path, name):
 # Meshes
 
 
+PRIMITIVE = {"attributes": {"POSITION": 0}, "indices": 1}
+
+
 def gltf(**changes):
     """One triangle; `changes` replace parts of the document."""
     points = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], "<f4").tobytes()
-    primitive = {"attributes": {"POSITION": 0}, "indices": 1}
     views = [{"buffer": 0, "byteLength": 36}, {"buffer": 0, "byteOffset": 36, "byteLength": 12}]
     document = {
         "asset": {"version": "2.0"},
         "scene": 0,
         "scenes": [{"nodes": [0]}],
         "nodes": [{"mesh": 0}],
-        "meshes": [{"primitives": [primitive]}],
+        "meshes": [{"primitives": [PRIMITIVE]}],
         "accessors": accessors(),
         "bufferViews": views,
         "buffers": [{"byteLength": 48}],
@@ -288,8 +290,10 @@ def ply(vertices, rest, kind="binary_little_endian"):
     return f"ply\nformat {kind} 1.0\nelement vertex {vertices}\n{coordinates}".encode() + rest
 
 
+ZEROS = accessors(count=20_000, bufferView=None)
 MESHES = {
     "whole.glb": gltf(),
+    "twice.glb": gltf(nodes=[{"mesh": 0}] * 2, scenes=[{"nodes": [0, 1]}]),
     "huge matrices.glb": gltf(nodes=[{"mesh": 0, "matrix": [1e308] * 16}]),
     "includes.obj": b"mtllib /etc/passwd\ncall x.obj\n" + OBJ,
     "one polygon.obj": OBJ + b"f " + b"1 " * 150_000 + b"\n",
@@ -304,6 +308,10 @@ BROKEN_MESHES = {
     "ring.glb": gltf(nodes=[{"mesh": 0, "children": [1]}, {"children": [0]}]),
     "own child.glb": gltf(nodes=[{"mesh": 0, "children": [0]}]),
     "doubles.glb": gltf(nodes=[*({"children": [n + 1, n + 1]} for n in range(30)), {"mesh": 0}]),
+    "thousands of nodes.glb": gltf(
+        accessors=ZEROS, nodes=[{"mesh": 0}] * 2000, scenes=[{"nodes": [*range(2000)]}]
+    ),
+    "thousands of parts.glb": gltf(accessors=ZEROS, meshes=[{"primitives": [PRIMITIVE] * 2000}]),
     "distant buffer.glb": gltf(buffers=[{"byteLength": 48, "uri": "../../etc/passwd"}]),
     "server.glb": gltf(buffers=[{"byteLength": 48, "uri": "http://127.0.0.1:9/x"}]),
     "few numbers.glb": gltf(nodes=[{"mesh": 0, "matrix": [1] * 3}]),
@@ -345,6 +353,8 @@ def test_meshes(tmp_path, name):
     path.write_bytes((MESHES | BROKEN_MESHES)[name])
     message = behaves(lambda: read_mesh(path), tmp_path)
     assert message == "" if name in MESHES else message.startswith(f"{path}: ")
+    if name == "twice.glb":
+        assert len(read_mesh(path)[0]) == 6
 
 
 def test_splats_beyond_their_numbers(tmp_path):
