@@ -12,8 +12,14 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import trimesh
-from capture import factory
-from capture.factory import edit, write_avatar_of, write_flame_capture, write_mesh_capture
+from capture.factory import (
+    CY,
+    edit,
+    silhouette,
+    write_avatar_of,
+    write_flame_capture,
+    write_mesh_capture,
+)
 from command_line import refused, stga
 from export.web.web_data import read_web_data
 from numpy.testing import assert_allclose, assert_array_equal
@@ -117,9 +123,9 @@ def test_render_a_run_an_avatar_and_a_ply(trained, root, tmp_path):
     assert (drawn[0] == 255).all()
     # Ten steps from gray: the ball stands where its silhouette says, in something not white.
     dark = (drawn < 230).any(axis=2)
-    assert np.mean(dark == factory.silhouette()) > 0.9
+    assert np.mean(dark == silhouette()) > 0.9
     middle = np.average(np.arange(60), weights=dark.sum(axis=1))
-    assert middle == pytest.approx(factory.CY - 0.5, abs=1.5)
+    assert middle == pytest.approx(CY - 0.5, abs=1.5)
     for name in val:
         assert_array_equal(*(pixels(tmp_path / kind / name) for kind in ("run", "avatar")))
     right, baked = (pixels(tmp_path / kind / val[1]).astype(int) for kind in ("run", "ply"))
@@ -184,7 +190,7 @@ def test_export_to_a_full_disk(trained, tmp_path, capsys, monkeypatch, format, n
 
 def test_files_that_have_moved(tmp_path, capsys, trained, root):
     """Catches a run lost with its FLAME file's or capture's old place, or measured on another."""
-    tracked, model = factory.write_flame_capture(tmp_path / "flame")
+    tracked, model = write_flame_capture(tmp_path / "flame")
     out = tmp_path / "run"
     pair = tmp_path / "pair"
     elsewhere = tmp_path / "elsewhere.npz"
@@ -199,14 +205,14 @@ def test_files_that_have_moved(tmp_path, capsys, trained, root):
     assert stga("eval", out, "--flame", elsewhere) == 0
     run = Path(shutil.copytree(trained, tmp_path / "copy"))
     moved = Path(shutil.copytree(root, tmp_path / "moved"))
-    factory.edit(run / "run.json", lambda document: document.update(capture=str(tmp_path / "gone")))
+    edit(run / "run.json", lambda document: document.update(capture=str(tmp_path / "gone")))
     assert "gone" in refused(capsys, "eval", run)
     assert stga("eval", run, "--capture", moved) == 0
     assert stga("eval", trained) == 0
     qualities = [(path / "quality_val.json").read_text() for path in (run, trained)]
     assert qualities[0] == qualities[1]
     val = moved / "transforms_val.json"
-    factory.edit(val, lambda document: document["frames"][0].update(fl_x=300.0))
+    edit(val, lambda document: document["frames"][0].update(fl_x=300.0))
     assert "other camera poses or intrinsics" in refused(capsys, "eval", run, "--capture", moved)
 
 
@@ -255,17 +261,17 @@ NUMPY_ALONE = "torch numba wgpu trimesh scipy PIL tqdm matplotlib platformdirs b
 def test_commands_need_few_packages(root, trained, tmp_path):
     """Catches an import that looking at a capture, selecting or exporting cannot do without, and a
     traceback where Blender, with numpy alone, lacks a package."""
-    flame, model = factory.write_flame_capture(tmp_path / "flame")
+    flame, model = write_flame_capture(tmp_path / "flame")
     ply = tmp_path / "a.ply"
     exported = f"export {trained}/avatar.npz --format ply --out {ply}"
     known = "162 vertices, 320 triangles", "40 x 60", "view-color"
     meshes = {
-        suffix: factory.write_mesh_capture(tmp_path / suffix, suffix=f".{suffix}")
+        suffix: write_mesh_capture(tmp_path / suffix, suffix=f".{suffix}")
         for suffix in ("ply", "stl")
     }
-    unsized = factory.write_mesh_capture(tmp_path / "unsized")
+    unsized = write_mesh_capture(tmp_path / "unsized")
     for path in unsized.glob("transforms_*.json"):
-        factory.edit(path, lambda document: [entry.pop("w") for entry in document["frames"]])
+        edit(path, lambda document: [entry.pop("w") for entry in document["frames"]])
     pillow = "frames[0].w: w and h are missing; to take them from the image needs Pillow"
     for missing, arguments, says in (
         ("torch numba wgpu", f"info {root}", known),
@@ -351,7 +357,7 @@ def test_names_that_a_terminal_would_obey(root, tmp_path, capsys):
     """Catches control characters of a capture's names that clear the screen, or write a title."""
     capture = shutil.copytree(root, tmp_path / "clear \x1b[2J")
     evil = "eyes\x1b]0;title\x07\nfolder\x9b2J"
-    factory.edit(capture / "regions.json", lambda document: document.update({evil: [0]}))
+    edit(capture / "regions.json", lambda document: document.update({evil: [0]}))
     for command in ("info", "select"):
         assert stga(command, capture) == 0
         printed = capsys.readouterr().out

@@ -13,7 +13,7 @@ from refusal import refusal
 
 from stga_addon.jobs.blender import RenderBlend, blender_command
 from stga_addon.jobs.perform import perform, worker_arguments, write_request
-from stga_addon.progress import Cancelled, Written, ignore
+from stga_addon.progress import Cancelled, Written
 
 BLENDER = """
 import os, sys, time
@@ -64,12 +64,12 @@ def test_only_missing_frames_are_rendered(shot, tmp_path):
     shot.output.mkdir()
     (shot.output / "000010.png").write_text("half 10")
     shares = []
-    perform(shot, lambda progress: bool(shares.append(progress.share)), lambda line: None)
+    perform(shot, lambda progress: bool(shares.append(progress.share)))
     assert pictures(shot.output) == WHOLE
     same = ["STGA_SPLATS", sys.executable]
     assert calls(tmp_path) == [["8", "9", *same], ["11", "12", *same]]
     assert shares == [0.2, 0.4, 0.6, 0.8, 1.0]
-    perform(shot, ignore, lambda line: None)
+    perform(shot)
     assert len(calls(tmp_path)) == 2
 
 
@@ -90,11 +90,11 @@ def test_what_went_wrong_is_a_sentence(shot, tmp_path, monkeypatch):
     """Catches a film that counts as finished without all frames, and a missing Blender."""
     monkeypatch.setenv("FAILS", "10")
     with refusal(r"shot\.blend: frame 10 was not rendered: .*exit status 1: Error: Out of memory"):
-        perform(shot, ignore, lambda line: None)
+        perform(shot)
     assert sorted(pictures(shot.output)) == ["000008.png", "000009.png"]
     monkeypatch.setenv("STGA_BLENDER", str(tmp_path / "nowhere"))
     with refusal(r"nowhere: Blender cannot be started .*; expected it on PATH"):
-        perform(shot, ignore, lambda line: None)
+        perform(shot)
 
 
 def test_cancelling_ends_blender(shot, tmp_path, monkeypatch):
@@ -105,7 +105,7 @@ def test_cancelling_ends_blender(shot, tmp_path, monkeypatch):
         return progress.share >= 0.4
 
     with pytest.raises(Cancelled):
-        perform(shot, report, lambda line: None)
+        perform(shot, report)
     assert pictures(shot.output) == {name: WHOLE[name] for name in ("000008.png", "000009.png")}
     process = int((tmp_path / "log").read_text().split()[0])
     with pytest.raises(ProcessLookupError):
@@ -114,7 +114,7 @@ def test_cancelling_ends_blender(shot, tmp_path, monkeypatch):
 
 def test_a_film_cancelled_with_its_last_picture_is_whole(shot):
     """Catches a job that is reported as cancelled, and done again, though no picture is missing."""
-    result = perform(shot, lambda progress: progress.share == 1, lambda line: None)
+    result = perform(shot, lambda progress: progress.share == 1)
     assert result == Written(shot.output)
     assert pictures(shot.output) == WHOLE
 
@@ -141,7 +141,7 @@ def test_blender_ends_with_a_killed_worker(shot, tmp_path, monkeypatch):
         os.kill(process, signal.SIGTERM)
     assert pictures(shot.output) == begun
     monkeypatch.delenv("STAYS")
-    perform(shot, ignore, lambda line: None)
+    perform(shot)
     assert pictures(shot.output) == WHOLE
     assert set(os.listdir(shot.output)) == set(WHOLE)
 
@@ -152,10 +152,10 @@ def test_two_jobs_with_one_output(shot):
 
     def report(progress):
         if progress.share == 0.2:  # the first Blender has four pictures to go
-            perform(other, ignore, lambda line: None)
+            perform(other)
         return False
 
-    perform(shot, report, lambda line: None)
+    perform(shot, report)
     more = {f"{frame:06d}.png": f"half {frame}" for frame in (20, 21)}
     assert pictures(shot.output) == WHOLE | more
     assert set(os.listdir(shot.output)) == set(WHOLE | more)
