@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
+from refusal import refusal
 
-from stga_addon.errors import StgaError
 from stga_addon.options import (
     add_options,
     color,
@@ -137,7 +137,7 @@ def test_times_and_colors():
         (color, NO_COLORS, "is not white, black or R,G,B"),
     ):
         for text in texts:
-            with pytest.raises(StgaError, match=message):
+            with refusal(message):
                 read(text)
 
 
@@ -153,5 +153,5 @@ def test_options_that_need_others(words, message):
     """Catches an option that is ignored without a message, and one that is refused where it has an
     effect."""
     refuse_useless(Drawing(**parsed("--shaded", "--strokes", "3", "--tones=dark", "--width=3")))
-    with pytest.raises(StgaError, match=f"^{message}$"):
+    with refusal(f"^{message}$"):
         refuse_useless(Drawing(**parsed(*words.split())))

@@ -3,6 +3,7 @@ directions."""
 
 import json
 import math
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -129,9 +130,8 @@ REFUSED = [
 def test_what_is_not_allowed(changes, message):
     """Catches a limit that does not hold, or holds for the value at its end, and a message about
     another field."""
-    with pytest.raises(StgaError) as caught:
+    with refusal(f"^{re.escape(message)}"):
         validate(Drawing(**changes))
-    assert str(caught.value).startswith(message)
 
 
 def test_limits():
@@ -173,9 +173,8 @@ def test_json_of_another_form(changes, message):
     """Catches a traceback for a file edited by hand, and a message that does not say where the
     mistake is."""
     plain = to_json(Drawing())
-    with pytest.raises(StgaError) as caught:
+    with refusal(f"^{re.escape(message)}"):
         from_json(Drawing, {**plain, **changes}, "d")
-    assert str(caught.value).startswith(message)
 
 
 @pytest.mark.parametrize("named", ["nowhere", 3, None, []])

@@ -3,7 +3,6 @@
 import os
 import shlex
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,14 +11,13 @@ from capture.factory import write_avatar_of, write_mesh_capture
 from PIL import Image
 
 from stga_addon.capture.open import open_capture
-from stga_addon.development.package import build_zip
+from stga_addon.development.package import ROOT, build_zip
 from stga_addon.jobs.batch.engines import LocalEngine
 from stga_addon.jobs.batch.plan import read_plan
 from stga_addon.jobs.batch.run import JobState
 
 from .simulated import carry_out
 
-ROOT = Path(__file__).resolve().parents[2]
 BLENDER = shlex.split(os.environ.get("STGA_BLENDER", ""))
 pytestmark = [
     pytest.mark.slow,

@@ -7,7 +7,6 @@ import signal
 import subprocess
 import sys
 import threading
-from pathlib import Path
 
 import pytest
 from capture.factory import write_mesh_capture
@@ -24,7 +23,6 @@ from .simulated import InProcessEngine, carry_out
 from .tiny import ITERATIONS, check_interrupted, interrupt_batch, splats_of, tiny_plan
 
 pytestmark = pytest.mark.slow
-ROOT = Path(__file__).resolve().parents[2]
 KILLS = int(os.environ.get("STGA_BATCH_KILLS", 2))
 """Workers that are killed, every second one with a checkpoint; 20 in the measurement of
 docs/batch.md."""

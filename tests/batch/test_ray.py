@@ -3,7 +3,6 @@
 import os
 import secrets
 import sys
-from pathlib import Path
 
 import pytest
 from blender.zips import output_of
@@ -15,6 +14,7 @@ from stga_addon.jobs.batch.engines import make_engine
 
 from .tiny import (
     ITERATIONS,
+    ROOT,
     check_interrupted,
     interrupt_batch,
     ray_variables,
@@ -22,7 +22,6 @@ from .tiny import (
     tiny_plan,
 )
 
-ROOT = Path(__file__).resolve().parents[2]
 BATCH = """
 import os, subprocess, sys
 sys.path[:0] = [sys.argv[1], sys.argv[1] + "/tests"]

@@ -29,6 +29,7 @@ from stga_addon.avatar.embedding import to_world
 from stga_addon.avatar.file import read_avatar, write_avatar
 from stga_addon.capture.open import open_capture
 from stga_addon.cli import commands
+from stga_addon.development.package import ROOT
 from stga_addon.errors import StgaError
 from stga_addon.export.ply import read_ply
 from stga_addon.jobs.render import unique_names
@@ -282,9 +283,7 @@ def test_commands_need_few_packages(root, trained, tmp_path):
         (NUMPY_ALONE, exported, ()),
     ):
         command = [sys.executable, "-c", WITHOUT, missing, *arguments.split()]
-        done = subprocess.run(
-            command, capture_output=True, text=True, cwd=Path(__file__).parents[2]
-        )
+        done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT)
         if isinstance(says, str):
             assert done.returncode == 2
             assert says in done.stderr

@@ -6,16 +6,15 @@ import signal
 import subprocess
 import sys
 import time
-from pathlib import Path
 
 import pytest
 from capture import factory
 
 from stga_addon.cli.commands import ProgressBar
+from stga_addon.development.package import ROOT
 from stga_addon.progress import Progress
 
 STGA = f'"{sys.executable}" -m stga_addon'
-ROOT = Path(__file__).parents[2]
 
 
 @pytest.fixture(scope="module")

@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 from refusal import refusal
 
+from stga_addon.development.package import ROOT
 from stga_addon.jobs.python_check import describe_check, finish_check, start_check
 from stga_addon.worker import training_python
 from stga_addon.worker.training_python import (
@@ -84,9 +85,7 @@ def test_order_of_choices(monkeypatch):
     assert find_training_python("/preferred/python") == "/farm/python"
 
 
-PROJECT = tomllib.loads((Path(__file__).resolve().parents[2] / "pyproject.toml").read_text())[
-    "project"
-]
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 
 
 def test_requirements():

@@ -2,7 +2,6 @@
 
 import math
 import os
-import re
 import subprocess
 import sys
 import time
@@ -142,10 +141,9 @@ def test_damaged_requests(tmp_path, name):
         edit(tmp_path / jobs.REQUEST, lambda values: values.update({name: DAMAGES[name]}))
     else:
         (tmp_path / jobs.REQUEST).write_text(name)
-    with refusal(r"request\.json: ") as caught:
+    expected = "" if name in TEXTS else f"({name}|not a request that this version reads)"
+    with refusal(rf"request\.json: .*{expected}"):
         jobs.read_request(tmp_path)
-    expected = rf"{name}|not a request that this version reads"
-    assert name in TEXTS or re.search(expected, str(caught.value))
 
 
 def test_time_left_is_told_by_the_pace_of_what_was_done_last():

@@ -9,10 +9,9 @@ from pathlib import Path
 import pytest
 from blender.zips import output_of
 
-from stga_addon.development.package import KERNELS_FOLDER
+from stga_addon.development.package import KERNELS_FOLDER, ROOT
 from stga_addon.raster.cpu.bundled import BUNDLE, PROCESSOR, kernel_folder
 
-ROOT = Path(__file__).resolve().parents[2]
 STEP = """
 import numpy as np
 from stga_addon.raster.cpu import USES_BUNDLED_KERNELS
@@ -88,7 +87,7 @@ def test_the_first_run_on_a_machine_has_the_bits_of_all_later_ones(kernel_bundle
     script = Path(__file__).with_name("kernel_bits.py")
     command = [sys.executable, "-c", f"import runpy; runpy.run_path({str(script)!r})"]
     files = sorted(folder.rglob("*"))
-    found = output_of(command, env=environment, cwd=script.parents[2])
+    found = output_of(command, env=environment, cwd=ROOT)
     assert sorted(folder.rglob("*")) == files  # nothing was compiled again
     assert len(compiled.split()) == 8
     assert found == compiled

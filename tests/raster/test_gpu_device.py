@@ -22,11 +22,6 @@ fn main(thread: Thread) {
 """
 
 
-@pytest.fixture(scope="module")
-def device():
-    return gpu_device.device()
-
-
 @pytest.mark.parametrize("dtype", [np.uint8, np.float32, np.int32])
 @pytest.mark.parametrize("count", [1, 3, 4, 1021])
 def test_arrays_arrive_whole(device, dtype, count):

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from raster import gpu_device
 from raster.gpu_autograd import split_rows
 from stga_addon.raster.cpu.layout import Parameters
 from stga_addon.raster.gpu.optimizer import OptimizerTables, optimize, upload_step
@@ -20,11 +19,6 @@ RATES = {name: 0.01 * (n + 1) for n, name in enumerate(NAMES)}
 COEFFICIENTS = 4
 STRIDE = 11 + 3 * COEFFICIENTS
 TABLES = ("splats", "gradients", "first", "second", "average")
-
-
-@pytest.fixture(scope="module")
-def device():
-    return gpu_device.device()
 
 
 def random_state(count=700, seed=1):

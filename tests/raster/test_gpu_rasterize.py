@@ -5,7 +5,6 @@ import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
 
-from raster import gpu_device
 from raster.gpu_autograd import render
 from raster.test_kernels import NAMES, SCENES, random_cotangents
 from stga_addon.avatar.embedding import WORLD
@@ -40,9 +39,8 @@ def test_the_same_bits_twice_and_from_used_buffers():
             assert_array_equal(got, want, err_msg=f"{name}: {field}")
 
 
-def test_a_trial_finds_wrong_numbers(monkeypatch):
+def test_a_trial_finds_wrong_numbers(device, monkeypatch):
     """Catches a trial that passes whatever a device computes."""
-    device = gpu_device.device()
     monkeypatch.setattr(trial, "SECONDS", 0.0)
     assert trial.try_device(device).is_right
     backward = Rasterizer.backward

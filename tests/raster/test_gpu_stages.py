@@ -7,7 +7,6 @@ from numerics.meshes import bent_ball, collapsed
 from numpy.random import default_rng
 from numpy.testing import assert_allclose, assert_array_equal
 
-from raster import gpu_device
 from raster.test_kernels import SCENES
 from stga_addon.avatar.embedding import CONVENTIONS, face_frames
 from stga_addon.avatar.offsets import SIGNALS
@@ -29,11 +28,6 @@ from stga_addon.raster.gpu.rasterize import counts_buffer, sort_keys
 from stga_addon.training.optimize.image_loss import image_gradient, whole_image
 
 pytestmark = pytest.mark.needs("adapter")
-
-
-@pytest.fixture(scope="module")
-def device():
-    return gpu_device.device()
 
 
 def view_of(device, splats):

@@ -7,8 +7,6 @@ from pathlib import Path
 
 import pytest
 
-from raster import gpu_device
-
 LAYER = "VK_LAYER_KHRONOS_validation"
 SCRIPT = """
 import sys
@@ -34,10 +32,9 @@ assert "libVkLayer_khronos_validation" in Path("/proc/self/maps").read_text()
 
 @pytest.mark.slow
 @pytest.mark.needs("adapter", "vulkan-validation")
-def test_vulkan_validation_has_nothing_to_say(toy_root, tmp_path):
+def test_vulkan_validation_has_nothing_to_say(device, toy_root, tmp_path):
     """Catches a race between dispatches, or a buffer's use, that one driver forgives and another
     does not."""
-    device = gpu_device.device()
     log = tmp_path / "validation.log"
     settings = tmp_path / "vk_layer_settings.txt"
     log.touch()

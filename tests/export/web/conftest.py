@@ -117,3 +117,9 @@ def make_head(convention="stga", sh_degree=3, antialiased=True, offsets=tuple(OF
 @pytest.fixture(scope="session")
 def head():
     return make_head()
+
+
+@pytest.fixture
+def shown(browser, head, tmp_path):
+    """The page of the head, in the browser."""
+    show(browser, tmp_path, head.data())

@@ -7,12 +7,12 @@ import re
 import threading
 from dataclasses import replace
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
-from pathlib import Path
 
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
+from stga_addon.development.package import ROOT
 from stga_addon.driving.head_map import head_map, page_controls
 from stga_addon.driving.inverse import write_performance
 from stga_addon.driving.performance import ARKIT_SHAPES, COLUMN, COUNT, Performance
@@ -26,7 +26,6 @@ from .test_page import psnr
 
 pytestmark = pytest.mark.needs("chromium")
 
-ROOT = Path(__file__).resolve().parents[3]
 PLAY_S = 600
 PLAY_RATE = 4
 """Length of the long play, and pictures drawn in each second of it."""
@@ -105,9 +104,8 @@ def forward(head, frame):
     return flame_forward(sequence.model, sequence.shape, frame, sequence.static_offset)
 
 
-def test_touch(browser, head, tmp_path):
+def test_touch(browser, shown):
     """Catches fingers that do nothing, scroll the page, or move the head the wrong way."""
-    show(browser, tmp_path, head.data())
     first = np.reshape(browser.evaluate(CAMERA), (4, 4))
     middle = browser.evaluate(MIDDLE_IN_CAMERA)
     touch(browser, line((200, 120), (260, 120)))
@@ -124,9 +122,8 @@ def test_touch(browser, head, tmp_path):
     assert browser.errors == []
 
 
-def test_keyboard(browser, head, tmp_path):
+def test_keyboard(browser, shown):
     """Catches a key of docs/web.md that does nothing, or something else."""
-    show(browser, tmp_path, head.data())
     loop = of_avatar(browser, "loop")
     press(browser, " ")
     assert of_avatar(browser, "playing")
@@ -168,10 +165,9 @@ def click(browser, selector):
         browser.send("Input.dispatchMouseEvent", type=kind, **place)
 
 
-def test_keys_press_the_control_that_has_the_focus(browser, head, tmp_path):
+def test_keys_press_the_control_that_has_the_focus(browser, shown):
     """Catches a checkbox, a button or a slider that the keyboard reaches, but whose keys play the
     motion; and a clicked button that keeps Space from playing it."""
-    show(browser, tmp_path, head.data())
     of_avatar(browser, "pause()")
     press(browser, "c")
     for selector, member in (("#show-selection", "showSelection"), ("#loop", "loop")):
@@ -229,9 +225,8 @@ def test_sliders_are_flames(browser, head, tmp_path):
     assert np.abs(np.reshape(found, (-1, 3)) - forward(head, wanted)).max() < 1e-5
 
 
-def test_a_lost_graphics_context_comes_back(browser, head, tmp_path):
+def test_a_lost_graphics_context_comes_back(browser, head, shown):
     """Catches a blank page, or another camera and pose, after the graphics driver was restarted."""
-    show(browser, tmp_path, head.data())
     of_avatar(browser, "setExpression(1, 0.9)")
     message = "shadowRoot.querySelector('p')"
     player = "document.querySelector('stga-avatar').player"
@@ -259,11 +254,10 @@ def test_a_lost_graphics_context_comes_back(browser, head, tmp_path):
     assert browser.errors == []
 
 
-def test_a_removed_element_stops_and_goes_on_where_it_is_put_back(browser, head, tmp_path):
+def test_a_removed_element_stops_and_goes_on_where_it_is_put_back(browser, shown):
     """Catches avatars of an application's earlier views that play on unseen and keep their graphics
     memory, until the browser takes the context of one that is seen; and a move within the page that
     stops one."""
-    show(browser, tmp_path, head.data())
     of_avatar(browser, "setExpression(1, 0.9)")
     found = browser.evaluate("""(async () => {
       const avatar = document.querySelector('stga-avatar');
