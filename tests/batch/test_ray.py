@@ -1,4 +1,4 @@
-"""The Ray engine on a cluster that is started here; skipped where Ray is not installed."""
+"""The Ray engine on a cluster that is started here."""
 
 import os
 import secrets
@@ -98,7 +98,6 @@ def run_script(script, *arguments, **variables):
 @pytest.mark.nightly
 def test_jobs_of_killed_nodes_resume_elsewhere(tmp_path, trained_here):
     """Catches a token that cannot be used, jobs lost or changed, and two workers on one."""
-    pytest.importorskip("ray", reason="Ray is not installed: pip install 'stga-addon[ray]'")
     seeds = max(1, KILLS // 2)
     iterations = max(ITERATIONS, 200 * KILLS)
     variables = {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": secrets.token_hex(32)}
@@ -118,7 +117,6 @@ def test_jobs_of_killed_nodes_resume_elsewhere(tmp_path, trained_here):
 @pytest.mark.slow
 def test_a_cluster_of_this_machine_is_its_users(tmp_path):
     """Catches a cluster that anyone on this machine may use, and jobs not carried out there."""
-    pytest.importorskip("ray", reason="Ray is not installed: pip install 'stga-addon[ray]'")
     write_mesh_capture(tmp_path / "capture")
     assert run_script(BATCH, tmp_path)[-1] == str([("look", "finished", "")])
 
@@ -126,7 +124,6 @@ def test_a_cluster_of_this_machine_is_its_users(tmp_path):
 @pytest.mark.nightly
 def test_ctrl_c_through_ray(tmp_path):
     """Catches Ctrl-C that tasks do not hear, or that takes the cluster before they have saved."""
-    pytest.importorskip("ray", reason="Ray is not installed: pip install 'stga-addon[ray]'")
     tiny_plan(tmp_path)
     check_interrupted(tmp_path, *interrupt_batch(tmp_path, "--engine", "ray"))
 

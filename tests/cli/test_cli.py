@@ -24,6 +24,7 @@ from command_line import refused, stga
 from export.web.web_data import read_web_data
 from numpy.testing import assert_allclose, assert_array_equal
 from PIL import Image
+from pxr import Usd
 
 from stga_addon.avatar.embedding import to_world
 from stga_addon.avatar.file import read_avatar, write_avatar
@@ -405,9 +406,8 @@ def test_frames_cameras_and_selection_of_a_capture(tmp_path):
     text = (tmp_path / "a.html").read_text(encoding="utf-8")
     assert "<title>anna</title>" in text
     assert "{{" not in text.partition('<script type="module">')[0]
-    usd = pytest.importorskip("pxr.Usd", reason="the package usd-core is not installed")
     assert stga("export", avatar_file, "--format usd", words, tmp_path / "a.usdc") == 0
-    assert usd.Stage.Open(str(tmp_path / "a.usdc")).GetTimeCodesPerSecond() == 60
+    assert Usd.Stage.Open(str(tmp_path / "a.usdc")).GetTimeCodesPerSecond() == 60
 
 
 def test_what_no_camera_saw_is_left_out(tmp_path, capsys):
@@ -434,10 +434,9 @@ def test_what_no_camera_saw_is_left_out(tmp_path, capsys):
     expected = to_world(whole.splats, whole.frames(whole.neutral)).rows(kept)
     assert_array_equal(np.float32(trimesh.load(written("ply", "a.ply")).vertices), expected.xyz)
     assert len(read_web_data(written("web", "b.glb").read_bytes())[1]["xyz"]) == count
-    usd = pytest.importorskip("pxr.Usd", reason="the package usd-core is not installed")
     words = f"--format usd --filmed-only --capture {capture.root} --out"
     assert stga("export", path, words, tmp_path / "a.usdc") == 0
-    stage = usd.Stage.Open(str(tmp_path / "a.usdc"))
+    stage = Usd.Stage.Open(str(tmp_path / "a.usdc"))
     positions = stage.GetPrimAtPath("/Avatar/Splats").GetAttribute("positions")
     assert len(positions.Get(positions.GetTimeSamples()[0])) == count
 

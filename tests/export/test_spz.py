@@ -3,6 +3,7 @@
 import gzip
 from dataclasses import replace
 
+import gsply
 import numpy as np
 import pytest
 from avatar.conftest import random_splats, world_splats
@@ -16,7 +17,6 @@ from stga_addon.export.spz import write_spz
 
 def read(path):
     """Splats that gsply finds in a file, and its flags, by Niantic's description."""
-    gsply = pytest.importorskip("gsply", reason="the package gsply is not installed")
     found = gsply.read_spz(path)
     sh = found.sh0[:, None]
     sh = sh if found.shN is None else np.concatenate([sh, found.shN], axis=1)

@@ -8,6 +8,7 @@ import pytest
 from avatar.conftest import rendered, world_splats
 from numpy.random import default_rng
 from numpy.testing import assert_allclose, assert_array_equal
+from pxr import Usd, UsdGeom, UsdValidation, UsdVol
 from refusal import refusal
 
 from stga_addon.avatar.embedding import to_world
@@ -15,7 +16,6 @@ from stga_addon.export.formats import FORMATS, Content, export_avatar
 from stga_addon.export.playback import Playback
 
 PLAYBACK = Playback(fps=30.0)
-MISSING = "the package usd-core is not installed"
 
 
 def moved(avatar, frames=(3, 4, 7)):
@@ -34,15 +34,9 @@ def colored(avatar):
     return replace(avatar, driven_offsets=driven)
 
 
-def opened(path):
-    usd = pytest.importorskip("pxr.Usd", reason=MISSING)
-    return usd.Stage.Open(str(path))
-
-
 def splats_at(stage, time):
     """What USD's own class of the prim says, as splats; raises where array lengths differ."""
-    vol = pytest.importorskip("pxr.UsdVol")
-    field = vol.ParticleField3DGaussianSplat(stage.GetPrimAtPath("/Avatar/Splats"))
+    field = UsdVol.ParticleField3DGaussianSplat(stage.GetPrimAtPath("/Avatar/Splats"))
     assert field
     xyz = np.array(field.GetPositionsAttr().Get(time))
     count = len(xyz)
@@ -63,7 +57,7 @@ def test_reads_back_and_renders_equal(avatar, tmp_path, suffix, color):
     path = tmp_path / f"a{suffix}"
     stage_of = avatar if color == "constant" else colored(avatar)
     assert export_avatar(path, stage_of, "usd", moved(avatar), playback=PLAYBACK) == [path]
-    stage = opened(path)
+    stage = Usd.Stage.Open(str(path))
     times = stage.GetStartTimeCode(), stage.GetEndTimeCode(), stage.GetTimeCodesPerSecond()
     assert times == (3, 7, 30.0)
     pictures = []
@@ -80,15 +74,12 @@ def test_reads_back_and_renders_equal(avatar, tmp_path, suffix, color):
 
 def test_valid(avatar, tmp_path):
     """Catches what validators find, and units, axis, hints and extents they do not."""
-    validation = pytest.importorskip("pxr.UsdValidation", reason=MISSING)
-    from pxr import UsdGeom
-
     path = tmp_path / "a.usdz"
     export_avatar(path, avatar, "usd", moved(avatar), playback=PLAYBACK)
-    stage = opened(path)
-    validators = validation.ValidationRegistry().GetOrLoadAllValidators()
+    stage = Usd.Stage.Open(str(path))
+    validators = UsdValidation.ValidationRegistry().GetOrLoadAllValidators()
     assert validators
-    errors = validation.ValidationContext(validators).Validate(stage)
+    errors = UsdValidation.ValidationContext(validators).Validate(stage)
     assert [error.GetMessage() for error in errors] == []
     assert (UsdGeom.GetStageUpAxis(stage), UsdGeom.GetStageMetersPerUnit(stage)) == ("Y", 1)
     assert str(stage.GetDefaultPrim().GetPath()) == "/Avatar"
@@ -107,7 +98,6 @@ def test_valid(avatar, tmp_path):
 
 def test_size_is_known_before(avatar, tmp_path):
     """Catches an estimate that would let a range fill the disk."""
-    pytest.importorskip("pxr.Usd", reason=MISSING)
     many = default_rng(0).integers(0, len(avatar.splats), 5000)
     avatar = replace(avatar, splats=avatar.splats.rows(many))
     for item in (avatar, colored(avatar)):

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import torch
 from numpy.testing import assert_allclose
+from safetensors.torch import load_file
 
 from raster import reference
 from stga_addon.capture.camera import Camera
@@ -40,7 +41,6 @@ def test_reference_image_is_gsplats(antialiased):
 @pytest.fixture(params=["tiny_case", "basic_case"])
 def gsplat_case(request, shared_data):
     """Images that gsplat's CUDA kernels made; development data, not part of the project."""
-    load_file = pytest.importorskip("safetensors.torch").load_file
     tensors = load_file(shared_data / "raster_reference" / f"{request.param}.safetensors")
     height, width, _ = tensors["out_img"].shape
     pose = np.eye(4)
