@@ -134,7 +134,8 @@ def assert_close(errors, image, gradient):
 def assert_agree(found, expected, image=5e-6, gradient=2e-5):
     """Images and gradients are the expected ones; image: absolute tolerance, relative to the
     largest above one; gradient: over the largest of the quantity."""
-    (images, gradients), (expected_images, expected_gradients) = found, expected
+    images, gradients = found
+    expected_images, expected_gradients = expected
     assert expected_images[1].max() > 0.3
     for one, want in zip(images, expected_images, strict=True):
         assert_allclose(one, want, atol=image * max(1, want.max()))
