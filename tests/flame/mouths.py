@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
+from rays import distances
 from scipy.sparse import coo_matrix, diags
 from scipy.sparse.linalg import spsolve
 
@@ -80,20 +81,8 @@ def _pierced(vertices, edged, pierced):
     ends = vertices[edges]
     corners = vertices[pierced]
     ends, corners = _near(ends, corners), _near(corners, ends)
-    start = ends[:, None, 0]
-    direction = (ends[:, 1] - ends[:, 0])[:, None]
-    origin, u, v = corners.transpose(1, 0, 2)[:, None]
-    u = u - origin
-    v = v - origin
-    across = np.cross(direction, v)
-    determinant = (across * u).sum(-1)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        a = ((start - origin) * across).sum(-1) / determinant
-        along = np.cross(start - origin, u)
-        b = (along * direction).sum(-1) / determinant
-        t = (along * v).sum(-1) / determinant
-        met = (a >= 0) & (b >= 0) & (a + b <= 1) & (t >= 0) & (t <= 1)
-    return int(met.sum())
+    along = distances(ends[:, None, 0], (ends[:, 1] - ends[:, 0])[:, None], corners)
+    return int(((along >= 0) & (along <= 1)).sum())
 
 
 def _near(some, others):
@@ -105,21 +94,4 @@ def _near(some, others):
 
 def covered_from_front(vertices, skin, points):
     """(n,) bool: points (n, 3) with a triangle of the skin in front of them, along z."""
-    corners = vertices[skin]
-    corners = corners[corners[:, :, 2].max(1) > points[:, 2].min()]
-    a = corners[None, :, 0]
-    b = corners[None, :, 1]
-    c = corners[None, :, 2]
-
-    def twice_area(p, q, r):
-        first = q - p
-        second = r - p
-        return first[..., 0] * second[..., 1] - first[..., 1] * second[..., 0]
-
-    at = points[:, None]
-    parts = np.stack([twice_area(at, b, c), twice_area(at, c, a), twice_area(at, a, b)], axis=-1)
-    inside = (parts > 0).all(-1) | (parts < 0).all(-1)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        heights = np.stack([a[..., 2], b[..., 2], c[..., 2]], axis=-1)
-        depth = (parts * heights).sum(-1) / parts.sum(-1)
-    return (inside & (depth > at[..., 2])).any(1)
+    return (distances(points[:, None], np.array([0.0, 0.0, 1.0]), vertices[skin]) > 0).any(1)

@@ -3,6 +3,7 @@
 import numpy as np
 import trimesh
 from avatar.conftest import splats_of
+from rays import distances
 
 from stga_addon.avatar.file import Avatar, AvatarLight
 from stga_addon.avatar.splats import SH_C0
@@ -23,24 +24,10 @@ def ball_and_plate(subdivisions=3):
     return np.array(both.vertices), np.array(both.faces, np.int32)
 
 
-def blocked(points, direction, vertices, faces):
-    """(N,) bool: whether rays from points meet a triangle (Möller and Trumbore), float64."""
-    a, b, c = (vertices[faces[:, k]] for k in range(3))
-    first = b - a
-    second = c - a
-    across = np.cross(direction, second)
-    determinant = (first * across).sum(1)
-    crossed = np.abs(determinant) > 1e-15
-    scale = np.where(crossed, 1 / np.where(crossed, determinant, 1), 0)
-    found = np.zeros(len(points), bool)
-    for n, point in enumerate(points):
-        offset = point - a
-        u = (offset * across).sum(1) * scale
-        turned = np.cross(offset, first)
-        v = turned @ direction * scale
-        distance = (second * turned).sum(1) * scale
-        found[n] = (crossed & (u >= 0) & (v >= 0) & (u + v <= 1) & (distance > 1e-6)).any()
-    return found
+def blocked(points, directions, vertices, faces):
+    """(N,) bool: whether rays from points, each in its direction or all in one, meet a triangle."""
+    rays = zip(points, np.broadcast_to(directions, points.shape), strict=True)
+    return np.array([(distances(*ray, vertices[faces]) > 1e-6).any() for ray in rays])
 
 
 def middle_splats(face, log_scale, coefficients=1):
