@@ -8,7 +8,6 @@ import pytest
 from numpy.linalg import norm
 from numpy.random import default_rng
 from numpy.testing import assert_allclose, assert_array_equal, assert_equal
-from refusal import refusal
 from scipy.spatial.transform import Rotation
 
 from stga_addon.avatar.embedding import face_frames, to_world
@@ -116,8 +115,7 @@ def test_deformation_stays_within_what_was_seen():
 
 
 def test_the_range_is_in_the_file_and_in_renderings(tmp_path):
-    """Catches driven colors or their range lost in the file, a range that frames ignore, and one of
-    another shape that is not refused."""
+    """Catches driven colors or their range lost in the file, and a range that frames ignore."""
     neutral = sheet()
     stretched = (1.1 * neutral).astype(np.float32)
     limits = np.zeros((len(FACES), 2, 6), np.float32)
@@ -128,8 +126,6 @@ def test_the_range_is_in_the_file_and_in_renderings(tmp_path):
     assert_array_equal(found.strain_range, limits)
     assert np.abs(colored(neutral).frames(stretched).color).max() > 0.01
     assert not found.frames(stretched).color.any()
-    with refusal(r"strain_range is float32 \(3, 2, 6\), expected float32 \(4, 2, 6\)"):
-        write_avatar(tmp_path / "b.npz", replace(avatar, strain_range=limits[1:]))
 
 
 def test_baking_keeps_the_picture():
@@ -243,14 +239,11 @@ def test_colors_follow_strain_and_normals(convention):
 
 
 @pytest.mark.parametrize("convention", ["stga", "gaussian_avatars"])
-def test_positions_follow_strain(convention, tmp_path):
-    """Catches a shift in other axes or units than the splats', one lost in the file, and a mesh at
-    rest that moves."""
+def test_positions_follow_strain(convention):
+    """Catches a shift in other axes or units than the splats', and a mesh at rest that moves."""
     neutral = sheet()
     posed = sheet(3)
     avatar = replace(following(neutral), convention=convention)
-    write_avatar(tmp_path / "a.npz", avatar)
-    found = read_avatar(tmp_path / "a.npz")
     basis = strain_basis(neutral, FACES)
     smoothed = smoothed_strain(basis, deformation(basis, posed)).astype(np.float64)
     moves = avatar.driven_offsets["strain_position"]
@@ -258,16 +251,13 @@ def test_positions_follow_strain(convention, tmp_path):
     xyz = avatar.splats.xyz + np.array(shift)[avatar.splats.face]
     shifted = replace(avatar.splats, xyz=xyz.astype(np.float32))
     plain = face_frames(posed, FACES, neutral, convention)
-    baked = to_world(found.splats, found.frames(posed))
+    baked = to_world(avatar.splats, avatar.frames(posed))
     assert_allclose(baked.xyz, to_world(shifted, plain).xyz, atol=1e-7)
     assert_array_equal(baked.rotation, to_world(shifted, plain).rotation)
     assert np.abs(baked.xyz - to_world(avatar.splats, plain).xyz).max() > 1e-4
     still = to_world(avatar.splats, face_frames(neutral, FACES, neutral, convention))
-    rest = to_world(found.splats, found.frames(neutral))
+    rest = to_world(avatar.splats, avatar.frames(neutral))
     assert_allclose(rest.xyz, still.xyz, atol=1e-7)
-    wrong = replace(avatar, driven_offsets={"strain_position": moves[1:]})
-    with refusal(r"strain_position is float32 \(3, 3, 3\), expected float32 \(4, 3, 3\)"):
-        write_avatar(tmp_path / "b.npz", wrong)
 
 
 def test_positions_stay_near_where_the_mesh_is_torn():
