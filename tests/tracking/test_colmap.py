@@ -54,7 +54,6 @@ def test_projections_are_colmaps(tmp_path, kind):
         np.testing.assert_allclose(found, expected, atol=1e-6, err_msg=shot.label)
 
 
-DEPTH = repr(float(rig(1)[0].world_to_camera[2, 3]))
 NO_IMAGE = "has no image, folder or video of the name"
 
 
@@ -63,23 +62,10 @@ NO_IMAGE = "has no image, folder or video of the name"
     [
         (
             "cameras",
-            "50.0",
-            "0",
-            "image 'left.png': expected a focal length of 1 to 1e7 pixels, not",
-        ),
-        (
-            "cameras",
             f" {WIDTH} {HEIGHT} ",
             " 0 30 ",
             "'left.png': expected an image size in pixels",
         ),
-        (
-            "cameras",
-            " 20.0",
-            " 1e308",
-            r"'left.png': expected a principal point within 1e\+07 pixels",
-        ),
-        ("images", DEPTH, "1e308", r"image 'left.png': expected a camera within 1e\+12 units"),
         ("images", " 2 right.png", " 2 left.png", "image 'left.png': two cameras are named left"),
         ("images", " 1 left.png", " 1 gone.png", f"{NO_IMAGE} 'gone.png'"),
         ("images", " 1 left.png", f" 1 {'9' * 5000}.png", f"{NO_IMAGE} '999"),

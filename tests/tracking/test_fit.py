@@ -28,7 +28,7 @@ from stga_addon.tracking.fit import (
     triangulate,
     triangulated,
 )
-from stga_addon.tracking.head_model import HeadModel, linear_model
+from stga_addon.tracking.head_model import HeadModel
 from stga_addon.tracking.posed_points import PosedPoints, SurfacePoints, split
 from stga_addon.tracking.seen import interpolated
 from stga_addon.tracking.solve import (
@@ -296,24 +296,6 @@ def test_rays_that_all_miss_give_a_start(head):
     assert norm(start[:3]) <= np.pi + 1e-9
 
 
-def test_a_linear_model_without_joints_moves_rigidly():
-    """Catches rotation about joints that a plain shape-key head does not have."""
-    rng = default_rng(0)
-    faces = np.array([[0, 1, 2], [2, 3, 4], [5, 6, 7]])
-    arrays = {
-        "mean": rng.normal(0, 0.1, (8, 3)),
-        "faces": faces,
-        "expression": rng.normal(0, 0.01, (8, 3, 2)),
-    }
-    head = HeadModel(linear_model(None, arrays), "mesh")
-    assert head.joints == (True, False, False, False, False)
-    fit = np.concatenate([[0.5, -1.0], [0.3, 0.2, 0.1], np.zeros(12), [0.1, 0.2, 0.3]])
-    found = flame_forward(head.model, np.zeros(0), frame_of(fit))
-    shaped = arrays["mean"] + arrays["expression"] @ [0.5, -1.0]
-    lengths = [norm(mesh[:, None] - mesh[None], axis=2) for mesh in (found, shaped)]
-    assert_allclose(*lengths, atol=1e-12)
-
-
 def test_timesteps_without_a_face_are_interpolated():
     """Catches gaps that keep the last pose, or extrapolate beyond the ends."""
     low = np.zeros(20)
@@ -343,19 +325,6 @@ def person_model(head):
 def meshes_of(head, parameters):
     model = person_model(head)
     return np.stack([flame_forward(model, np.zeros(0), frame_of(own)) for own in parameters])
-
-
-@pytest.mark.parametrize("world", WORLDS)
-def test_the_world_says_nothing_of_heads_in_between(head, world):
-    """Catches axis-angles that are interpolated number by number: where they are near half a turn,
-    a missing frame lay 353 mm off."""
-    known = {t: frame_at(head, 3 * t).parameters for t in (0, 4)}
-    known[0][-18:-15] = [0.05, 0.1, 0.03]
-    known[4][-18:-15] = [-0.04, -0.2, 0.0]
-    expected = meshes_of(head, interpolated(known, range(5)).values())
-    turned, turn = moved(head, known.values(), WORLDS[world])
-    found = interpolated(dict(zip(known, turned, strict=True)), range(5))
-    assert_allclose(meshes_of(head, found.values()), expected @ turn.T, atol=2e-4)
 
 
 @pytest.mark.parametrize("world", WORLDS)

@@ -29,7 +29,7 @@ from stga_addon.tracking.focal_length import scale_warnings
 from stga_addon.tracking.folder import PLACES_FILE
 from stga_addon.tracking.footage.open import open_footage
 from stga_addon.tracking.footage.sequences import FrameRange
-from stga_addon.tracking.head_model import HeadModel
+from stga_addon.tracking.head_model import HeadModel, read_head_model
 from stga_addon.tracking.landmarks import detect_landmarks, landmark_file, read_camera
 from stga_addon.tracking.opened import TrackingOptions
 from stga_addon.tracking.solve import person
@@ -179,7 +179,7 @@ def test_offsets_that_are_none(recorded, capsys, offset):
 
 
 def test_a_linear_model_gives_a_mesh_capture(recorded, head):
-    """Catches a layout that only FLAME's own files open in."""
+    """Catches a layout that only FLAME's own files open in, and joints of a head that has none."""
     folder = recorded[0]
     model = head.model
     shapes = np.split(model.shapedirs, [model.n_identity], axis=2)
@@ -189,6 +189,7 @@ def test_a_linear_model_gives_a_mesh_capture(recorded, head):
     capture = open_capture(folder / "out")
     assert capture.layout == "mesh"
     assert len(capture.neutral) == len(model.v_template)
+    assert read_head_model(folder / "head.npz").joints == (True, False, False, False, False)
 
 
 ONE_POINT = {"face": np.zeros(LANDMARKS, int), "barycentric": np.full((LANDMARKS, 3), 1 / 3)}
