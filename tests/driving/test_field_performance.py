@@ -158,9 +158,7 @@ def test_degrees_and_percent(tmp_path):
     ("key", "times", "about", "fps", "sentence"),
     [
         ("timestamp_ms", lambda n: n * 1000 // 30, {}, 30, None),
-        ("timestampMs", lambda n: n * 1000 // 30, {}, 30, None),
         ("timestamp", lambda n: n * 40, {}, 25, "timestamp holds milliseconds"),
-        ("time", lambda n: n / 24, {}, 24, None),
         ("timecode", lambda n: f"00:00:{n // 30:02d}:{n % 30:02d}", {}, 30, None),
         ("frame", lambda n: n, {"frame_rate": 30}, 30, None),
         ("frame", lambda n: n, {}, 60, "says no times"),
