@@ -5,10 +5,11 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from stga_addon.avatar.embedding import CONVENTIONS, face_areas, face_frames, to_world
+from stga_addon.avatar.embedding import CONVENTIONS, face_frames, to_world
 from stga_addon.avatar.lattice import lattice_splats
 
 from .conftest import random_mesh
+from .test_embedding import covariance
 
 
 @pytest.mark.parametrize(("order", "count"), [(0, 1), (1, 3), (2, 6), (3, 10), (4, 15)])
@@ -55,15 +56,9 @@ def test_world_scale_is_flat_along_the_normal(convention):
     """Catches triangle units taken for meters, and flattening along another axis."""
     neutral, faces = random_mesh(2)
     splats = lattice_splats(neutral, faces, 2, convention=convention)
-    frames = face_frames(neutral, faces, neutral, convention)
-    world = to_world(splats, frames)
-    expected = 0.6 * np.sqrt(2 * face_areas(neutral, faces)) / 2
+    world = to_world(splats, face_frames(neutral, faces, neutral, convention))
     normal = np.cross(*(neutral[faces[:, i]] - neutral[faces[:, 0]] for i in (1, 2)))
-    normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
-    # local axis that is the normal
-    along = np.abs(np.einsum("fij,fi->fj", frames.rotation, normal)).argmax(1)
-    sigma = np.exp(world.log_scale).reshape(len(faces), 6, 3)
-    for face, axis in enumerate(along):
-        want = np.full(3, expected[face])
-        want[axis] *= 0.5
-        assert_allclose(sigma[face], np.tile(want, (6, 1)), rtol=1e-5)
+    twice_area = np.linalg.norm(normal, axis=1)[:, None, None]
+    flat = np.eye(3) - 0.75 * normal[:, :, None] * normal[:, None] / twice_area**2
+    expected = np.repeat(0.6**2 * twice_area / 4 * flat, 6, axis=0)
+    assert_allclose(covariance(world), expected, atol=1e-5 * expected.max())

@@ -46,19 +46,22 @@ def sheet(seed=0):
     return 0.01 * bumpy
 
 
-def colored(neutral, size=0.2, names=("strain_color", "normal_color")):
+NEUTRAL = sheet()
+POSED = sheet(3)
+
+
+def colored(size=0.2, names=("strain_color", "normal_color")):
     """An avatar whose triangles' splats follow signals, by random offsets."""
-    splats = lattice_splats(neutral, FACES, 1, 0, opacity_logit=2.0)
+    splats = lattice_splats(NEUTRAL, FACES, 1, 0, opacity_logit=2.0)
     values = default_rng(0).normal(0, size, (len(names), len(FACES), 3, 3)).astype(np.float32)
     offsets = dict(zip(names, values, strict=True))
-    return Avatar(splats, "stga", neutral.astype(np.float32), FACES, driven_offsets=offsets)
+    return Avatar(splats, "stga", NEUTRAL.astype(np.float32), FACES, driven_offsets=offsets)
 
 
 def test_rigid_motion_far_away_does_not_strain():
     """Catches strain of pose instead of expression, and cancellation 100 m from the origin."""
-    neutral = sheet()
-    turned = neutral @ Rotation.random(random_state=2).as_matrix().T + [100, -50, 20]
-    assert np.abs(deformation(strain_basis(neutral, FACES), turned)[:, :3]).max() < 1e-6
+    turned = NEUTRAL @ Rotation.random(random_state=2).as_matrix().T + [100, -50, 20]
+    assert np.abs(deformation(strain_basis(NEUTRAL, FACES), turned)[:, :3]).max() < 1e-6
 
 
 @pytest.mark.parametrize("broken", ["point", "line", "posed point", "torn"])
@@ -85,12 +88,11 @@ def test_deformation_stays_within_what_was_seen():
     """Catches colors extrapolated beyond the trained expressions, a range of another triangle or
     component, one that clips what was trained, a margin counted from 0 where a mesh at rest is
     clipped to less, and one beyond what may be followed."""
-    neutral = sheet()
     rng = default_rng(4)
     allowed = trained_range(len(FACES))
-    posed = [neutral + rng.normal(0, 3e-4, neutral.shape) for _ in range(3)]
-    posed.append(0.7 * neutral)
-    basis = strain_basis(neutral, FACES, allowed)
+    posed = [NEUTRAL + rng.normal(0, 3e-4, NEUTRAL.shape) for _ in range(3)]
+    posed.append(0.7 * NEUTRAL)
+    basis = strain_basis(NEUTRAL, FACES, allowed)
     every = np.stack([deformation(basis, mesh) for mesh in posed])
     limits = seen_range(basis, posed)
     rest = np.array([-MIN_COMPRESSION, -MIN_COMPRESSION, 0, 0, 0, 0])
@@ -103,12 +105,12 @@ def test_deformation_stays_within_what_was_seen():
             assert_allclose(limits[face, :, component], expected, atol=1e-6)
     assert limits[:, 0, :2].max() < -MIN_COMPRESSION
     assert (limits[:, 1, :2] == np.float32(-MIN_COMPRESSION)).all()
-    limited = strain_basis(neutral, FACES, limits)
+    limited = strain_basis(NEUTRAL, FACES, limits)
     for mesh, found in zip(posed, every, strict=True):
         assert_array_equal(deformation(limited, mesh), found)
-    stronger = neutral + 4 * (posed[0] - neutral)
+    stronger = NEUTRAL + 4 * (posed[0] - NEUTRAL)
     free, clipped = (
-        deformation(basis, stronger) for basis in (strain_basis(neutral, FACES), limited)
+        deformation(basis, stronger) for basis in (strain_basis(NEUTRAL, FACES), limited)
     )
     assert_array_equal(clipped, np.clip(free, limits[:, 0], limits[:, 1]))
     assert (np.abs(free) > np.abs(clipped) + 0.01).any(0)[[0, 1, 3, 4]].all()
@@ -116,22 +118,20 @@ def test_deformation_stays_within_what_was_seen():
 
 def test_the_range_is_in_the_file_and_in_renderings(tmp_path):
     """Catches driven colors or their range lost in the file, and a range that frames ignore."""
-    neutral = sheet()
-    stretched = (1.1 * neutral).astype(np.float32)
+    stretched = (1.1 * NEUTRAL).astype(np.float32)
     limits = np.zeros((len(FACES), 2, 6), np.float32)
-    avatar = replace(colored(neutral), strain_range=limits)
+    avatar = replace(colored(), strain_range=limits)
     write_avatar(tmp_path / "a.npz", avatar)
     found = read_avatar(tmp_path / "a.npz")
     assert_equal(found.driven_offsets, avatar.driven_offsets)
     assert_array_equal(found.strain_range, limits)
-    assert np.abs(colored(neutral).frames(stretched).color).max() > 0.01
+    assert np.abs(colored().frames(stretched).color).max() > 0.01
     assert not found.frames(stretched).color.any()
 
 
 def test_baking_keeps_the_picture():
     """Catches a world PLY that forgets the colors of a deformed frame, or counts them twice."""
-    neutral = sheet()
-    avatar = colored(neutral)
+    avatar = colored()
     posed = sheet(4)
     pose = np.eye(4)
     pose[:3, 3] = [-0.005, -0.008, 0.1]
@@ -142,13 +142,13 @@ def test_baking_keeps_the_picture():
     assert_allclose(render(baked, camera, white), drawn, atol=2e-5)
     plain = replace(avatar, driven_offsets={})
     assert np.abs(render_avatar(plain, posed, camera, white) - drawn).max() > 0.05
-    undeformed = face_frames(posed, FACES, neutral)
+    undeformed = face_frames(posed, FACES, NEUTRAL)
     assert_array_equal(to_world(avatar.splats, undeformed).sh, avatar.splats.sh)
 
 
-def following(neutral):
+def following():
     """An avatar without driven colors whose triangles' splats move by millimeters with strain."""
-    return colored(neutral, 3e-3, ["strain_position"])
+    return colored(3e-3, ["strain_position"])
 
 
 def test_neighbors_share_an_edge():
@@ -221,62 +221,57 @@ def test_colors_follow_strain_and_normals(convention):
     """Catches coefficients of another triangle, signal or component, normals in the triangle's own
     axes, or of the posed mesh only, one of two colors that is lost, and the capture's light that
     stays where other light takes its place: plain loops."""
-    neutral = sheet()
-    posed = sheet(3)
-    avatar = replace(colored(neutral), convention=convention)
-    basis = strain_basis(neutral, FACES)
-    smoothed = smoothed_strain(basis, deformation(basis, posed))
+    avatar = replace(colored(), convention=convention)
+    basis = strain_basis(NEUTRAL, FACES)
+    smoothed = smoothed_strain(basis, deformation(basis, POSED))
     by_strain, by_normal = avatar.driven_offsets.values()
     for f, (a, b, c) in enumerate(FACES):
-        normals = [np.cross(m[b] - m[a], m[c] - m[a]) for m in (posed, neutral)]
+        normals = [np.cross(m[b] - m[a], m[c] - m[a]) for m in (POSED, NEUTRAL)]
         after, before = (normal / norm(normal) for normal in normals)
         skin = sum(smoothed[f, k] * by_strain[f, k] for k in range(3))
         light = sum((after - before)[k] * by_normal[f, k] for k in range(3))
         assert np.abs(light).max() > 1e-3
-        assert_allclose(avatar.frames(posed).color[f], skin + light, atol=1e-6)
-        assert_allclose(avatar.without_light.frames(posed).color[f], skin, atol=1e-6)
-    assert_allclose(avatar.frames(neutral).color, 0, atol=1e-6)
+        assert_allclose(avatar.frames(POSED).color[f], skin + light, atol=1e-6)
+        assert_allclose(avatar.without_light.frames(POSED).color[f], skin, atol=1e-6)
+    assert_allclose(avatar.frames(NEUTRAL).color, 0, atol=1e-6)
 
 
 @pytest.mark.parametrize("convention", ["stga", "gaussian_avatars"])
 def test_positions_follow_strain(convention):
     """Catches a shift in other axes or units than the splats', and a mesh at rest that moves."""
-    neutral = sheet()
-    posed = sheet(3)
-    avatar = replace(following(neutral), convention=convention)
-    basis = strain_basis(neutral, FACES)
-    smoothed = smoothed_strain(basis, deformation(basis, posed)).astype(np.float64)
+    avatar = replace(following(), convention=convention)
+    basis = strain_basis(NEUTRAL, FACES)
+    smoothed = smoothed_strain(basis, deformation(basis, POSED)).astype(np.float64)
     moves = avatar.driven_offsets["strain_position"]
     shift = [sum(smoothed[f, k] * moves[f, k] for k in range(3)) for f in range(len(FACES))]
     xyz = avatar.splats.xyz + np.array(shift)[avatar.splats.face]
     shifted = replace(avatar.splats, xyz=xyz.astype(np.float32))
-    plain = face_frames(posed, FACES, neutral, convention)
-    baked = to_world(avatar.splats, avatar.frames(posed))
+    plain = face_frames(POSED, FACES, NEUTRAL, convention)
+    baked = to_world(avatar.splats, avatar.frames(POSED))
     assert_allclose(baked.xyz, to_world(shifted, plain).xyz, atol=1e-7)
     assert_array_equal(baked.rotation, to_world(shifted, plain).rotation)
     assert np.abs(baked.xyz - to_world(avatar.splats, plain).xyz).max() > 1e-4
-    still = to_world(avatar.splats, face_frames(neutral, FACES, neutral, convention))
-    rest = to_world(avatar.splats, avatar.frames(neutral))
+    still = to_world(avatar.splats, face_frames(NEUTRAL, FACES, NEUTRAL, convention))
+    rest = to_world(avatar.splats, avatar.frames(NEUTRAL))
     assert_allclose(rest.xyz, still.xyz, atol=1e-7)
 
 
 def test_positions_stay_near_where_the_mesh_is_torn():
     """Catches positions that leave with strain beyond its range, and NaN of triangles without
     area."""
-    neutral = sheet()
-    avatar = following(neutral)
+    avatar = following()
     farthest = MAX_STRAIN * np.abs(avatar.driven_offsets["strain_position"]).sum((1, 2))
     torn = 1000 * sheet(2)
-    flat = neutral * [1, 0, 0]
-    far = neutral + 100.0
+    flat = NEUTRAL * [1, 0, 0]
+    far = NEUTRAL + 100.0
     torn[1] = torn[0]
-    for posed in (torn, flat, far, np.zeros_like(neutral)):
-        plain = face_frames(posed, FACES, neutral)
+    for posed in (torn, flat, far, np.zeros_like(NEUTRAL)):
+        plain = face_frames(posed, FACES, NEUTRAL)
         moved = avatar.frames(posed)
         away = norm(moved.origin - plain.origin, axis=1)
         assert np.isfinite(moved.origin).all()
         assert (away <= farthest * plain.scale + 1e-9).all()
-    away = avatar.frames(far).origin - face_frames(far, FACES, neutral).origin
+    away = avatar.frames(far).origin - face_frames(far, FACES, NEUTRAL).origin
     assert norm(away, axis=1).max() < 1e-7  # strain of float32
 
 
@@ -284,19 +279,18 @@ def test_positions_stay_near_where_the_mesh_is_torn():
 @pytest.mark.parametrize("name", OFFSETS)
 def test_only_what_shows_is_kept(name, convention):
     """Catches coefficients taken for invisible by another range, signal or unit than poses have."""
-    neutral = sheet()
     rng = default_rng(4)
     limits = rng.random((len(FACES), 2, 6)).astype(np.float32) * [[-2], [0.5]]
-    unit = face_frames(neutral, FACES, neutral, convention).scale
+    unit = face_frames(NEUTRAL, FACES, NEUTRAL, convention).scale
     shares = []
     divisor = 10 * unit if name == "strain_position" else 1.0
     for exponent in np.linspace(-3, 1, 41):
         sizes = 10**exponent * rng.random(len(FACES)) / divisor
         coefficients = sizes[:, None, None] * rng.normal(0, 0.2, (len(FACES), 3, 3))
         whole = Avatar(
-            colored(neutral).splats,
+            colored().splats,
             convention,
-            neutral.astype(np.float32),
+            NEUTRAL.astype(np.float32),
             FACES,
             strain_range=limits.astype(np.float32),
             driven_offsets={name: coefficients.astype(np.float32)},
@@ -308,12 +302,12 @@ def test_only_what_shows_is_kept(name, convention):
         )
         shares.append(is_kept.mean())
         for _ in range(20):
-            posed = (neutral * rng.uniform(0.4, 1.5, 3)) @ Rotation.random(rng=rng).as_matrix()
+            posed = (NEUTRAL * rng.uniform(0.4, 1.5, 3)) @ Rotation.random(rng=rng).as_matrix()
             ours = pruned.frames(posed)
             theirs = whole.frames(posed)
             assert abs(ours.color - theirs.color).max(initial=0) < MIN_COLOR_CHANGE
             assert abs(np.log(ours.scale / theirs.scale)).max() < MIN_SCALE_CHANGE
-            plain = face_frames(posed, FACES, neutral, convention)
+            plain = face_frames(posed, FACES, NEUTRAL, convention)
             away = norm(ours.origin - theirs.origin, axis=1)
             assert (away < np.sqrt(3) * MIN_SHIFT_M * plain.scale / unit).all()
     assert shares[0] < 0.3
