@@ -104,17 +104,6 @@ def test_eyeballs_are_found(shared_data):
     assert eyes[wet].mean() > 0.95
 
 
-def test_harmonics_turn_with_their_axes():
-    """Catches a rotation that is applied the other way round."""
-    rng = np.random.default_rng(0)
-    turn = Rotation.random(random_state=0).as_matrix()
-    sky = even_directions(2000)
-    light = rng.normal(size=3)
-    project = basis(sky).T * (4 * np.pi / len(sky))
-    sharp, turned = (np.maximum(sky @ axis, 0)[:, None] for axis in (light, turn @ light))
-    assert_allclose(rotated(project @ sharp, turn), project @ turned, atol=2e-3)
-
-
 def test_transfer_and_occlusion_are_those_of_cast_rays():
     """Catches depth maps that are mirrored, coarse or shade themselves, and another solid angle."""
     vertices, faces = ball_and_plate(2)
