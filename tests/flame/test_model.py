@@ -56,36 +56,27 @@ def test_every_pickle_protocol(tmp_path, protocol):
 
 
 def test_npz_with_masks_and_identity_count(tmp_path):
-    """Catches npz models whose own masks or identity count are ignored, and a wrong split of
-    FLAME's published layout."""
+    """Catches npz models whose own masks or identity count are ignored, eye regions that miss the
+    eyeballs, and a wrong split of FLAME's published layout."""
     arrays = random_arrays()
     path = tmp_path / "model.npz"
     np.savez(path, **random_arrays(vertices=10, components=400))
     model = read_flame(path)
     assert (model.n_identity, model.n_expression) == (300, 100)
     corners = np.unique(arrays["f"][:20])
-    np.savez(path, **arrays, n_identity=5, **{"masks/nose": arrays["f"][3], "masks/lips": corners})
+    names = "nose", "left_eye_region", "left_eyeball", "right_eyeball"
+    masks = dict(zip(names, arrays["f"][3:7], strict=True)) | {"lips": corners}
+    masks = {f"masks/{name}": ids for name, ids in masks.items()}
+    np.savez(path, **arrays, n_identity=5, **masks)
     model = read_flame(path)
     assert (model.n_identity, model.n_expression) == (5, 7)
     regions = key_regions(model)
-    assert set(regions) == {"nose", "mouth"}
+    assert set(regions) == {"nose", "mouth", "left_eye", "right_eye"}
     expected = [set(face) <= set(corners) for face in arrays["f"].tolist()]
     assert regions["mouth"].tolist() == expected
     assert regions["nose"][3]
-
-
-def test_mask_file_beside_the_model(tmp_path):
-    """Catches masks that are not picked up, and eye regions that miss the eyeballs."""
-    arrays = random_arrays()
-    path = tmp_path / "model.pkl"
-    path.write_bytes(pickle.dumps(arrays))
-    names = "left_eye_region", "left_eyeball", "right_eyeball"
-    regions = dict(zip(names, arrays["f"][:3], strict=True))
-    (tmp_path / "FLAME_masks.pkl").write_bytes(pickle.dumps(regions, 2))
-    keys = key_regions(read_flame(path))
-    assert keys["left_eye"][[0, 1]].all()
-    assert keys["right_eye"][2]
-    assert "mouth" not in keys
+    assert regions["left_eye"][[4, 5]].all()
+    assert regions["right_eye"][6]
 
 
 def python2_masks(end="\n"):
@@ -159,12 +150,9 @@ class _Attack:
     ("attack", "name"),
     [
         (_Attack(os.system, "touch {}"), "posix.system"),
-        (_Attack(eval, "open('{}', 'w')"), "builtins.eval"),
         (_Attack(getattr, "text", "format"), "builtins.getattr"),
         (_Attack(np.load, "{}"), "numpy.load"),
         (_Attack(scipy.sparse.load_npz, "{}"), "load_npz"),
-        (_Attack(pickle.loads, b"N."), "_pickle.loads"),
-        (_Attack(bytearray, 10**15), "builtins.bytearray"),
     ],
     ids=lambda value: value if isinstance(value, str) else "",
 )
@@ -183,15 +171,7 @@ def test_other_classes_are_refused_by_name(tmp_path, attack, name, protocol):
     assert not witness.exists()
 
 
-@pytest.mark.parametrize(
-    "name",
-    [
-        "_codecs\nencode",
-        "copy_reg\n_reconstructor",
-        "numpy.core.multiarray\n_reconstruct",
-        "__builtin__\nset",
-    ],
-)
+@pytest.mark.parametrize("name", ["_codecs\nencode", "numpy.core.multiarray\n_reconstruct"])
 @pytest.mark.parametrize("state", [b"}S'left'\nI1\ns", b"N}S'_call'\nI1\ns\x86"])
 def test_functions_cannot_be_changed(tmp_path, name, state):
     """Catches a pickle that sets attributes of a function by BUILD, which would outlive its
@@ -203,23 +183,3 @@ def test_functions_cannot_be_changed(tmp_path, name, state):
     for method in (vars(_RestrictedUnpickler)[name] for name in ("encode", "rebuild")):
         assert vars(method) == {}
     assert not hasattr(codecs.encode, "left")
-
-
-@pytest.mark.parametrize(
-    ("data", "problem"),
-    [
-        (b"})" + b"\x85" * 1_000_000 + b"Ns.", "too many, or too deep"),
-        (b"}(" + b"K\x01" * 9 + b"t" + b"2\x86" * 60 + b"Ns.", "too many, or too deep"),
-        (b"}U\x01a\x96" + b"\xff" * 7 + b"\x0fs.", "damaged, or cut off"),
-        (b"}U\x01a\x96" + b"\xff" * 8 + b"s.", "damaged, or cut off"),
-        (b"}r\xff\xff\xff\x7fU\x01aT\xff\xff\xff\x7fs.", "damaged, or cut off"),
-    ],
-    ids=["deep", "wide", "long", "longest", "slot"],
-)
-def test_what_a_file_promises_is_not_allocated(tmp_path, data, problem):
-    """Catches tuples as keys that end the process when they are hashed, and memory that only an
-    opcode's number asks for."""
-    path = tmp_path / "model.pkl"
-    path.write_bytes(b"\x80\x02" + data)
-    with refusal(problem):
-        read_pickled_arrays(path)

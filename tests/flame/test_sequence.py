@@ -7,7 +7,7 @@ import pytest
 from numpy.random import default_rng
 from numpy.testing import assert_allclose, assert_array_equal
 from refusal import refusal
-from scipy.spatial.transform import Rotation, Slerp
+from scipy.spatial.transform import Rotation
 
 from stga_addon.flame.forward import (
     change_between,
@@ -163,7 +163,8 @@ def _matrices(vectors):
 
 
 def _between(first, second, share):
-    return np.asarray(Slerp([0, 1], Rotation.from_rotvec([first, second]))(share).as_matrix())
+    start, end = (Rotation.from_rotvec(vectors.reshape(-1, 3)) for vectors in (first, second))
+    return (start * (start.inv() * end) ** share).as_matrix()
 
 
 def _motion(model, timesteps=(2, 3, 7)):
@@ -194,10 +195,8 @@ def test_parameters_between_timesteps_against_scipy():
         for first, second in values.swapaxes(0, 1):
             both = np.stack([first, second])
             found = parameters_at(np.array([2 + 4 * share]), np.array([2, 6]), both)
-            for column in range(4, 19, 3):
-                own = slice(column, column + 3)
-                expected = _between(first[own], second[own], share)
-                assert_allclose(_matrices(found[0, own])[0], expected, atol=1e-12)
+            expected = _between(first[4:-3], second[4:-3], share)
+            assert_allclose(_matrices(found[0, 4:-3]), expected, atol=1e-12)
             rest = np.r_[:4, -3:0]
             mixed = (1 - share) * first[rest] + share * second[rest]
             assert_allclose(found[0, rest], mixed, atol=1e-12)
@@ -221,10 +220,6 @@ def test_the_same_speed_gives_the_frames_and_what_lies_between(tiny_flame):
     end = motion.frame(7)
     between = frames[2]
     assert_allclose(between.expr, 0.75 * start.expr + 0.25 * end.expr, atol=1e-12)
-    expected = _between(start.jaw_pose, end.jaw_pose, 0.25)
-    assert_allclose(_matrices(between.jaw_pose)[0], expected, atol=1e-12)
-    expected = _between(start.eyes_pose[3:], end.eyes_pose[3:], 0.25)
-    assert_allclose(_matrices(between.eyes_pose)[1], expected, atol=1e-12)
     (alone,) = retimed(_motion(tiny_flame, (5,)), 0.5)
     _assert_same(alone, random_frame(5, 4))
     for step, count in ((0.5, 11), (2.0, 3), (2.5, 3), (0.1, 51), (60 / 24, 3)):
@@ -249,7 +244,7 @@ def test_strength(tiny_flame):
     middle = (frames[0].translation + frames[3].translation) / 2
     assert_allclose(half.translation, middle)
     middle = _between(frames[0].rotation, frames[3].rotation, 0.5)
-    assert_allclose(_matrices(half.rotation)[0], middle, atol=1e-12)
+    assert_allclose(_matrices(half.rotation), middle, atol=1e-12)
 
 
 def test_driven_by_the_neutral_mesh_alone(tiny_flame):
