@@ -44,12 +44,9 @@ def with_expressions(model, components):
     moved = np.einsum("vp,spc->svc", spread, face_shapes().shapes[kept][:, used])
     moved = moved.reshape(len(kept), -1)
     weights = random_poses(SAMPLES, np.random.default_rng(0))[:, kept]
-    # Principal components of weights @ moved, from the small matrix of the shapes' products.
-    values, vectors = np.linalg.eigh(moved @ moved.T)
-    root = vectors * np.sqrt(np.maximum(values, 0))
-    _, sizes, axes = np.linalg.svd((weights - weights.mean(axis=0)) @ root, full_matrices=False)
-    inverse = vectors / np.sqrt(np.maximum(values, 1e-12 * values.max()))
-    axes = sizes[:components, None] * axes[:components] @ inverse.T @ moved / np.sqrt(SAMPLES)
+    samples = weights @ moved
+    _, sizes, axes = np.linalg.svd(samples - samples.mean(axis=0), full_matrices=False)
+    axes = sizes[:components, None] * axes[:components] / np.sqrt(SAMPLES)
     expressions = axes.T.reshape(-1, 3, len(axes))
     return replace(model, shapedirs=np.concatenate([identity, expressions], axis=2))
 

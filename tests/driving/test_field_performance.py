@@ -54,7 +54,7 @@ CLOCKS = {
     "microseconds": ("time_us", lambda n: n * 1_000_000 // 60, 60, None),
     "nanoseconds": ("Timestamp [ns]", lambda n: NANOSECONDS + n * 10**9 // 30, 30, None),
     "seconds": ("elapsed_seconds", lambda n: n / 24, 24, None),
-    "short seconds": ("time_s", lambda n: n / 24, 24, None),
+    "short seconds": ("blendShapes.time_s", lambda n: n / 24, 24, None),
     "seconds without a unit": ("time", lambda n: round(n / 30, 3), 30, None),
     "milliseconds without a unit": ("timestamp", lambda n: n * 1000 // 30, 30, "milliseconds"),
     "nanoseconds without a unit": ("t", lambda n: NANOSECONDS + n * 10**7, 100, "nanoseconds"),
@@ -108,26 +108,12 @@ def test_drop_frame_numbers_over_ten_minutes(tmp_path):
     assert_allclose(found.times, np.arange(20) * 1001 / 30000, atol=1e-9)
 
 
-@pytest.mark.parametrize("kind", ["german", "named delimiter", "tabs", "mark", "quoted"])
-def test_takes_saved_again_by_a_spreadsheet(tmp_path, kind):
-    """Catches columns that are not found, or numbers cut off at a decimal comma."""
+def test_a_take_saved_again_by_a_spreadsheet(tmp_path):
+    """Catches a line that names the delimiter taken for that of columns."""
     codes = [f"01:00:00:{n:02d}.000" for n in range(COUNT)]
     path = write_csv(tmp_path / "take.csv", codes, WEIGHTS)
-    expected = read_performance(path)
-    text = path.read_text()
-    comma = re.sub(r"(?<=\d)\.(?=\d{6})", ",", text.replace(",", ";"))
-    files = {
-        "german": comma.encode("utf-8-sig"),
-        "named delimiter": ("sep=;\r\n" + comma.replace("\n", "\r\n")).encode(),
-        "tabs": comma.replace(";", "\t").encode("utf-16"),
-        "mark": text.encode("utf-16"),
-        "quoted": re.sub(r"(\d),(\d{6})", r'"\1,\2"', comma).replace(";", ",").encode(),
-    }
-    path.write_bytes(files[kind])
-    found = read_performance(path)
-    assert_allclose(found.weights, expected.weights)
-    assert_allclose(found.head, expected.head)
-    assert_allclose(found.times, expected.times)
+    path.write_text("sep=;\n" + path.read_text().replace(",", ";").replace("0.", "0,"))
+    assert_allclose(read_performance(path).weights, WEIGHTS)
 
 
 def test_tab_separated_suffix(tmp_path):

@@ -109,12 +109,6 @@ def test_every_form_of_csv_json_and_text(tmp_path):
         found = read_performance(tmp_path / f"{name}.json")
         assert_allclose(found.weights, WEIGHTS, err_msg=name)
         assert found.fps == pytest.approx(25), name
-    header = ["timeCode", *(f"blendShapes.{PASCAL[k]}" for k in order)]
-    lines = [",".join(map(str, [n / 25, *row])) for n, row in enumerate(rows)]
-    (tmp_path / "a2f.csv").write_text("\n".join([",".join(header), *lines]))
-    found = read_performance(tmp_path / "a2f.csv")
-    assert_allclose(found.weights, WEIGHTS)
-    assert found.fps == pytest.approx(25)
     named = [dict(zip(ARKIT_SHAPES, row, strict=True)) for row in WEIGHTS]
     packets = [wire.facial_mocap(row, (90, 45, -30)) for row in named]
     (tmp_path / "take.txt").write_bytes(b"\n".join(packets))
