@@ -2,6 +2,7 @@
 
 import numpy as np
 from flame.small_head import small_head
+from scipy.spatial.transform import Rotation
 
 from stga_addon.render.video import video_writer
 from stga_addon.tracking.correspondence import picture_cameras, shaded_image
@@ -13,9 +14,7 @@ def write_head_video(path, frames, size=256):
     front = picture_cameras(model.v_template)[0]
     center = model.v_template.mean(axis=0)
     with video_writer(path, 25) as write:
-        for turn in np.radians(np.linspace(-20, 20, frames)):
-            about = np.array(
-                [[np.cos(turn), 0, np.sin(turn)], [0, 1, 0], [-np.sin(turn), 0, np.cos(turn)]]
-            )
-            turned = (model.v_template - center) @ about.T + center
+        for degrees in np.linspace(-20, 20, frames):
+            turn = Rotation.from_euler("y", degrees, degrees=True)
+            turned = turn.apply(model.v_template - center) + center
             write(shaded_image(turned, model.faces, front.scaled(size / front.width)))

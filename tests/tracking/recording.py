@@ -7,8 +7,10 @@ from PIL import Image
 from stga_addon.capture.camera import look_at
 from stga_addon.files import write_json, write_npz
 from stga_addon.flame.forward import flame_forward
+from stga_addon.tracking.folder import PLACES_FILE
 from stga_addon.tracking.landmarks import write_places
 
+from .test_calibrations import entry
 from .test_fit import frame_at, places_on
 
 SIZE = 64
@@ -28,10 +30,8 @@ def write_footage(folder, cameras, timesteps, picture):
             name = f"images/{number}_{timestep}.png"
             (folder / name).parent.mkdir(parents=True, exist_ok=True)
             Image.fromarray(picture(camera, timestep)).save(folder / name)
-            entry = {"file_path": name, "timestep_index": timestep, "camera_id": f"cam{number}"}
-            entry |= {name: getattr(camera, name) for name in ("fl_x", "fl_y", "cx")}
-            entry |= {"w": camera.width, "h": camera.height, "cy": camera.height - camera.cy}
-            frames.append({**entry, "transform_matrix": camera.camera_to_world_gl.tolist()})
+            moment = {"timestep_index": timestep, "camera_id": f"cam{number}"}
+            frames.append(entry(camera, name, **moment, cy=camera.height - camera.cy))
     write_json(folder / "transforms.json", {"frames": frames})
     return folder
 
@@ -53,11 +53,17 @@ def record(
     meshes = [flame_forward(head.model, shape, frame) for frame in frames]
     write_footage(folder / "footage", cameras, timesteps, lambda c, t: picture(meshes[t], c))
     write_flame(head.model, folder / "head.npz")
-    write_places(folder / "points/head_model.npz", places, np.ones(LANDMARKS, bool))
-    for number, camera in enumerate(cameras):
-        points = seen_landmarks(head, places, meshes, camera)
-        confidence = np.ones(points.shape[:2])
-        confidence[2] = 0
-        arrays = {"timesteps": np.arange(timesteps), "points": points, "confidence": confidence}
-        write_npz(folder / f"points/cam{number}.npz", arrays)
+    seen = [seen_landmarks(head, places, meshes, camera) for camera in cameras]
+    confidence = np.ones((timesteps, LANDMARKS))
+    confidence[2] = 0
+    named = {f"cam{number}": points for number, points in enumerate(seen)}
+    write_points(folder / "points", places, named, confidence=confidence)
     return meshes
+
+
+def write_points(folder, places, named, **more):
+    """Landmark files of cameras' names -> pixels (T, N, 2) at all timesteps; more: other arrays."""
+    write_places(folder / PLACES_FILE, places, np.ones(len(places), bool))
+    for name, points in named.items():
+        arrays = {"timesteps": np.arange(len(points)), "points": points, **more}
+        write_npz(folder / f"{name}.npz", arrays)

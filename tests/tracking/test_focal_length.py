@@ -9,17 +9,17 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from stga_addon.capture.camera import camera_from_gl
-from stga_addon.files import read_json, write_npz
+from stga_addon.files import read_json
 from stga_addon.flame.forward import FlameFrame, flame_forward
 from stga_addon.tracking.fit import HeadFit, RecordedTake, TimestepLandmarks
 from stga_addon.tracking.focal_length import solved_focal
 from stga_addon.tracking.footage.open import open_footage, usual_focal
 from stga_addon.tracking.footage.video import VideoFrames
 from stga_addon.tracking.known_person import KnownPerson
-from stga_addon.tracking.landmarks import write_places
 from stga_addon.tracking.opened import TrackingOptions
 from stga_addon.tracking.track import track
 
+from .recording import write_points
 from .scenes import write_image, write_video
 from .test_fit import HERE, places_on
 
@@ -199,9 +199,8 @@ def film(folder, head, turn_deg):
     places, take = turning(head, 1.6 * usual_focal(*SIZE), turn_deg, SIZE, COUNT)
     write_video(folder / "phone.mp4", range(60, 60 + 10 * COUNT, 10), size=SIZE, gop=COUNT)
     write_flame(head.model, folder / "head.npz")
-    write_places(folder / "points/head_model.npz", places, np.ones(300, bool))
     points = np.concatenate([take[t].points for t in range(COUNT)])
-    write_npz(folder / "points/phone.npz", {"timesteps": np.arange(COUNT), "points": points})
+    write_points(folder / "points", places, {"phone": points})
 
 
 def test_a_lens_that_nothing_tells_is_that_of_the_avatars_camera(tmp_path, head):

@@ -144,8 +144,12 @@ def test_mattes_of_a_video(tmp_path):
 def test_a_folder_that_is_none(tmp_path, capsys):
     """Catches a traceback for a folder that does not exist."""
     take(tmp_path)
-    words = {"--model": "none.npz", "--out": "out", "--mattes": "nowhere"}
-    more = [word for name, file in words.items() for word in (name, str(tmp_path / file))]
-    assert "nowhere: is not a folder; expected one of mattes" in refused(
-        capsys, "track", tmp_path / "footage", *more
+    words = (
+        "track",
+        tmp_path / "footage",
+        "--out",
+        tmp_path / "out",
+        "--mattes",
+        tmp_path / "nowhere",
     )
+    assert "nowhere: is not a folder; expected one of mattes" in refused(capsys, *words)

@@ -26,6 +26,7 @@ from stga_addon.tracking.pictures import (
 )
 
 from .head_video import write_head_video
+from .test_surface import rays_of
 
 SIZE = 120
 BALL = trimesh.creation.icosphere(subdivisions=3, radius=0.1)
@@ -43,15 +44,10 @@ def footage(folder, cameras, timesteps):
     for number in range(cameras):
         camera = look_at((0.2 * number, 0.1, 1.0), (0, 0, 0), SIZE, SIZE, 400.0)
         views = {}
-        y, x = np.mgrid[:SIZE, :SIZE] + 0.5
-        flat = (x - camera.cx) / camera.fl_x, (y - camera.cy) / camera.fl_y
-        rays = np.stack([*flat, np.ones_like(x)], axis=-1)
-        rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
-        turn = camera.world_to_camera[:3, :3]
-        shift = camera.world_to_camera[:3, 3]
+        rays = rays_of(camera)
         for t in range(timesteps):
-            center = turn @ [0.02 * t, 0, 0] + shift
-            covered = center @ center - (rays @ center) ** 2 < 0.1**2
+            away = [0.02 * t, 0, 0] - camera.position
+            covered = away @ away - (rays @ away) ** 2 < 0.1**2
             image = np.where(covered[..., None], 255, np.array([20 * number, 20 * t, 0]))
             path = folder / f"{number}_{t}.png"
             Image.fromarray(image.astype(np.uint8)).save(path)

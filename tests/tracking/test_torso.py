@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from stga_addon.capture.camera import look_at
 from stga_addon.capture.mesh_geometry import rasterize, weighted_procrustes
 from stga_addon.capture.open import open_capture
-from stga_addon.files import read_json, write_npz
+from stga_addon.files import read_json
 from stga_addon.flame.forward import (
     FlameFrame,
     axis_angle_matrices,
@@ -30,7 +30,6 @@ from stga_addon.tracking.dense_head import REGIONS
 from stga_addon.tracking.fit import HeadFit, posed_mesh
 from stga_addon.tracking.folder import (
     KEPT_FOLDER,
-    PLACES_FILE,
     REPORT_FILE,
     TorsoMotion,
     TorsoPoints,
@@ -40,7 +39,6 @@ from stga_addon.tracking.folder import (
 from stga_addon.tracking.footage.model import Footage, FootageCamera
 from stga_addon.tracking.footage.open import open_footage
 from stga_addon.tracking.head_model import HeadModel
-from stga_addon.tracking.landmarks import write_places
 from stga_addon.tracking.opened import TrackingOptions
 from stga_addon.tracking.solve import person
 from stga_addon.tracking.stages import Crew, Stage
@@ -62,7 +60,7 @@ from stga_addon.tracking.torso_take import (
 from stga_addon.tracking.track import track
 from stga_addon.worker.helpers import Helpers
 
-from .recording import seen_landmarks, write_footage
+from .recording import seen_landmarks, write_footage, write_points
 from .test_fit import HERE, places_on
 
 SIZE = 105, 142
@@ -414,11 +412,10 @@ def test_a_take_on_its_torso_has_the_vertices_that_motion_and_cloth_say(fine_hea
 
 
 @pytest.mark.slow
-def test_track_writes_the_torso_as_flames_neck(tmp_path, head, lifted, monkeypatch):
+@pytest.mark.usefixtures("without_surface")
+def test_track_writes_the_torso_as_flames_neck(tmp_path, head, lifted):
     """Catches a torso that is followed and then not written, or not reported to those who train on
     the capture; dense tracking that `track` does not run, and a report without it."""
-    # What takes the longest, and changes neither
-    monkeypatch.setattr("stga_addon.tracking.seen.fit_surface", lambda head, fit, *_, **__: fit)
     fit, parameters, footage = lifted
     cameras = [own.camera for own in footage.cameras]
     numbers = {camera.position.tobytes(): number for number, camera in enumerate(cameras)}
@@ -430,12 +427,9 @@ def test_track_writes_the_torso_as_flames_neck(tmp_path, head, lifted, monkeypat
     write_footage(tmp_path / "footage", cameras, TIMESTEPS, picture)
     write_flame(head.model, tmp_path / "head.npz")
     places = places_on(head, 200)
-    write_places(tmp_path / "points" / PLACES_FILE, places, np.ones(200, bool))
-    for number, camera in enumerate(cameras):
-        meshes = [posed_mesh(fit, parameters[timestep]) for timestep in range(TIMESTEPS)]
-        points = seen_landmarks(head, places, meshes, camera)
-        arrays = {"timesteps": np.arange(TIMESTEPS), "points": points}
-        write_npz(tmp_path / f"points/cam{number}.npz", arrays)
+    meshes = [posed_mesh(fit, parameters[timestep]) for timestep in range(TIMESTEPS)]
+    seen = [seen_landmarks(head, places, meshes, camera) for camera in cameras]
+    write_points(tmp_path / "points", places, {f"cam{n}": own for n, own in enumerate(seen)})
     footage = open_footage(tmp_path / "footage")
     out = tmp_path / "out"
     result = track(

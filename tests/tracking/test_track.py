@@ -16,7 +16,6 @@ from scipy.spatial.transform import Rotation
 from stga_addon.capture.camera import look_at
 from stga_addon.capture.mesh_geometry import Similarity
 from stga_addon.capture.open import open_capture
-from stga_addon.cli.main import main
 from stga_addon.export.playback import playback_fps
 from stga_addon.files import read_json, read_npz, write_json, write_npz
 from stga_addon.flame.forward import RIGID_SIZE, flame_forward
@@ -51,17 +50,21 @@ def take(tmp_path_factory, head):
 
 
 @pytest.fixture
-def recorded(tmp_path, take, monkeypatch):
-    """A copy of the take that a test may change, and its meshes. Its blank images are not searched
-    for the surface, which would take a third of the time."""
-    monkeypatch.setattr("stga_addon.tracking.seen.fit_surface", lambda head, fit, *_, **__: fit)
+def recorded(tmp_path, take, without_surface):
+    """A copy of the take that a test may change, and its meshes."""
     folder, meshes = take
     return shutil.copytree(folder, tmp_path, dirs_exist_ok=True), meshes
 
 
 def command(folder, *more):
-    named = {"--model": "head.npz", "--out": "out", "--landmarks": "points"}
-    paths = [word for name, file in named.items() for word in (name, str(folder / file))]
+    paths = (
+        "--model",
+        folder / "head.npz",
+        "--out",
+        folder / "out",
+        "--landmarks",
+        folder / "points",
+    )
     return stga("track", folder / "footage", *paths, *more)
 
 
@@ -78,14 +81,13 @@ def change(path, **values):
     write_npz(path, {**np.load(path), **values})
 
 
-def test_the_bundled_head_is_tracked_without_a_model(tmp_path, monkeypatch):
+@pytest.mark.usefixtures("without_surface")
+def test_the_bundled_head_is_tracked_without_a_model(tmp_path):
     """Catches a default that needs a file, and weights of another scale."""
-    monkeypatch.setattr("stga_addon.tracking.seen.fit_surface", lambda head, fit, *_, **__: fit)
     head = HeadModel(flame_model(None), "flame")
     meshes = record(tmp_path, head)
-    footage, out, points = (str(tmp_path / name) for name in ("footage", "out", "points"))
-    words = ["track", footage, "--out", out, "--landmarks", points, "--mattes", "none"]
-    assert main(words) == 0
+    paths = tmp_path / "footage", "--out", tmp_path / "out", "--landmarks", tmp_path / "points"
+    assert stga("track", *paths, "--mattes none") == 0
     capture = open_capture(tmp_path / "out", tmp_path / "head.npz")
     assert capture.flame_file == tmp_path / "out/bundled_head.npz"
     assert capture.flame.model.expression_names == head.model.expression_names
@@ -539,7 +541,7 @@ def test_no_face_is_found_on_the_back_of_a_head(recorded, capsys, head):
     folder, _ = recorded
     turned = replace(head.model, v_template=head.model.v_template * [-1, 1, -1])
     write_flame(turned, folder / "turned.npz")
-    words = ["--model", str(folder / "turned.npz"), "--out", str(folder / "out")]
-    assert stga("track", folder / "footage", *words) == 2
+    words = "track", folder / "footage", "--model", folder / "turned.npz", "--out", folder / "out"
+    assert stga(*words) == 2
     assert re.search(r"turned\.npz: shows a face in . of 9 pictures", capsys.readouterr().err)
     assert not (folder / "out").exists()
