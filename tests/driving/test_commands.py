@@ -22,6 +22,7 @@ from stga_addon.driving.performers import read_performance
 from stga_addon.export.playback import DEFAULT_FPS
 from stga_addon.files import write_json
 from stga_addon.flame.forward import flame_forward, neutral_frame
+from stga_addon.flame.parts import flame_model
 from stga_addon.flame.sequence import read_motion, sequence_mesh
 from stga_addon.jobs.track import MAX_MISFIT
 from stga_addon.render.video import video_writer
@@ -48,6 +49,7 @@ def files(tmp_path_factory):
     weights = np.zeros((10, 52))
     weights[:, COLUMN["jawOpen"]] = np.linspace(0, 0.9, 10)
     weights[:, COLUMN["jawLeft"]] = np.linspace(0, 0.5, 10)
+    weights[:, COLUMN["eyeLookOutLeft"]] = np.linspace(0, 1, 10)
     head = np.linspace([0, 0, 0], [0.4, 0, 0.2], 10)
     write_performance(folder / "take.csv", Performance(np.arange(10) / 30, weights, head, 30.0))
     camera = look_at(np.array([0.0, 0.0, 0.8]), np.zeros(3), 64, 64, 130.0)
@@ -57,8 +59,8 @@ def files(tmp_path_factory):
 
 
 def test_convert_there_and_back(files, tmp_path, capsys):
-    """Catches an unreadable or refitted motion, another rate, and a mirror or strength without
-    effect."""
+    """Catches an unreadable or refitted motion, another rate, gaze without eyeballs, and a mirror
+    or strength without effect."""
     out = tmp_path / "motion.npz"
     back = tmp_path / "back.csv"
     flame = files["flame.npz"]
@@ -86,6 +88,7 @@ def test_convert_there_and_back(files, tmp_path, capsys):
     out = tmp_path / "bundled.npz"
     back = tmp_path / "bundled.csv"
     assert stga("drive", files["take.csv"], "--out", out) == 0
+    assert read_motion(out, flame_model(None)).frame(9).eyes_pose[1] > 0.5
     assert stga("drive", out, "--out", back) == 0
     given = read_performance(files["take.csv"])
     found = read_performance(back)

@@ -61,13 +61,14 @@ def rich():
     return sequence, head_map(sequence, "rich")
 
 
+def frame_of(found, weights):
+    (frame,) = found.frames(Performance(np.zeros(1), weights[None], None, 1.0))
+    return frame
+
+
 def posed(sequence, found, weights):
     """(N, 3) face points of one row of weights."""
-    row = found.parameters(weights[None])[0]
-    count = sequence.model.n_expression
-    zero = np.zeros(3)
-    frame = FlameFrame(row[:count], zero, zero, row[count : count + 3], zero, row[count + 3 :])
-    mesh = flame_forward(sequence.model, sequence.shape, frame)
+    mesh = flame_forward(sequence.model, sequence.shape, frame_of(found, weights))
     return found.points.on(mesh, sequence.model.faces)
 
 
@@ -136,15 +137,12 @@ def test_directions(demo):
     assert smile[row[MOUTH_LEFT]] > smile[row[MOUTH_RIGHT]]
     assert posed(*demo, weights_of(jawLeft=1.0))[row[CHIN], 0] > rest[row[CHIN], 0] + 0.002
     assert_allclose(posed(*demo, weights_of(tongueOut=1.0)), rest, atol=1e-12)
-    zero = np.zeros(3)
     ball = model.weights[:, 3] > 0.9
     before = model.v_template[ball]
     pupil = before[:, 2].argmax()
     for name, axis, sign in (("Up", 1, 1), ("Out", 0, 1), ("In", 0, -1)):
-        values = found.parameters(weights_of(**{f"eyeLook{name}Left": 1.0})[None])[0]
-        eyes = values[model.n_expression + 3 :]
-        rest_face = np.zeros(model.n_expression)
-        frame = FlameFrame(rest_face, zero, zero, zero, zero, eyes)
+        frame = frame_of(found, weights_of(**{f"eyeLook{name}Left": 1.0}))
+        frame = replace(frame, expr=0 * frame.expr)
         moved = flame_forward(model, sequence.shape, frame)[ball][pupil] - before[pupil]
         assert sign * moved[axis] > 0.003, name
 

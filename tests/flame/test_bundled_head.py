@@ -12,13 +12,10 @@ from scipy.spatial import cKDTree
 from stga_addon.capture.camera import look_at
 from stga_addon.capture.mesh_geometry import rasterize
 from stga_addon.development.arkit_shapes import ict_names
-from stga_addon.driving.head_map import head_map
-from stga_addon.driving.inverse import arkit_weights
-from stga_addon.driving.performance import ARKIT_SHAPES, COLUMN, COUNT, Performance
+from stga_addon.driving.performance import ARKIT_SHAPES
 from stga_addon.flame.forward import flame_forward, joint_positions, neutral_frame
 from stga_addon.flame.model import BUNDLED_HEAD, JOINTS, SHAPE_STEP_M, torso_faces
 from stga_addon.flame.parts import flame_model, key_regions
-from stga_addon.flame.sequence import FlameSequence
 from stga_addon.flame.teeth import lip_pairs
 from stga_addon.tracking.solve import LID_SHAPES
 
@@ -187,22 +184,6 @@ def test_lips_part_when_the_jaw_opens(head):
     gaps = [norm(mesh[upper] - mesh[lower], axis=1) for mesh in meshes]
     assert gaps[0].max() < 0.002
     assert gaps[1].max() > 0.02
-
-
-def test_arkits_weights_are_its_coefficients(head):
-    """Catches a map that is fitted where it is exact, gaze without eyeballs, and weights that do
-    not come back."""
-    sequence = FlameSequence(head, np.zeros(head.n_identity), None, (), {}.__getitem__)
-    weights = np.zeros((2, COUNT))
-    given = {"jawOpen": 0.7, "mouthSmileLeft": 0.4, "eyeLookOutLeft": 1.0}
-    weights[0, [COLUMN[name] for name in given]] = list(given.values())
-    weights[1, COLUMN["browInnerUp"]] = 0.9
-    found = head_map(sequence, "bundled")
-    frames = found.frames(Performance(np.arange(2.0), weights, None, 1.0))
-    assert_allclose(frames[0].expr, expression(head, **given), atol=1e-12)
-    assert frames[0].eyes_pose[1] > 0.5  # the left eye looks to the person's left
-    assert not np.any([frame.jaw_pose for frame in frames])
-    assert_allclose(arkit_weights(frames, found, sequence), weights, atol=1e-12)
 
 
 def test_a_changed_model_file_is_read_again(tmp_path):
