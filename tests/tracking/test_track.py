@@ -324,16 +324,17 @@ def test_a_camera_at_the_side_is_not_blamed_for_what_landmarks_get_wrong_there(
     assert [text[:40] for text in warnings] == (told if is_told else [])
 
 
-class Counting:
-    """A detector that sees `faces` in each image."""
+class Detector:
+    """Sees faces by the brightness of an image, of which there are as many as `faces`, and
+    counts."""
 
-    def __init__(self, faces):
+    def __init__(self, *faces):
         self.faces = faces
         self.calls = 0
 
     def find(self, image, near=None):
         self.calls += 1
-        return self.faces
+        return self.faces[int(image[0, 0, 0]) % len(self.faces)]
 
 
 def test_detection_resumes_camera_by_camera(recorded):
@@ -341,7 +342,7 @@ def test_detection_resumes_camera_by_camera(recorded):
     head that jumps between two people."""
     folder, _ = recorded
     footage = open_footage(folder / "footage")
-    detector = Counting([np.ones((3, 2))] * 2)
+    detector = Detector([np.ones((3, 2))] * 2)
     with pytest.raises(KeyboardInterrupt):
         detect_landmarks(footage, detector, folder / "found", Crew(Helpers(1), cancel))
     assert len(list((folder / "found").iterdir())) == 2
@@ -355,22 +356,12 @@ def test_detection_resumes_camera_by_camera(recorded):
     assert_array_equal(written.points, 1)
     two = np.array([[0.0, 0.0], [9.0, 9.0]])
     with refusal(r"camera cam0 sees 5 of 5 frames with two faces, the first at timestep 0"):
-        detect_landmarks(footage, Counting([two, two + 30]), folder, Crew(Helpers(1)))
+        detect_landmarks(footage, Detector([two, two + 30]), folder, Crew(Helpers(1)))
 
 
 def cancel(stage, done, total):
     if done == 13:
         raise KeyboardInterrupt
-
-
-class Remembering:
-    """A detector that knows each image by its brightness."""
-
-    def __init__(self, landmarks):
-        self.landmarks = landmarks
-
-    def find(self, image, near=None):
-        return [self.landmarks[int(image[0, 0, 0])]]
 
 
 def numbered_take(folder, head):
@@ -395,7 +386,7 @@ def test_a_canceled_run_ends_as_an_unbroken_one(tmp_path, head, monkeypatch):
     numbers."""
     footage, places, exact = numbered_take(tmp_path, head)
     noisy = exact + np.random.default_rng(0).normal(0, 0.1, exact.shape)
-    use_detector(monkeypatch, Remembering(noisy), places)
+    use_detector(monkeypatch, Detector(*([own] for own in noisy)), places)
     model = tmp_path / "head.npz"
     track(footage, model, tmp_path / "unbroken")
     with pytest.raises(KeyboardInterrupt):
@@ -433,7 +424,7 @@ def test_landmarks_of_another_recording_are_not_used_again(tmp_path, head, monke
     """Catches landmarks of another offset, recording or head model under its name."""
     write_folders(tmp_path / "footage", (6, 8))
     write_flame(head.model, tmp_path / "head.npz")
-    use_detector(monkeypatch, Counting([]), places_on(head, LANDMARKS))
+    use_detector(monkeypatch, Detector([]), places_on(head, LANDMARKS))
     for name in ("out", "out_0", "out_1"):
         (tmp_path / name / "job").mkdir(parents=True)  # else nothing is left without a face
     none = "shows no face"
@@ -479,21 +470,10 @@ def test_footage_without_a_face_leaves_nothing(tmp_path, monkeypatch):
     does not name it."""
     write_video(tmp_path / "landscape.mp4", range(0, 200, 50))
     bundled = HeadModel(flame_model(None), "flame")
-    use_detector(monkeypatch, Counting([]), places_on(bundled, LANDMARKS))
+    use_detector(monkeypatch, Detector([]), places_on(bundled, LANDMARKS))
     with refusal(r"landscape.mp4.*: shows no face, nor does any other of 4 frames"):
         perform(Track(tmp_path / "landscape.mp4", None, tmp_path / "out"))
     assert not (tmp_path / "out").exists()
-
-
-class Glimpsing(Remembering):
-    """A detector that sees the face in some images alone."""
-
-    def __init__(self, landmarks, seen):
-        super().__init__(landmarks)
-        self.seen = seen
-
-    def find(self, image, near=None):
-        return super().find(image) if int(image[0, 0, 0]) % 5 in self.seen else []
 
 
 def test_a_face_that_is_hardly_ever_found_is_no_capture(tmp_path, head, monkeypatch):
@@ -501,12 +481,20 @@ def test_a_face_that_is_hardly_ever_found_is_no_capture(tmp_path, head, monkeypa
     that shows the face half of the time and is refused."""
     footage, places, points = numbered_take(tmp_path, head)
     model = tmp_path / "head.npz"
-    use_detector(monkeypatch, Glimpsing(points, {3}), places)
+
+    def seen_at(*timesteps):
+        return Detector(*([own] * (n % 5 in timesteps) for n, own in enumerate(points)))
+
+    use_detector(monkeypatch, seen_at(3), places)
     message = r"is found at 1 of 5 timesteps, expected 33% .* crop the video to head and shoulders"
     with refusal(message):
         track(footage, model, tmp_path / "out", TrackingOptions(mattes=False))
     assert not (tmp_path / "out").exists()
-    use_detector(monkeypatch, Glimpsing(points, {0, 4}), places)
+    use_detector(
+        monkeypatch,
+        seen_at(0, 4),
+        places,
+    )
     found = track(footage, model, tmp_path / "out", TrackingOptions(mattes=False))
     assert any("no face at 3 of 5 timesteps" in warning for warning in found.warnings)
 
