@@ -18,7 +18,7 @@ from stga_addon.training.optimize.state import new_offset
 from stga_addon.training.optimize.trainer import Trainer
 from stga_addon.training.run.checkpoint import trained_strain_range
 
-from .toys import quick_settings, random_state
+from .toys import adam_step, quick_settings, random_state
 
 
 def squeezed(toy):
@@ -95,8 +95,7 @@ def test_the_step_is_adam_in_float64():
     rng = default_rng(2)
     faces = 6
     rate = 0.02
-    ema_share = 0.1
-    epsilon = np.float32(1e-3)
+    options = adam.PLAIN._replace(ema_share=np.float32(0.1), epsilon=np.float32(1e-3))
     state = new_offset(rng.normal(0, 1, (faces, 3, 3)))
     offset = OFFSETS["strain_position"]
     value = state.value.astype(np.float64)
@@ -114,22 +113,17 @@ def test_the_step_is_adam_in_float64():
         splats = random_state(40, faces)
         splats = replace(splats, face=face, driven_offsets={offset.name: state})
         splats.gradients.xyz[:] = gradient
-        options = adam.PLAIN._replace(ema_share=np.float32(ema_share), epsilon=np.float32(epsilon))
         signal = {offset.signal: smoothed}.__getitem__
         rates = {offset.rate: rate}
         adam.step_offsets(splats, rows, signal, rates, options)
         for f in np.unique(face[rows]):
             steps[f] += 1
-            summed = sum(gradient[i].astype(np.float64) for i in rows if face[i] == f)
-            g = smoothed[f][:, None] * summed
-            if not np.isfinite(g).all():
-                continue
-            first[f] = 0.9 * first[f] + 0.1 * g
-            second[f] = 0.999 * second[f] + 0.001 * g**2
-            m = first[f] / (1 - 0.9 ** steps[f])
-            v = second[f] / (1 - 0.999 ** steps[f])
-            value[f] -= offset.rate_share * rate * m / (np.sqrt(v) + epsilon)
-            average[f] += max(ema_share, 4 / (steps[f] + 3)) * (value[f] - average[f])
+            g = smoothed[f][:, None] * gradient[rows[face[rows] == f]].astype(float).sum(0)
+            if np.isfinite(g).all():
+                own = (value[f], first[f], second[f])
+                own = adam_step(own, g, steps[f], offset.rate_share * rate, options)
+                value[f], first[f], second[f] = own
+                average[f] += max(0.1, 4 / (steps[f] + 3)) * (value[f] - average[f])
     assert_array_equal(state.steps, steps)
     assert steps.min() == 0
     for found, expected in ((state.value, value), (state.first, first), (state.average, average)):

@@ -40,6 +40,18 @@ def random_state(count, faces, seed=0, degree=1):
     return state
 
 
+def adam_step(arrays, gradient, count, rate, options):
+    """Value, first and second moment, float64, after a step by Adam's formula; count: of steps,
+    with this one."""
+    value, first, second = arrays
+    ahead = options.ahead
+    first = 0.9 * first + 0.1 * gradient
+    second = options.beta2 * second + (1 - options.beta2) * gradient**2
+    mean = ((1 - ahead) * first + ahead * gradient) / (1 - (1 - ahead) * 0.9**count)
+    deviation = np.sqrt(second / (1 - options.beta2**count))
+    return value - rate * mean / (deviation + options.epsilon), first, second
+
+
 def quick_settings(strategy="selective", **changes):
     """Without hull points, which have tests of their own."""
     return make_settings(strategy, **{"iterations": 100, "hull_points": False, **changes})
