@@ -82,5 +82,4 @@ def _paint(capture):
             view.image
         )
         alpha = to_uint8(render(blank, view.camera, (0.0, 0.0, 0.0), frames))[..., 0]
-        assert view.mask is not None
         Image.fromarray(np.where(alpha > 127, 255, 0).astype(np.uint8)).save(view.mask)

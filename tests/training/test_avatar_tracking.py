@@ -20,7 +20,6 @@ from stga_addon.avatar.embedding import face_frames, frame_backward
 from stga_addon.avatar.file import Avatar, read_avatar
 from stga_addon.capture.images import read_view
 from stga_addon.capture.mesh_geometry import silhouette
-from stga_addon.capture.model import Capture
 from stga_addon.capture.open import open_capture
 from stga_addon.files import read_npz, write_npz
 from stga_addon.flame.forward import parameters_gradient
@@ -46,16 +45,15 @@ from stga_addon.training.optimize.cpu_backend import frame_gradient
 from stga_addon.training.optimize.trainer import Trainer
 from stga_addon.training.run import session
 from stga_addon.training.run.checkpoint import read_checkpoint, write_checkpoint
-from stga_addon.training.run.folder import Run, read_run, with_refined_tracking
+from stga_addon.training.run.folder import read_run, with_refined_tracking
 from stga_addon.training.run.metrics_log import read_metrics
 from stga_addon.training.run.session import train_run
 from stga_addon.training.schedule import view_order
 
 from .heads import TIMESTEPS, write_head
 from .test_run import without_times
-from .toys import assert_same_state, quick_settings, stop_at
+from .toys import assert_same_state, quick_settings, run_of, stop_at
 
-Made = tuple[Capture, dict[int, np.ndarray]]
 NAMES = ("origin", "rotation", "scale")
 WHITE = np.ones(3, np.float32)
 
@@ -99,7 +97,7 @@ def test_a_finished_avatar_finds_the_head(person, lost):
     early, and a drift of the last timestep, which is tracked right already."""
     capture, true = lost
     tracking = RefinedTracking(capture, "stga")
-    stages = list[tuple[int, int]]()
+    stages = []
 
     def report(done, total):
         stages.append((done, total))
@@ -170,7 +168,6 @@ def test_without_masks_the_mesh_that_is_tried_cuts(person, lost, tmp_path):
     capture, true = lost
     views = []
     for view in capture.views["train"]:
-        assert view.mask is not None
         mask, image = (np.asarray(Image.open(path)) for path in (view.mask, view.image))
         path = tmp_path / f"{view.timestep}_{view.camera_index}.png"
         Image.fromarray(np.where(mask[..., None] > 0, image, np.uint8(90))).save(path)
@@ -374,7 +371,6 @@ def test_the_gradient_from_splats_to_parameters(lost):
     )
     parts = frame_gradient(splats, face, asked, np.arange(len(face)), frames())
     by_vertex = frame_backward(tracking.mesh(3), capture.faces, frames(), parts)
-    assert capture.flame is not None
     found = parameters_gradient(with_identity(capture.flame).model, tracking.frame(3), by_vertex)
     expected = differences(tracking, 3, lambda: loss().item(), 1e-6)
     assert_allclose(found, expected, rtol=1e-3, atol=1e-4 * np.abs(expected).max())
@@ -391,8 +387,7 @@ def run_folder(lost, tmp_path_factory):
 def make_run(capture, **changes):
     ours = {"iterations": 40, "lattice": 1, "tracking": True}
     changes = {**ours, "driven_offsets": ("strain_position", "strain_scale"), **changes}
-    settings = quick_settings("global", **changes)
-    return Run(capture.root, capture.root / "model.npz", "vhap", settings)
+    return replace(run_of(capture, **changes), flame=capture.root / "model.npz")
 
 
 def test_what_it_brings(lost, tmp_path):
@@ -480,13 +475,8 @@ def test_stopped_and_resumed_is_the_unbroken_run(stops, lost, run_folder, tmp_pa
     train_run(capture, tmp_path, make_run(capture), resume=True)
     ours, theirs = (read_checkpoint(folder) for folder in (tmp_path, run_folder))
     assert ours.rounds == theirs.rounds == 2
-    assert_array_equal(ours.tracking, theirs.tracking)
     assert_same_state(tmp_path, run_folder)
-    moved, expected = (
-        checkpoint.state.driven_offsets["strain_position"] for checkpoint in (ours, theirs)
-    )
-    assert np.abs(expected.value).max() > 0
-    assert_array_equal(moved.value, expected.value)
+    assert theirs.state.driven_offsets["strain_position"].value.any()
     for name in ("avatar.npz", "tracking.npz", "residuals.npz"):
         left, right = (read_npz(folder / name) for folder in (tmp_path, run_folder))
         assert_equal(left, right)
@@ -568,7 +558,6 @@ def test_the_runs_capture_has_the_refined_meshes(lost, right, run_folder):
     capture, _ = lost
     checkpoint = read_checkpoint(run_folder)
     tracking = RefinedTracking(capture, "stga")
-    assert checkpoint.tracking is not None
     tracking.parameters = checkpoint.tracking
     shown = with_refined_tracking(capture, run_folder)
     for timestep in TIMESTEPS:

@@ -114,7 +114,6 @@ def test_without_masks_the_mesh_is_the_mask(toy, tmp_path):
     view = walled.views["train"][0]
     small, image, mask = read_view(view, 0.7)
     found, made = without_backdrop(walled, small, image, mask, "mesh", GREEN)
-    assert made is not None
     mesh = rasterize(np.asarray(walled.mesh(view.timestep)), walled.faces, small.camera)[0] >= 0
     assert same_but_for_the_edge(made > 0, mesh)
     assert_array_equal(found[made == 0], np.broadcast_to([0, 255, 0], found[made == 0].shape))
@@ -151,7 +150,6 @@ def transmittance_error(capture, random_background):
         options = RenderOptions(np.zeros(3, np.float32), 0)
         rendering = trainer._backend._forward(splats, seen, options)
         mask = read_mask(view)
-        assert mask is not None
         errors.append(np.mean((1 - rendering.transmittance - mask / 255) ** 2))
     return float(np.mean(errors))
 

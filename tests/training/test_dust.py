@@ -1,5 +1,6 @@
 """Pruning of dust, and the sums of blend weights that tell it."""
 
+from copy import copy
 from dataclasses import replace
 
 import numpy as np
@@ -100,7 +101,8 @@ def test_a_turn_comes_once(toy):
     or where a run is resumed between two steps."""
     shares = np.cumsum(np.random.default_rng(0).uniform(0.001, 0.05, 60))
     shares = shares[shares < 1]
-    trainer = Trainer(toy, quick_settings("global", lattice=0), {})
+    begun = Trainer(toy, quick_settings("global", lattice=0), {})
+    trainer = copy(begun)
     turns = []
     trainer.changes = {"all": Recorded(turns)}
     for share in shares:
@@ -111,7 +113,7 @@ def test_a_turn_comes_once(toy):
     for stop in (1, 12, 29, 30, 31, 48):
         turns.clear()
         for part in (steps[:stop], steps[stop:]):
-            resumed = Trainer(toy, quick_settings("global", lattice=0), {})
+            resumed = copy(begun)
             resumed.iteration = 0 if part[0] == 0 else stop
             resumed.changes = {"all": Recorded(turns)}
             for share in part:

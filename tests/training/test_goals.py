@@ -1,7 +1,6 @@
 """When a run evaluates, and when it stops by itself."""
 
 import re
-from collections.abc import Callable
 from itertools import count
 
 import numpy as np
@@ -16,17 +15,10 @@ from stga_addon.training.evaluate.metrics import Quality
 from stga_addon.training.run import session
 from stga_addon.training.run import session as run_module
 from stga_addon.training.run.checkpoint import read_checkpoint
-from stga_addon.training.run.folder import Run
 from stga_addon.training.run.metrics_log import read_metrics
 from stga_addon.training.run.session import train_run
 
-from .toys import quick_settings
-
-Evaluate = Callable[..., Quality]
-
-
-def run_of(capture, **changes):
-    return Run(capture.root, None, "vhap", quick_settings("global", **{"lattice": 0, **changes}))
+from .toys import run_of
 
 
 def scores(values):
@@ -65,7 +57,7 @@ def clock(monkeypatch):
 
 def test_evaluation_keeps_to_its_share_of_the_time(toy, tmp_path, clock):
     """Catches evaluations that eat the budget, are counted as training, or hardly ever come."""
-    train_run(toy, tmp_path, run_of(toy, iterations=None, seconds=400.0))
+    train_run(toy, tmp_path, run_of(toy, lattice=0, iterations=None, seconds=400.0))
     lines = read_metrics(tmp_path)
     assert read_checkpoint(tmp_path).elapsed_s == 400 == read_checkpoint(tmp_path).iteration
     assert [line["evaluation_s"] for line in lines] == [3.0] * len(lines)
@@ -77,7 +69,7 @@ def test_evaluation_keeps_to_its_share_of_the_time(toy, tmp_path, clock):
 def test_forecasts_are_noted_and_told(toy, tmp_path, clock):
     """Catches forecasts that cannot be checked afterwards, or that nobody sees."""
     told = []
-    run = run_of(toy, iterations=200)
+    run = run_of(toy, lattice=0, iterations=200)
     train_run(toy, tmp_path, run, report=lambda progress: bool(told.append(progress)))
     lines = read_metrics(tmp_path)
     foretold = [line["iteration"] for line in lines if "forecast" in line]
@@ -91,7 +83,7 @@ def test_a_reached_target_ends_the_run(toy, tmp_path, monkeypatch):
     """Catches a target that is passed by or forgotten, or whose avatar an earlier one replaces."""
     values = iter([25.0, 29.0, 30.5, 30.5])
     monkeypatch.setattr(evaluator, "evaluate", scores(values))
-    run = run_of(toy, target_psnr=30.0)
+    run = run_of(toy, lattice=0, target_psnr=30.0)
     train_run(toy, tmp_path, run)
     assert read_checkpoint(tmp_path).iteration == 30
     train_run(toy, tmp_path, run, resume=True)
@@ -112,7 +104,7 @@ def test_a_run_that_no_longer_improves(toy, tmp_path, monkeypatch, clock, stop):
     falling = (30 - n / 10 for n in count())
     monkeypatch.setattr(evaluator, "evaluate", scores(falling))
     told = []
-    run = run_of(toy, iterations=None, seconds=200.0, stop_when_flat=stop)
+    run = run_of(toy, lattice=0, iterations=None, seconds=200.0, stop_when_flat=stop)
     train_run(toy, tmp_path, run, report=lambda progress: bool(told.append(progress.detail)))
     assert (read_checkpoint(tmp_path).iteration < 200) == stop
     if not stop:
@@ -134,9 +126,9 @@ def test_images_grow_where_settings_say_so(toy, tmp_path, monkeypatch):
 
     monkeypatch.setattr(session.Trainer, "step", note)
     settings = {"iterations": 20, "scale": 0.5, "coarse_share": 0.25}
-    train_run(toy, tmp_path / "small", run_of(toy, **settings))
+    train_run(toy, tmp_path / "small", run_of(toy, lattice=0, **settings))
     assert seen == [(30, 20)] * 20  # half of so few pixels shows too little
     seen.clear()
     monkeypatch.setattr(schedule, "MIN_COARSE_SIDE_PX", 10)
-    train_run(toy, tmp_path / "large", run_of(toy, **settings))
+    train_run(toy, tmp_path / "large", run_of(toy, lattice=0, **settings))
     assert seen == [(15, 10)] * 5 + [(30, 20)] * 15

@@ -24,8 +24,6 @@ from .toys import quick_settings
 pytestmark = pytest.mark.needs("adapter")
 
 SETTINGS = quick_settings("global", scale_limit=0.2)
-Counts = tuple[int, int, int]
-"""Splats, pixels, and pairs: found on the CPU, room for them on the GPU."""
 
 
 def splats_on(capture, count, log_scale):
@@ -53,8 +51,8 @@ def batch_of(capture, width, height):
 
 
 def cpu_bytes(capture, count, size, log_scale):
-    """Of the state and of the buffers that iterations share; without what a kernel allocates for
-    itself."""
+    """Counts of splats, pixels and pairs (here found; room for them on the GPU), and bytes of the
+    state and of the buffers that iterations share; without what a kernel allocates for itself."""
     state = new_state(splats_on(capture, count, log_scale))
     frames = FrameStore(capture, SETTINGS.convention)
     backend = CpuBackend(SETTINGS, frames, state)

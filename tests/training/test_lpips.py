@@ -17,11 +17,10 @@ from stga_addon.capture.model import View
 from stga_addon.training.evaluate import lpips
 from stga_addon.training.evaluate.lpips import read_network
 from stga_addon.training.evaluate.metrics import EvaluationView, evaluate
-from stga_addon.training.run.folder import Run
 from stga_addon.training.run.metrics_log import read_metrics
 from stga_addon.training.run.session import train_run
 
-from .toys import quick_settings, stop_at
+from .toys import run_of, stop_at
 
 LAYERS = (
     (3, 64, 11, 4, 2),
@@ -149,20 +148,16 @@ def test_another_file_is_refused(tmp_path, toy, monkeypatch):
         read_network(tmp_path)
     monkeypatch.setenv(lpips.WEIGHTS_VARIABLE, str(tmp_path / "none.ckpt"))
     with refusal(r"none\.ckpt"):
-        train_run(toy, tmp_path / "run", run_of(toy))
+        train_run(toy, tmp_path / "run", run_of(toy, lattice=0, iterations=20))
     assert not (tmp_path / "run").exists()
-
-
-def run_of(capture):
-    return Run(capture.root, None, "vhap", quick_settings("global", lattice=0, iterations=20))
 
 
 def test_only_the_final_evaluation_measures_lpips(toy, tmp_path, weights_file, monkeypatch):
     """Catches slow evaluations, a cancel that waits for LPIPS, and a missing final figure."""
     monkeypatch.setenv(lpips.WEIGHTS_VARIABLE, str(weights_file))
-    train_run(toy, tmp_path / "run", run_of(toy), report=stop_at(11))
+    train_run(toy, tmp_path / "run", run_of(toy, lattice=0, iterations=20), report=stop_at(11))
     assert not any("lpips" in line for line in read_metrics(tmp_path / "run"))
-    train_run(toy, tmp_path / "run", run_of(toy), resume=True)
+    train_run(toy, tmp_path / "run", run_of(toy, lattice=0, iterations=20), resume=True)
     *before, last = read_metrics(tmp_path / "run")
     assert not any("lpips" in line for line in before)
     assert last["lpips"] > 0

@@ -37,12 +37,11 @@ from stga_addon.training.evaluate.metrics import (
     visible_pixels,
 )
 from stga_addon.training.optimize.image_preparation import exposure_correction
-from stga_addon.training.run.folder import Run
 from stga_addon.training.run.metrics_log import read_metrics
 from stga_addon.training.run.session import train_run
 from stga_addon.training.settings import TrainingSettings
 
-from .toys import quick_settings
+from .toys import run_of
 
 HEIGHT = 31
 WIDTH = 24
@@ -301,10 +300,9 @@ def test_transparent_images_lie_over_the_settings_background(toy, tmp_path):
     gray = (0.2, 0.4, 0.6)
     target = read_evaluation_view(capture, views[0], gray).target
     assert_array_equal(target[0, 0], [51, 102, 153])
-    settings = replace(
-        quick_settings("global", lattice=0, iterations=2), background=gray, random_background=False
-    )
-    path = train_run(capture, tmp_path / "run", Run(toy.root, None, "vhap", settings))
+    plain = {"background": gray, "random_background": False}
+    run = run_of(capture, lattice=0, iterations=2, **plain)
+    path = train_run(capture, tmp_path / "run", run)
     # behind the cameras: nothing but the background is rendered
     outside = np.ones(capture.neutral.shape) * 10
     avatar = read_avatar(path)

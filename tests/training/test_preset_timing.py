@@ -1,7 +1,6 @@
 """Preset timing."""
 
 from dataclasses import replace
-from typing import Any
 
 import pytest
 from refusal import refusal
@@ -38,7 +37,7 @@ def shares(monkeypatch):
         once_s = 0.0
 
         def __init__(self, *_, **__):
-            self.changes: dict[str, Any] = {}
+            self.changes = {}
 
         def prepare_turns(self):
             watch.now += self.once_s

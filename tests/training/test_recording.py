@@ -137,7 +137,7 @@ def test_the_world_is_turned_as_the_avatars_was(light_turns, keeps_world, record
     for timestep in after.timesteps:
         expected = moved.apply(before[timestep])
         assert_allclose(after.mesh(timestep), expected, atol=2e-6)
-    told = list[int]()
+    told = []
 
     def stop_once_turned(done, total):
         told.append(done)
@@ -171,7 +171,7 @@ def test_another_person_is_missed(recording, hasty):
 def test_parts_of_another_avatar_are_not_taken(recording, tmp_path, monkeypatch):
     """Catches a cancelled tracking that begins anew, or goes on with another avatar's."""
     (run, root) = recording
-    calls = list[int]()
+    calls = []
     every = [1] * len(TIMESTEPS)
     twice = [len(TIMESTEPS)] * 2
     shutil.copytree(root, tmp_path / "start")

@@ -25,13 +25,13 @@ from stga_addon.training.run.continuation import (
     replayed_views,
     views_of_region,
 )
-from stga_addon.training.run.folder import Continuation, Run, read_run
+from stga_addon.training.run.folder import Continuation, read_run
 from stga_addon.training.run.metrics_log import read_metrics
 from stga_addon.training.run.session import train_run
 from stga_addon.training.schedule import learning_rates
 from stga_addon.training.settings import Rates, TrainingSettings
 
-from .toys import assert_same_state, quick_settings, stop_at
+from .toys import assert_same_state, run_of, stop_at
 
 ITERATIONS = 16
 
@@ -40,8 +40,9 @@ ITERATIONS = 16
 def finished(toy, tmp_path_factory):
     """With strain color, density control and hull points; the avatar is the last state's."""
     out = tmp_path_factory.mktemp("finished") / "run"
-    settings = quick_settings(
-        "global",
+    without_held_out = replace(toy, views={"train": toy.views["train"]})
+    run = run_of(
+        without_held_out,
         iterations=12,
         driven_offsets=("strain_color",),
         lattice=1,
@@ -51,8 +52,7 @@ def finished(toy, tmp_path_factory):
         stray_limit=0.3,
         hull_points=True,
     )
-    without_held_out = replace(toy, views={"train": toy.views["train"]})
-    train_run(without_held_out, out, Run(toy.root, None, "vhap", settings))
+    train_run(without_held_out, out, run)
     return out
 
 

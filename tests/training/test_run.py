@@ -16,12 +16,12 @@ from stga_addon.training.evaluate.forecast import kept_line
 from stga_addon.training.evaluate.metrics import Quality
 from stga_addon.training.run import session as run_module
 from stga_addon.training.run.checkpoint import read_checkpoint, read_selection
-from stga_addon.training.run.folder import Run, read_residuals, read_run
+from stga_addon.training.run.folder import read_residuals, read_run
 from stga_addon.training.run.metrics_log import read_metrics
 from stga_addon.training.run.session import train_more, train_run
 from stga_addon.training.settings import STRATEGIES
 
-from .toys import assert_same_state, quick_settings, stop_at
+from .toys import assert_same_state, run_of, stop_at
 
 ITERATIONS = 24
 # Everything that changes a state happens in a few iterations.
@@ -32,8 +32,7 @@ CLOCKED = ("seconds", "evaluation_s", "wall_s", "peak_memory_mb", "forecast")
 
 
 def make_run(capture, strategy="selective", **changes):
-    settings = quick_settings(strategy, **{"iterations": ITERATIONS, **BUSY, **changes})
-    return Run(capture.root, None, "vhap", settings)
+    return run_of(capture, strategy, **{"iterations": ITERATIONS, **BUSY, **changes})
 
 
 def without_times(lines):
@@ -361,10 +360,8 @@ def test_more_training(toy, unbroken, tmp_path, monkeypatch):
 @pytest.mark.parametrize("schedule", ["default", "paper"])
 def test_every_strategy_and_schedule_runs(toy, tmp_path, strategy, schedule):
     """Catches a combination that no other test trains, and an avatar's wrong convention."""
-    settings = quick_settings(
-        strategy, schedule=schedule, iterations=8, stray_reset_interval=3, density_interval=3
-    )
-    train_run(toy, tmp_path, Run(toy.root, None, "vhap", settings))
+    often = {"stray_reset_interval": 3, "density_interval": 3}
+    train_run(toy, tmp_path, run_of(toy, strategy, schedule=schedule, iterations=8, **often))
     avatar = read_avatar(tmp_path / "avatar.npz")
     assert avatar.convention == ("gaussian_avatars" if strategy == "gaussian-avatars" else "stga")
     assert set(avatar.splats.face.tolist()) == set(range(len(toy.faces)))

@@ -15,25 +15,24 @@ from stga_addon.avatar.strain import (
     strain_basis,
     trained_range,
 )
-from stga_addon.files import write_npz
+from stga_addon.files import read_npz, write_npz
 from stga_addon.training.evaluate.forecast import kept_line
 from stga_addon.training.evaluate.metrics import evaluate_avatar
 from stga_addon.training.optimize.frames import FrameStore
 from stga_addon.training.run.checkpoint import STRAIN_RANGE, trained_strain_range
-from stga_addon.training.run.folder import Continuation, Run
-from stga_addon.training.run.identity import identity_of
+from stga_addon.training.run.folder import Continuation
 from stga_addon.training.run.metrics_log import read_metrics
 from stga_addon.training.run.session import train_run
 from stga_addon.training.settings import Rates
 
-from .toys import quick_settings, random_splats, stop_at
+from .toys import random_splats, run_of, stop_at
 
 COLORS = "strain_color", "normal_color"
 
 
 def deformed(toy, timestep):
     """The toy's mesh, stretched by another amount along each axis in each timestep."""
-    return np.asarray(toy.neutral) * (1 + 0.03 * np.random.default_rng(timestep).normal(size=3))
+    return toy.neutral * (1 + 0.03 * np.random.default_rng(timestep).normal(size=3))
 
 
 def strains(toy, timesteps):
@@ -44,14 +43,14 @@ def strains(toy, timesteps):
 def test_a_run_writes_the_range_of_what_it_trained(toy, tmp_path):
     """Catches a range of held-out expressions, one that clips, and one nobody needs."""
     capture = replace(toy, mesh=lambda timestep: deformed(toy, timestep))
-    settings = quick_settings("global", iterations=4, lattice=0, driven_offsets=COLORS)
-    found = read_avatar(train_run(capture, tmp_path / "on", Run(toy.root, None, "vhap", settings)))
+    run = run_of(capture, iterations=4, lattice=0, driven_offsets=COLORS)
+    found = read_avatar(train_run(capture, tmp_path / "on", run))
     trained = strains(toy, {view.timestep for view in toy.views["train"]})
     limits = found.strain_range
     assert (limits[:, 0] <= trained.min(0)).all()
     assert (trained.max(0) <= limits[:, 1]).all()
     assert (trained.max(0) * 1.21 + 1e-6 >= limits[:, 1])[trained.max(0) > 0].all()
-    without = Run(toy.root, None, "vhap", replace(settings, driven_offsets=()))
+    without = run_of(capture, iterations=4, lattice=0)
     assert read_avatar(train_run(capture, tmp_path / "off", without)).strain_range is None
 
 
@@ -85,16 +84,15 @@ def test_a_continuation_keeps_what_its_parent_saw(toy, tmp_path):
 def test_colors_follow_compression_and_shear_but_no_stretch(toy):
     """Catches wrinkles of opposite sign in stretched skin, or of the least compression."""
     basis = FrameStore(toy, "stga", strain=True).strain
-    assert basis is not None
     larger, little, smaller = (
-        deformation(basis, scale * np.asarray(toy.neutral)) for scale in (1.05, 0.985, 0.9)
+        deformation(basis, scale * toy.neutral) for scale in (1.05, 0.985, 0.9)
     )
     assert_array_equal(larger[:, :2], np.float32(-MIN_COMPRESSION))
     assert_array_equal(little[:, :2], np.float32(-MIN_COMPRESSION))
     assert (smaller[:, :2] < -0.4).all()
-    limits = trained_strain_range(toy, lambda t: 1.05 * np.asarray(toy.neutral), None)
+    limits = trained_strain_range(toy, lambda t: 1.05 * toy.neutral, None)
     assert_array_equal(limits[:, :, :2], np.float32(-MIN_COMPRESSION))
-    sheared = np.asarray(toy.neutral) @ np.array([[1, 0.1, 0], [0, 1, 0], [0, 0, 1.0]])
+    sheared = toy.neutral @ np.array([[1, 0.1, 0], [0, 1, 0], [0, 0, 1.0]])
     shear = deformation(basis, sheared)[:, 2]
     assert shear.min() < -0.05
     assert shear.max() > 0.05
@@ -107,7 +105,7 @@ def test_the_range_covers_an_expression_of_few_timesteps(toy):
     views = {"train": tuple(replace(view, timestep=timestep) for timestep in range(1200))}
 
     def mesh(timestep):
-        return np.asarray(toy.neutral) * (0.85 if timestep in blink else 1.0)
+        return toy.neutral * (0.85 if timestep in blink else 1.0)
 
     basis = strain_basis(toy.neutral, toy.faces, trained_range(len(toy.faces)))
     limits = trained_strain_range(replace(toy, views=views), mesh, None)
@@ -119,32 +117,24 @@ def test_evaluation_while_training_measures_the_avatar_that_is_written(toy, tmp_
     strong = {view.timestep for view in toy.views["val"]} - {0}
 
     def mesh(timestep):
-        return np.asarray(toy.neutral) * (0.8 if timestep in strong else 1.0)
+        return toy.neutral * (0.8 if timestep in strong else 1.0)
 
     weak = tuple(view for view in toy.views["train"] if view.timestep not in strong)
     plain = {"iterations": 20, "lattice": 0, "sh_degree": 0, "sh_steps": (), "ema_share": 1.0}
     rates = Rates(strain_color=0.5)
-    settings = quick_settings("global", driven_offsets=COLORS, rates=rates, **plain)
     capture = replace(toy, mesh=mesh, views={**toy.views, "train": weak})
-    path = train_run(capture, tmp_path / "run", Run(toy.root, None, "vhap", settings))
-    best = kept_line(read_metrics(tmp_path / "run"), settings)
+    run = run_of(capture, driven_offsets=COLORS, rates=rates, **plain)
+    path = train_run(capture, tmp_path / "run", run)
+    best = kept_line(read_metrics(tmp_path / "run"), run.settings)
     found = evaluate_avatar(read_avatar(path), capture, "val").psnr
     assert found == pytest.approx(best["psnr"], abs=1e-3)
 
 
-def test_another_runs_range_is_refused(toy, tmp_path):
-    """Catches a resumed run that clips its colors to what another run has seen."""
-    settings = quick_settings("global", iterations=4, lattice=0, driven_offsets=COLORS)
-    run = Run(toy.root, None, "vhap", settings)
-    out = tmp_path / "run"
-    train_run(toy, out, run, report=stop_at(2))
-    limits = trained_range(len(toy.faces))
-    digest = identity_of(toy, "vhap", settings).digest
-    for (stored, identity), says in (
-        ((limits, "other"), "belongs to another run than run.json"),
-        ((limits[1:], digest), r"strain_range is float32 .*, expected float32 \(320, 2, 6\)"),
-    ):
-        arrays = {"strain_range": stored, "identity": np.frombuffer(identity.encode(), np.uint8)}
-        write_npz(out / STRAIN_RANGE, arrays)
-        with refusal(rf"strain_range\.npz: {says}"):
-            train_run(toy, out, run, resume=True)
+def test_a_range_of_another_mesh_is_refused(toy, tmp_path):
+    """Catches a resumed run whose kernels read beyond its file."""
+    run = run_of(toy, iterations=4, lattice=0, driven_offsets=COLORS)
+    train_run(toy, tmp_path, run, report=stop_at(2))
+    arrays = read_npz(tmp_path / STRAIN_RANGE)
+    write_npz(tmp_path / STRAIN_RANGE, {**arrays, "strain_range": arrays["strain_range"][1:]})
+    with refusal(r"strain_range\.npz: .* is float32 .*, expected float32 \(320, 2, 6\)"):
+        train_run(toy, tmp_path, run, resume=True)

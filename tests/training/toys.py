@@ -1,5 +1,6 @@
 """States and settings small enough to check by hand."""
 
+import json
 import math
 from dataclasses import replace
 
@@ -7,9 +8,10 @@ import numpy as np
 from avatar.conftest import splats_of
 from numpy.testing import assert_array_equal
 
+from stga_addon.files import read_npz
 from stga_addon.training.optimize.cpu_backend import CpuBackend
 from stga_addon.training.optimize.state import arrays_of, new_state
-from stga_addon.training.run.checkpoint import read_checkpoint
+from stga_addon.training.run.folder import CHECKPOINT, Run
 from stga_addon.training.settings import make_settings
 
 
@@ -57,6 +59,11 @@ def quick_settings(strategy="selective", **changes):
     return make_settings(strategy, **{"iterations": 100, "hull_points": False, **changes})
 
 
+def run_of(capture, strategy="global", **changes):
+    """A run of a capture, of `quick_settings`."""
+    return Run(capture.root, None, "vhap", quick_settings(strategy, **changes))
+
+
 def stop_at(iteration):
     """A report that stops a training after so many iterations; None: not at all."""
     return lambda progress: progress.figures().get("iteration", 0) >= (iteration or math.inf)
@@ -64,15 +71,13 @@ def stop_at(iteration):
 
 def assert_same_state(folder, expected):
     """The checkpoints of two runs, bit for bit."""
-    ours = read_checkpoint(folder)
-    theirs = read_checkpoint(expected)
-    right = arrays_of(theirs.state)
-    for name, array in arrays_of(ours.state).items():
-        np.testing.assert_array_equal(
-            array.view(np.uint8), right[name].view(np.uint8), err_msg=name
-        )
-    for name in ("iteration", "visit", "initial_count"):
-        assert getattr(ours, name) == getattr(theirs, name)
+    ours, theirs = (read_npz(each / CHECKPOINT) for each in (folder, expected))
+    counts, right = (json.loads(arrays.pop("meta").tobytes()) for arrays in (ours, theirs))
+    assert ours.keys() == theirs.keys()
+    for name, array in ours.items():
+        assert_array_equal(array.view(np.uint8), theirs[name].view(np.uint8), err_msg=name)
+    for name in ("iteration", "visit", "initial_count", "rounds"):
+        assert counts[name] == right[name], name
 
 
 class Rows(CpuBackend):
