@@ -35,7 +35,7 @@ from stga_addon.training.schedule import learning_rates
 from .test_driven_offsets import SIZES, squeezed
 from .test_run import make_run
 from .test_trainer import large, view_of
-from .toys import assert_only_selected_changed, assert_same_state, bits, quick_settings, stop_at
+from .toys import assert_only_selected_changed, assert_same_run, bits, quick_settings, stop_at
 
 pytestmark = pytest.mark.needs("adapter")
 
@@ -374,5 +374,5 @@ def test_stopped_and_resumed_is_the_unbroken_run(toy, tmp_path):
     train_run(squeezed(toy), broken, run, report=stop_at(6))
     assert read_checkpoint(broken).iteration == 6
     train_run(squeezed(toy), broken, run, resume=True)
-    assert_same_state(broken, whole)
+    assert_same_run(broken, whole)
     assert following(read_checkpoint(whole).state)["strain_color/steps"].max() > 3

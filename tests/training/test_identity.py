@@ -23,7 +23,7 @@ from stga_addon.training.run.folder import device_of, open_run, read_run, write_
 from stga_addon.training.run.identity import difference, identity_of
 from stga_addon.training.run.session import train_run
 
-from .toys import assert_same_state, quick_settings, run_of, stop_at
+from .toys import assert_same_run, quick_settings, run_of, stop_at
 
 ITERATIONS = 12
 
@@ -271,7 +271,7 @@ def test_interrupt_saves_and_resumes_to_the_same_bits(toy, tmp_path):
     assert len(read_avatar(out / "avatar.npz").splats) == len(toy.faces)
     train_run(toy, out, make_run(toy), resume=True)
     train_run(toy, unbroken, make_run(toy))
-    assert_same_state(out, unbroken)
+    assert_same_run(out, unbroken)
 
     def interrupt_twice(progress):
         if progress.figures().get("iteration", 0) == 5:

@@ -11,7 +11,8 @@ from numpy.testing import assert_array_equal
 from stga_addon.files import read_npz
 from stga_addon.training.optimize.cpu_backend import CpuBackend
 from stga_addon.training.optimize.state import arrays_of, new_state
-from stga_addon.training.run.folder import CHECKPOINT, Run
+from stga_addon.training.run.folder import CHECKPOINT, RUN, Run
+from stga_addon.training.run.metrics_log import METRICS, read_metrics
 from stga_addon.training.settings import make_settings
 
 
@@ -78,6 +79,31 @@ def assert_same_state(folder, expected):
         assert_array_equal(array.view(np.uint8), theirs[name].view(np.uint8), err_msg=name)
     for name in ("iteration", "visit", "initial_count", "rounds"):
         assert counts[name] == right[name], name
+
+
+CLOCKED = ("seconds", "evaluation_s", "wall_s", "peak_memory_mb", "forecast")
+"""Fields of a metrics line that depend on how fast the machine was."""
+
+
+def without_times(lines):
+    """Metrics without wall times; sums of float32 rows to seven digits."""
+    kept = [{k: v for k, v in line.items() if k not in CLOCKED} for line in lines]
+    for line in kept:
+        line |= {k: float(f"{v:.7g}") for k, v in line.items() if k.startswith(("loss", "ssim"))}
+    return kept
+
+
+def assert_same_run(folder, expected):
+    """Two runs at their end: states and files bit for bit, and evaluations but for times."""
+    assert_same_state(folder, expected)
+    ours, theirs = (
+        {path.name: path.read_bytes() for path in each.iterdir()} for each in (folder, expected)
+    )
+    assert ours.keys() == theirs.keys()
+    for name, content in ours.items():
+        assert content == theirs[name] or name in (CHECKPOINT, METRICS, RUN), name
+    lines, right = (without_times(read_metrics(each)) for each in (folder, expected))
+    assert lines == right
 
 
 class Rows(CpuBackend):

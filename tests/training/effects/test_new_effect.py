@@ -28,7 +28,7 @@ from stga_addon.training.run.folder import Continuation, Run
 from stga_addon.training.run.session import train_run
 
 from ..test_driven_offsets import squeezed
-from ..toys import assert_same_state, quick_settings, stop_at
+from ..toys import assert_same_run, quick_settings, stop_at
 
 NAME = "toy_growth"
 
@@ -87,7 +87,7 @@ def test_it_is_decided_trained_and_resumed_to_the_same_bits(capture, tmp_path):
     train_run(capture, tmp_path / "parts", run, report=stop_at(13))
     assert read_checkpoint(tmp_path / "parts").iteration == 13
     train_run(capture, tmp_path / "parts", run, resume=True)
-    assert_same_state(tmp_path / "parts", tmp_path / "whole")
+    assert_same_run(tmp_path / "parts", tmp_path / "whole")
     whole = read_checkpoint(tmp_path / "whole").state
     avatar = read_avatar(tmp_path / "parts" / "avatar.npz")
     assert_array_equal(avatar.driven_offsets[NAME], whole.driven_offsets[NAME].average)
