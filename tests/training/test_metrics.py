@@ -1,7 +1,6 @@
 """Image quality against numpy and scipy: exposure, which pixels count, residuals."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -31,15 +30,12 @@ from stga_addon.training.evaluate.metrics import (
     evaluate_avatar,
     known_exposure,
     match_exposure,
-    psnr,
     read_evaluation_view,
     triangle_residuals,
     visible_pixels,
 )
-from stga_addon.training.optimize.image_preparation import exposure_correction
 from stga_addon.training.run.metrics_log import read_metrics
 from stga_addon.training.run.session import train_run
-from stga_addon.training.settings import TrainingSettings
 
 from .toys import run_of
 
@@ -69,32 +65,21 @@ def write_views(root, count):
     return [View(n, 0, camera, f"{n}.png", root / f"{n}.png") for n in range(count)]
 
 
-def test_psnr():
-    """Catches wrong axes, a peak of 255, natural logarithms, and a mask ignored."""
-    target = random_image(0)
-    image = default_rng(1).random((3, HEIGHT, WIDTH)).astype(np.float32)
-    error = (image.astype(float) - np.moveaxis(target / 255, 2, 0)) ** 2
-    assert psnr(image, target) == pytest.approx(10 * np.log10(1 / error.mean()), abs=1e-4)
-    where = default_rng(2).random((HEIGHT, WIDTH)) < 0.2
-    wanted = np.mean([error[c][where].mean() for c in range(3)])
-    assert psnr(image, target, where) == pytest.approx(10 * np.log10(1 / wanted), abs=1e-4)
-    assert psnr((target.transpose(2, 0, 1) / 255).astype(np.float32), target) > 100
-
-
 def test_evaluate_means_over_views_and_clips(tmp_path):
-    """Catches PSNR of the mean error, another SSIM, and values over one counted double."""
+    """Catches PSNR of the mean error, of other axes, a peak of 255 or natural logarithms, an
+    infinite one, another SSIM, and values over one counted double."""
     views = write_views(tmp_path, 3)
     drawn = {
         view.name: default_rng(9).normal(0.5, 0.5, (3, HEIGHT, WIDTH)).astype(np.float32)
         for view in views
     }
-    drawn["2.png"] = (random_image(2).transpose(2, 0, 1) / 255 * 0.9 + 0.05).astype(np.float32)
+    drawn["2.png"] = (random_image(2).transpose(2, 0, 1) / 255).astype(np.float32)
     quality = evaluate(lambda view: drawn[view.name], sights_of(views))
     pairs = [
         (np.clip(drawn[view.name], 0, 1).transpose(1, 2, 0).astype(float), random_image(n) / 255)
         for n, view in enumerate(views)
     ]
-    psnrs = [-10 * np.log10(np.mean((a - b) ** 2)) for a, b in pairs]
+    psnrs = [-10 * np.log10(max(np.mean((a - b) ** 2), 1e-12)) for a, b in pairs]
     assert quality.psnr == pytest.approx(np.mean(psnrs), abs=1e-3)
     ssims = [reference_ssim(a, b) for a, b in pairs]
     assert quality.ssim == pytest.approx(np.mean(ssims), abs=1e-4)
@@ -160,18 +145,6 @@ def test_against_the_formula():
     assert detail_difference(same, target) == pytest.approx(0, abs=1e-6)
 
 
-def test_detail_that_is_a_pixel_off_beats_blur():
-    """Catches a criterion that, like PSNR, keeps the blurred state instead of hair."""
-    rng = default_rng(1)
-    gray = gaussian_filter(rng.random((96, 96)), (4, 0.8)).astype(np.float32)
-    strands = np.repeat((gray - gray.min())[None] / np.ptp(gray), 3, 0)
-    target = (255 * strands).round().astype(np.uint8).transpose(1, 2, 0)
-    moved = np.roll(strands, 1, axis=2)
-    blurred = gaussian_filter(strands, (0, 0, 2.5))
-    assert psnr(blurred, target) > psnr(moved, target)
-    assert detail_difference(moved, target) < 0.5 * detail_difference(blurred, target)
-
-
 SIDE = 32
 
 
@@ -181,22 +154,6 @@ def head_and_image():
     head[6:26, 8:24] = True
     noise = default_rng(0).uniform(0.2, 0.7, (3, SIDE, SIDE))
     return head, np.where(head, noise, 1.0).astype(np.float32)
-
-
-def test_inverts_what_training_corrects():
-    """Catches gain and offset swapped, mixed channels, a background that changes."""
-    head, image = head_and_image()
-    gain = np.array([1.1, 0.9, 1.2])
-    offset = np.array([5.0, -8.0, 2.0])
-    levels = 255 * image.transpose(1, 2, 0)
-    target = np.where(head[..., None], gain * levels + offset, levels).round().astype(np.uint8)
-    matched = match_exposure(image, target, head, head)
-    assert np.abs(255 * matched - target.transpose(2, 0, 1)).max() < 2
-    assert np.array_equal(matched[:, ~head], image[:, ~head])
-    correct = exposure_correction(TrainingSettings(iterations=1, exposure=((0.0, *gain, *offset),)))
-    view = View(0, 0, Camera(SIDE, SIDE, 50.0, 50.0, 16.0, 16.0, np.eye(4)), "0.png", Path("0.png"))
-    back = correct(view, target, (255 * head).astype(np.uint8))
-    assert np.abs(back - levels).max() < 3
 
 
 def test_a_rendering_of_one_color_stays_finite():
