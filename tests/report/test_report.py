@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from command_line import refused, stga
+from command_line import stga
 from numpy.testing import assert_array_equal
 from PIL import Image
 
@@ -242,6 +242,3 @@ def test_a_preset_brings_its_iterations(toy_root, tmp_path, capsys, monkeypatch)
     assert stga(*train, tmp_path / "counted", "--preset final --iterations 3") == 0
     settings = read_run(tmp_path / "counted").settings
     assert (settings.preset, settings.seconds, settings.iterations) == ("final", None, 3)
-    assert "--preset: this run began with final" in refused(
-        capsys, *train, tmp_path / "counted", "--resume --preset draft"
-    )

