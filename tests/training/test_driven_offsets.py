@@ -43,7 +43,7 @@ def make_trainer(capture, *offsets, seed=0):
 
 
 @pytest.mark.parametrize("name", OFFSETS)
-def test_the_step_is_adams_on_the_gradient_of_the_loss(toy, name):
+def test_the_gradient_is_that_of_the_loss(toy, name):
     """Catches a gradient of the wrong sign, unit or axes, and one summed over other splats: against
     differences of the loss by each coefficient of a few triangles."""
     capture = squeezed(toy)
@@ -63,9 +63,7 @@ def test_the_step_is_adams_on_the_gradient_of_the_loss(toy, name):
         return trainer.step(view, target, 0.0)
 
     loss(before)
-    stepped = position.value.copy()
-    first = position.first.copy()
-    gradient = first / (1 - float(adam.PLAIN.beta1))
+    gradient = position.first / (1 - float(adam.PLAIN.beta1))
     assert position.steps.max() == 1
     touched = np.flatnonzero(position.steps)
     assert len(touched)
@@ -80,11 +78,6 @@ def test_the_step_is_adams_on_the_gradient_of_the_loss(toy, name):
             ends.append(loss(changed))
         slope = (ends[0] - ends[1]) / (2 * step)
         assert_allclose(gradient[face, component, axis], slope, rtol=0.1)
-    rate = offset.rate_share * getattr(trainer.settings.rates, offset.rate)
-    moved = (stepped - before)[strongest]
-    # Adam's first step is nearly as long as the rate
-    assert_allclose(np.abs(moved).max((1, 2)), rate, rtol=0.1)
-    assert (np.sign(moved) == -np.sign(gradient[strongest])).all()
 
 
 def test_the_step_is_adam_in_float64():

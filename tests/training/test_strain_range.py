@@ -35,17 +35,14 @@ def deformed(toy, timestep):
     return toy.neutral * (1 + 0.03 * np.random.default_rng(timestep).normal(size=3))
 
 
-def strains(toy, timesteps):
-    basis = strain_basis(toy.neutral, toy.faces, trained_range(len(toy.faces)))
-    return np.stack([deformation(basis, deformed(toy, t)) for t in sorted(timesteps)])
-
-
 def test_a_run_writes_the_range_of_what_it_trained(toy, tmp_path):
     """Catches a range of held-out expressions, one that clips, and one nobody needs."""
     capture = replace(toy, mesh=lambda timestep: deformed(toy, timestep))
     run = run_of(capture, iterations=4, lattice=0, driven_offsets=COLORS)
     found = read_avatar(train_run(capture, tmp_path / "on", run))
-    trained = strains(toy, {view.timestep for view in toy.views["train"]})
+    basis = strain_basis(toy.neutral, toy.faces, trained_range(len(toy.faces)))
+    timesteps = {view.timestep for view in toy.views["train"]}
+    trained = np.stack([deformation(basis, deformed(toy, t)) for t in timesteps])
     limits = found.strain_range
     assert (limits[:, 0] <= trained.min(0)).all()
     assert (trained.max(0) <= limits[:, 1]).all()
