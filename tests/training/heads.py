@@ -10,6 +10,7 @@ from stga_addon.avatar.embedding import face_frames
 from stga_addon.avatar.lattice import lattice_splats
 from stga_addon.capture.open import open_capture
 from stga_addon.render.render import render, to_uint8
+from stga_addon.training.optimize.avatar_tracking import AvatarTracking
 
 TIMESTEPS = (0, 2, 3, 5, 6)
 CAMERAS = range(5)
@@ -35,6 +36,19 @@ def write_head(root, error=1.0):
     meshes = {timestep: true.mesh(timestep) for timestep in TIMESTEPS}
     _lose_track(root, error)
     return open_capture(root, model), meshes
+
+
+def parameters_of(capture, timesteps):
+    """(T, P) as tracked."""
+    return np.stack([capture.flame.frame(timestep).parameters for timestep in timesteps])
+
+
+def tracked_as(timesteps, parameters, **more):
+    """What an avatar has tracked: parameters (T, P), and of all else nothing."""
+    count = len(parameters)
+    usual = {"misfit": np.zeros(count), "shift": np.zeros((count, 3)), "scale": np.ones(count)}
+    values = {**usual, "information": np.eye(1), **more}
+    return AvatarTracking(tuple(timesteps), parameters, **values)
 
 
 def _entry(timestep, camera):

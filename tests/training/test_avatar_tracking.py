@@ -23,7 +23,7 @@ from stga_addon.capture.mesh_geometry import silhouette
 from stga_addon.capture.open import open_capture
 from stga_addon.files import read_npz, write_npz
 from stga_addon.flame.forward import parameters_gradient
-from stga_addon.flame.sequence import read_motion, sequence_mesh, with_identity
+from stga_addon.flame.sequence import with_identity
 from stga_addon.jobs.finished_run import measure_run
 from stga_addon.progress import Cancelled
 from stga_addon.raster.cpu.layout import Parameters
@@ -34,7 +34,6 @@ from stga_addon.training.evaluate import evaluator
 from stga_addon.training.evaluate.metrics import evaluate_avatar
 from stga_addon.training.optimize import avatar_tracking
 from stga_addon.training.optimize.avatar_tracking import (
-    AvatarTracking,
     OtherRecording,
     RefinedTracking,
     TrainedAvatar,
@@ -50,7 +49,7 @@ from stga_addon.training.run.metrics_log import read_metrics
 from stga_addon.training.run.session import train_run
 from stga_addon.training.schedule import view_order
 
-from .heads import TIMESTEPS, write_head
+from .heads import TIMESTEPS, parameters_of, tracked_as, write_head
 from .toys import assert_same_run, quick_settings, run_of, stop_at
 
 NAMES = ("origin", "rotation", "scale")
@@ -132,7 +131,7 @@ def test_a_timestep_begins_where_the_one_before_led(person, lost, monkeypatch):
 
     monkeypatch.setattr(avatar_tracking._Tracker, "_minimize", minimize)
     monkeypatch.setattr(avatar_tracking._Tracker, "_loss", loss)
-    tracked = [capture.flame.frame(timestep).parameters for timestep in TIMESTEPS[:2]]
+    tracked = parameters_of(capture, TIMESTEPS[:2])
     led = np.zeros(len(tracked[0]) + 3)
     led[-1] = 0.004
     for better in (True, False):
@@ -191,10 +190,9 @@ def test_refined_meshes_cut_what_is_trained_on(right, tmp_path, monkeypatch):
     moved = []
 
     def aside(trained, shown, timesteps, *_):
-        values = np.stack([shown.flame.frame(timestep).parameters for timestep in timesteps])
+        values = parameters_of(shown, timesteps)
         values[:, -3:] += 0.02
-        none = np.zeros((len(values), 3))
-        return AvatarTracking(tuple(timesteps), values, none[:, 0], none, none[:, 0], np.eye(1))
+        return tracked_as(timesteps, values)
 
     def note(trainer, view, image, share, mask, mesh):
         found = step(trainer, view, image, share, mask, mesh)
@@ -270,8 +268,7 @@ def test_timesteps_between_change_as_their_neighbors(lost):
     """Catches changes that go to the wrong timesteps where a budget allows only some."""
     tracking = RefinedTracking(lost[0], "stga")
     some = tracking.tracked[[0, 3]] + np.array([[1.0], [4.0]])
-    found = AvatarTracking((0, 5), some, np.zeros(2), np.zeros((2, 3)), np.ones(0), np.eye(1))
-    tracking.take(found, TIMESTEPS[:-1])
+    tracking.take(tracked_as((0, 5), some), TIMESTEPS[:-1])
     change = tracking.parameters[:, :-3] - tracking.tracked
     assert_allclose(change[:, 0], [1, 2, 3, 4, 0])
 
@@ -291,8 +288,7 @@ def test_a_change_near_half_a_turn_is_one_of_rotations(lost):
     tracking.parameters = np.pad(tracking.tracked, ((0, 0), (0, 3)))
     ends = tracking.tracked[[0, 3]].copy()
     ends[:, own] = [(Rotation.from_rotvec(tilt) * turns[row]).as_rotvec() for row in (0, 3)]
-    found = AvatarTracking((0, 5), ends, np.zeros(2), np.zeros((2, 3)), np.ones(0), np.eye(1))
-    tracking.take(found, TIMESTEPS[:-1])
+    tracking.take(tracked_as((0, 5), ends), TIMESTEPS[:-1])
     for row, turn in enumerate(turns[:4]):
         now = Rotation.from_rotvec(tracking.parameters[row, -21:-18])
         assert_allclose((now * turn.inv()).as_rotvec(), tilt, atol=1e-9)
@@ -310,10 +306,8 @@ def test_time_says_what_images_do_not(right):
     values[count // 2 :, 0] = 3  # a cut
     values[:, -3:] = noise.normal(0, 0.003, (count, 3))
     shift = noise.normal(0, 0.003, (count, 3))
-    none = np.zeros(count)
     each = np.tile(np.diag(known), (count, 1, 1))
-    found = AvatarTracking(tuple(range(count)), values, none, shift, none, each)
-    smooth = found.smoothed(model)
+    smooth = tracked_as(range(count), values, shift=shift, information=each).smoothed(model)
     assert smooth.parameters[:, -1].std() < 0.6 * values[:, -1].std()
     assert_allclose(smooth.parameters[:, 1:-1], values[:, 1:-1], atol=1e-5)
     assert_allclose(smooth.parameters[:, 0], values[:, 0], atol=0.05)
@@ -418,10 +412,9 @@ def test_tracking_is_undone_where_what_is_left_out_loses(held_out, right, tmp_pa
     def astray(trained, shown, timesteps, *_):
         seen = (view for views in shown.views.values() for view in views)
         given.append((tuple(timesteps), {view.camera_index for view in seen}))
-        values = np.stack([shown.flame.frame(timestep).parameters for timestep in timesteps])
+        values = parameters_of(shown, timesteps)
         values[:, -3:] += 0.004
-        none = np.zeros((len(values), 3))
-        return AvatarTracking(tuple(timesteps), values, none[:, 0], none, none[:, 0], np.eye(1))
+        return tracked_as(timesteps, values)
 
     monkeypatch.setattr(session, "track_by_avatar", astray)
     train_run(capture, tmp_path, make_run(capture))
@@ -531,21 +524,6 @@ def test_a_run_and_its_checkpoint_must_agree(lost, run_folder, tmp_path):
         train_run(lost[0], run, make_run(lost[0]), resume=True)
 
 
-@pytest.mark.parametrize(
-    ("value", "says"),
-    [
-        (np.zeros(20), "a field is missing or malformed"),
-        (np.full((5, 20), np.nan), "tracking/parameters holds a value that is not finite"),
-    ],
-)
-def test_damaged_checkpoints(run_folder, tmp_path, value, says):
-    """Catches an array that training would go on with to nonsense."""
-    arrays = read_npz(run_folder / "checkpoint.npz")
-    write_npz(tmp_path / "checkpoint.npz", {**arrays, "tracking/parameters": value})
-    with refusal(says):
-        read_checkpoint(tmp_path)
-
-
 def test_the_runs_capture_has_the_refined_meshes(lost, right, run_folder):
     """Catches a quality on other meshes than trained on, and meshes of another capture."""
     capture, _ = lost
@@ -559,16 +537,6 @@ def test_the_runs_capture_has_the_refined_meshes(lost, right, run_folder):
     other = with_refined_tracking(right[0], run_folder)
     assert_array_equal(other.mesh(2), right[0].mesh(2))
     assert with_refined_tracking(capture, run_folder.parent) is capture
-
-
-def test_the_file_is_a_motion(lost, run_folder):
-    """Catches a file that neither `render --motion` nor Blender's Apply Motion could play."""
-    capture, _ = lost
-    motion = read_motion(run_folder / "tracking.npz", capture.flame.model)
-    shown = with_refined_tracking(capture, run_folder)
-    assert motion.timesteps == TIMESTEPS
-    for timestep in TIMESTEPS:
-        assert_allclose(sequence_mesh(motion, timestep), shown.mesh(timestep), atol=1e-12)
 
 
 def test_commands_use_the_refined_meshes(

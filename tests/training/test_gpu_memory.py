@@ -11,13 +11,12 @@ from avatar.conftest import splats_of
 
 from stga_addon.raster.gpu import rasterize
 from stga_addon.raster.gpu.device import Device
-from stga_addon.training.optimize.backend import Batch, RenderOptions
 from stga_addon.training.optimize.cpu_backend import CpuBackend
 from stga_addon.training.optimize.frames import FrameStore
 from stga_addon.training.optimize.gpu_backend import GpuBackend
 from stga_addon.training.optimize.state import arrays_of, new_state
-from stga_addon.training.schedule import learning_rates
 
+from .test_gpu_backend import batch_of
 from .test_trainer import view_of
 from .toys import quick_settings
 
@@ -33,21 +32,15 @@ def splats_on(capture, count, log_scale):
     return splats_of(np.zeros((count, 3)), log_scale=log_scale, sh=sh, face=face)
 
 
-def batch_of(capture, width, height):
+def blank(capture, width, height):
+    """A batch of a blank image."""
     view = view_of(capture, 1)
     view = replace(view, camera=replace(view.camera, width=width, height=height))
     target = np.zeros((height, width, 3), np.uint8)
     mask = np.zeros((height, width), np.uint8)
     for array in (target, mask):
         array.setflags(write=False)
-    return Batch(
-        view,
-        target,
-        mask,
-        RenderOptions(np.ones(3, np.float32), 3),
-        None,
-        learning_rates(SETTINGS.rates, 0.0),
-    )
+    return batch_of(capture, SETTINGS, view=view, target=target, mask=mask)
 
 
 def cpu_bytes(capture, count, size, log_scale):
@@ -56,7 +49,7 @@ def cpu_bytes(capture, count, size, log_scale):
     state = new_state(splats_on(capture, count, log_scale))
     frames = FrameStore(capture, SETTINGS.convention)
     backend = CpuBackend(SETTINGS, frames, state)
-    backend.step(batch_of(capture, *size))
+    backend.step(blank(capture, *size))
     buffers = backend._buffers._buffers
     arrays = [*arrays_of(backend.state).values(), *buffers.values()]
     pairs = buffers["pair_blocks"].size * 8 // 9  # an eighth to spare
@@ -69,7 +62,7 @@ def gpu_bytes(capture, count, size, capacity):
     frames = FrameStore(capture, SETTINGS.convention)
     state = new_state(splats_on(capture, count, -9.0))
     backend = GpuBackend(device, SETTINGS, frames, state)
-    backend.step(batch_of(capture, *size))
+    backend.step(blank(capture, *size))
     assert len(backend.state) == count
     assert backend._rasterizer.capacity == capacity
     return (count, size[0] * size[1], capacity), device.bytes
