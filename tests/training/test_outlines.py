@@ -9,7 +9,7 @@ from PIL import Image
 from scipy.ndimage import binary_dilation
 from scipy.spatial.transform import Rotation
 
-from stga_addon.avatar.embedding import face_frames, to_local
+from stga_addon.avatar.embedding import face_frames
 from stga_addon.capture.camera import look_at
 from stga_addon.capture.images import read_image
 from stga_addon.capture.open import open_capture
@@ -19,33 +19,16 @@ from stga_addon.training.optimize.trainer import Trainer
 
 from .toys import Rows, bits, quick_settings, random_state
 
-UPRIGHT_NEEDLE_M = np.array([0.0005, 0.03, 0.0005])
 
-
-def place(trainer, row, position):
-    """Make a splat an opaque, upright needle at a position in meters, which never moves."""
-    state = trainer.state
-    capture = trainer.capture
-    frames = face_frames(capture.mesh(0), capture.faces, capture.neutral)
-    needle = replace(
-        state.splats().rows(np.array([row])),
-        xyz=np.array([position], np.float32),
-        rotation=np.array([[1, 0, 0, 0]], np.float32),
-        log_scale=np.log(UPRIGHT_NEEDLE_M[None]).astype(np.float32),
-        opacity=np.full(1, 4, np.float32),
-    )
-    local = to_local(needle, frames, state.face[[row]])
-    for values in (state.parameters, state.average):
-        for name in ("xyz", "rotation", "log_scale", "opacity"):
-            getattr(values, name)[row] = getattr(local, name)[0]
-
-
-def splats_after_a_turn(capture, needle, masks=True):
-    """How many splats there are before and after iteration 200 of a training with a needle."""
+def splats_after_a_turn(capture, place, masks=True):
+    """How many splats there are before and after iteration 200 of a training, one of them at a
+    place in meters."""
     quiet = {"density_interval": 0, "stray_reset_interval": 0, "random_background": masks}
     trainer = Trainer(capture, quick_settings("global", **quiet), {})
-    top = int(capture.neutral[capture.faces].mean(1)[:, 1].argmax())
-    place(trainer, int(np.flatnonzero(trainer.state.face == top)[0]), needle)
+    frames = face_frames(capture.neutral, capture.faces, capture.neutral)
+    top = int(capture.neutral[capture.faces].mean(1)[:, 1].argmax())  # which never moves
+    local = frames.rotation[top].T @ (place - frames.origin[top]) / frames.scale[top]
+    trainer.state.parameters.xyz[trainer.state.face.searchsorted(top)] = local
     count = len(trainer)
     trainer.iteration = 199
     view = capture.views["train"][0]

@@ -70,13 +70,3 @@ def test_one_schema_for_new_and_stored_settings(name, value):
         return  # JSON's lists become tuples
     with refusal(name):
         from_json(TrainingSettings, {**stored, name: plain})
-
-
-def test_paper_schedule():
-    """Catches a schedule that does not reach the settings: the figures are the paper's own."""
-    paper = make_settings(schedule="paper", iterations=5)
-    assert (paper.global_interval, paper.global_unit, paper.warm_up_share) == (20, "iteration", 0.0)
-    assert (paper.lattice, paper.views_per_visit, paper.hull_points) == (4, 0, False)
-    assert (paper.scale_limit, paper.stray_limit, paper.selection.threshold) == (1.0, 1.0, 0.01)
-    changed = make_settings(schedule="paper", iterations=5, lattice=2)
-    assert changed == dataclasses.replace(paper, lattice=2)

@@ -1,24 +1,11 @@
-"""Rows travel with everything that belongs to them."""
+"""Memory that a state shares."""
 
 import numpy as np
 from numpy.testing import assert_array_equal
 
-from stga_addon.training.optimize.state import arrays_of, keep_rows, new_state
+from stga_addon.training.optimize.state import new_state
 
-from .toys import random_splats, random_state
-
-
-def test_rows_are_kept_whole():
-    """Catches an array left at its old length or in another order after pruning or a split."""
-    state = random_state(9, 5)
-    rows = np.array([7, 1, 1, 8, 0])
-    chosen = np.isin(np.arange(9), rows)
-    for given, order in ((rows, rows), (chosen, np.flatnonzero(chosen))):
-        kept = arrays_of(keep_rows(state, given))
-        for name, array in arrays_of(state).items():
-            assert_array_equal(kept[name], array[order], err_msg=name)
-            assert kept[name].dtype == array.dtype
-            assert kept[name].flags.c_contiguous
+from .toys import random_splats
 
 
 def test_memory_is_shared_where_promised_and_only_there():
