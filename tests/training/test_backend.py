@@ -1,7 +1,5 @@
 """The seam between the trainer and what holds the splats."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
@@ -10,7 +8,7 @@ from stga_addon.training.optimize import make_backend, trainer
 from stga_addon.training.optimize.backend import Backend
 from stga_addon.training.optimize.trainer import Trainer
 
-from .toys import bits, quick_settings
+from .toys import bits, one_camera, quick_settings
 
 METHODS = {name for name in vars(Backend) if name == "__len__" or not name.startswith("_")}
 
@@ -53,9 +51,7 @@ def trained(capture):
 def test_a_training_needs_no_more_than_the_seam(toy, monkeypatch):
     """Catches a change of the splats that copies all of them to the host, writes to a column in
     place, or reaches past the seam, and so does nothing where splats are on a device."""
-    first = toy.views["train"][0].camera_index
-    views = tuple(view for view in toy.views["train"] if view.camera_index == first)
-    capture = replace(toy, views={"train": views})
+    capture = one_camera(toy)
     near = trained(capture)
 
     def far(*given):

@@ -14,6 +14,8 @@ from stga_addon.training.preset_timing import (
 )
 from stga_addon.training.settings import PRESETS, Preset, make_settings
 
+from .toys import one_camera
+
 
 class Stopwatch:
     """A clock that only steps of training move: by 0.01 s a thousand pixels."""
@@ -132,10 +134,8 @@ def test_what_is_done_once_is_no_step(toy, shares, monkeypatch):
 
 def test_one_phones_sides_are_found_before_they_are_timed(toy):
     """Catches one-off work that a trainer would still do in a step."""
-    first = toy.views["train"][0].camera_index
-    views = tuple(view for view in toy.views["train"] if view.camera_index == first)
     settings = make_settings(iterations=1, hull_points=False, lattice=0)
-    trainer = Trainer(replace(toy, views={"train": views}), settings, {})
+    trainer = Trainer(one_camera(toy), settings, {})
     trainer.prepare_turns()
     assert "outlines" in vars(trainer.changes["outlines"])
     assert "sides" in vars(trainer.changes["unseen sides"])

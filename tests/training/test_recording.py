@@ -28,7 +28,6 @@ from stga_addon.training.effects.facts import CaptureFacts
 from stga_addon.training.effects.plan import depth_limits
 from stga_addon.training.optimize import avatar_tracking
 from stga_addon.training.optimize.avatar_tracking import (
-    AvatarTracking,
     normal_images,
 )
 from stga_addon.training.run.folder import AVATAR, Run, write_run
@@ -40,9 +39,9 @@ from stga_addon.training.run.recording import (
 )
 from stga_addon.worker.helpers import Helpers
 
-from .heads import TIMESTEPS
+from .heads import TIMESTEPS, parameters_of, tracked_as
 from .test_avatar_tracking import lost, millimeters, person, right  # noqa: F401
-from .toys import quick_settings
+from .toys import one_camera, quick_settings
 
 SCALE = 1.02
 GAIN = 0.85
@@ -178,11 +177,9 @@ def test_parts_of_another_avatar_are_not_taken(recording, tmp_path, monkeypatch)
 
     def as_tracked(trained, capture, timesteps, *_):
         calls.append(len(timesteps))
-        values = np.stack([capture.flame.frame(timestep).parameters for timestep in timesteps])
-        none = np.zeros(len(values))
+        values = parameters_of(capture, timesteps)
         known = np.tile(np.eye(values.shape[1] + 3), (len(values), 1, 1))
-        shift = np.zeros((len(values), 3))
-        return AvatarTracking(tuple(timesteps), values, none, shift, none + 1, known)
+        return tracked_as(timesteps, values, information=known)
 
     monkeypatch.setattr("stga_addon.training.run.recording.track_by_avatar", as_tracked)
     for trained_ns, expected in ((1, [*every, *twice]), (1, []), (2, [*every, *twice])):
@@ -198,15 +195,14 @@ def test_a_phone_is_one_camera_in_all_its_takes(lost, person, tmp_path):  # noqa
     """Catches an avatar of one phone that, extended by a second take, no longer tells the focal
     length of its camera and how the world is turned, and whose depth is left free."""
     first = lost[0]
-    index = first.views["train"][0].camera_index
-    views = {"train": tuple(v for v in first.views["train"] if v.camera_index == index)}
-    phone = replace(first, views=views)
+    phone = one_camera(first)
+    views = phone.views["train"]
     place = np.eye(4)
     place[:3, 3] = 0.02
-    poses = [view.camera.world_to_camera @ place for view in views["train"]]
+    poses = [view.camera.world_to_camera @ place for view in views]
     again = tuple(
         replace(view, camera=replace(view.camera, fl_x=99.0, world_to_camera=pose))
-        for view, pose in zip(views["train"], poses, strict=True)
+        for view, pose in zip(views, poses, strict=True)
     )
     joined = join_takes([phone, replace(phone, views={"train": again})])
     every = joined.views["train"]
@@ -214,7 +210,7 @@ def test_a_phone_is_one_camera_in_all_its_takes(lost, person, tmp_path):  # noqa
     assert cameras_at_once(every) == 1
     assert cameras_at_once(first.views["train"]) == 4
     (camera,) = cameras_of(joined).values()
-    assert camera == views["train"][0].camera
+    assert camera == views[0].camera
     assert len(cameras_of(first)) > 1
     settings = quick_settings("global", lattice=0)
     for capture, is_one in ((joined, True), (first, False)):

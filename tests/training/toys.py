@@ -65,6 +65,13 @@ def run_of(capture, strategy="global", **changes):
     return Run(capture.root, None, "vhap", quick_settings(strategy, **changes))
 
 
+def one_camera(capture):
+    """The capture as the first of its cameras sees it."""
+    first, *_ = views = capture.views["train"]
+    own = tuple(view for view in views if view.camera_index == first.camera_index)
+    return replace(capture, views={"train": own})
+
+
 def stop_at(iteration):
     """A report that stops a training after so many iterations; None: not at all."""
     return lambda progress: progress.figures().get("iteration", 0) >= (iteration or math.inf)
