@@ -3,23 +3,21 @@
 import hashlib
 import os
 import pickle
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
-from PIL import Image
 from refusal import refusal
 from torch.nn import functional
 
-from stga_addon.capture.camera import Camera
-from stga_addon.capture.images import read_image
-from stga_addon.capture.model import View
 from stga_addon.training.evaluate import lpips
 from stga_addon.training.evaluate.lpips import read_network
-from stga_addon.training.evaluate.metrics import EvaluationView, evaluate
+from stga_addon.training.evaluate.metrics import evaluate
 from stga_addon.training.run.metrics_log import read_metrics
 from stga_addon.training.run.session import train_run
 
+from .test_metrics import evaluation_views
 from .toys import run_of, stop_at
 
 LAYERS = (
@@ -110,11 +108,11 @@ def test_distance_matches_the_package_lpips(size):
     assert network.distance(*pair(*size)) == pytest.approx(REFERENCE[size], abs=2e-6)
 
 
-def test_evaluation_measures_lpips_if_weights_are_named(tmp_path, weights_file, monkeypatch):
+def test_evaluation_measures_lpips_if_weights_are_named(weights_file, monkeypatch):
     """Catches another range or channels, a region that sees the rest, and small images."""
     monkeypatch.setenv(lpips.WEIGHTS_VARIABLE, str(weights_file))
     image, target = pair(47, 68)
-    evaluation_view = evaluation_view_of(tmp_path, target)
+    evaluation_view = evaluation_view_of(target)
     quality = evaluate(lambda view: image, [evaluation_view], perceptual=True)
     stored = np.round(255 * target).astype("f4") / 255
     network = read_network(weights_file)
@@ -123,20 +121,17 @@ def test_evaluation_measures_lpips_if_weights_are_named(tmp_path, weights_file, 
     where = np.zeros((47, 68), bool)
     where[10:30, 10:40] = True
     partly = np.where(where, image, stored)
-    masked = [EvaluationView(evaluation_view.view, evaluation_view.target, {"mask": where})]
+    masked = [replace(evaluation_view, regions={"mask": where})]
     of_region = evaluate(lambda view: image, masked, perceptual=True).as_json()["lpips_mask"]
     assert of_region == pytest.approx(network.distance(partly, stored), rel=1e-6)
     small, other = pair(30, 68)
-    few = evaluate(lambda view: small, [evaluation_view_of(tmp_path, other)], perceptual=True)
+    few = evaluate(lambda view: small, [evaluation_view_of(other)], perceptual=True)
     assert few.lpips is None
 
 
-def evaluation_view_of(root, target):
-    picture = np.round(255 * target.transpose(1, 2, 0)).astype(np.uint8)
-    Image.fromarray(picture).save(root / "target.png")
-    camera = Camera(picture.shape[1], picture.shape[0], 50.0, 50.0, 12.0, 15.0, np.eye(4))
-    view = View(0, 0, camera, "target.png", root / "target.png")
-    return EvaluationView(view, read_image(view))
+def evaluation_view_of(target):
+    (found,) = evaluation_views(np.round(255 * target.transpose(1, 2, 0)).astype(np.uint8))
+    return found
 
 
 def test_another_file_is_refused(tmp_path, toy, monkeypatch):

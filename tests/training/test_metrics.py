@@ -1,6 +1,7 @@
 """Image quality against numpy and scipy: exposure, which pixels count, residuals."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -54,30 +55,29 @@ def reference_ssim(image, target, where=None):
     return float(np.mean(values if where is None else values[:, where]))
 
 
-def sights_of(views):
-    return [EvaluationView(view, read_image(view)) for view in views]
+def evaluation_views(*targets):
+    """Of images (H, W, 3) uint8, each by a camera of its own."""
+    found = []
+    for number, target in enumerate(targets):
+        height, width, _ = target.shape
+        camera = Camera(width, height, 50.0, 50.0, 12.0, 15.0, np.eye(4))
+        target.setflags(write=False)  # as it is read: Numba would compile again
+        view = View(number, number, camera, f"{number}.png", Path())
+        found.append(EvaluationView(view, target))
+    return found
 
 
-def write_views(root, count):
-    camera = Camera(WIDTH, HEIGHT, 50.0, 50.0, 12.0, 15.0, np.eye(4))
-    for n in range(count):
-        Image.fromarray(random_image(n)).save(root / f"{n}.png")
-    return [View(n, 0, camera, f"{n}.png", root / f"{n}.png") for n in range(count)]
-
-
-def test_evaluate_means_over_views_and_clips(tmp_path):
+def test_evaluate_means_over_views_and_clips():
     """Catches PSNR of the mean error, of other axes, a peak of 255 or natural logarithms, an
     infinite one, another SSIM, and values over one counted double."""
-    views = write_views(tmp_path, 3)
-    drawn = {
-        view.name: default_rng(9).normal(0.5, 0.5, (3, HEIGHT, WIDTH)).astype(np.float32)
-        for view in views
-    }
+    views = evaluation_views(*map(random_image, range(3)))
+    noise = default_rng(9).normal(0.5, 0.5, (3, HEIGHT, WIDTH)).astype(np.float32)
+    drawn = dict.fromkeys(("0.png", "1.png"), noise)
     drawn["2.png"] = (random_image(2).transpose(2, 0, 1) / 255).astype(np.float32)
-    quality = evaluate(lambda view: drawn[view.name], sights_of(views))
+    quality = evaluate(lambda view: drawn[view.name], views)
     pairs = [
-        (np.clip(drawn[view.name], 0, 1).transpose(1, 2, 0).astype(float), random_image(n) / 255)
-        for n, view in enumerate(views)
+        (np.clip(drawn[name], 0, 1).transpose(1, 2, 0).astype(float), each.target / 255)
+        for name, each in zip(sorted(drawn), views, strict=True)
     ]
     psnrs = [-10 * np.log10(max(np.mean((a - b) ** 2), 1e-12)) for a, b in pairs]
     assert quality.psnr == pytest.approx(np.mean(psnrs), abs=1e-3)
@@ -86,23 +86,20 @@ def test_evaluate_means_over_views_and_clips(tmp_path):
     assert quality.lpips is None
 
 
-def test_regions_are_measured_by_themselves(tmp_path):
+def test_regions_are_measured_by_themselves():
     """Catches figures that depend on the rest of the image, and views without the region."""
-    views = write_views(tmp_path, 2)
+    views = evaluation_views(random_image(0), random_image(1))
     where = np.zeros((HEIGHT, WIDTH), bool)
     where[4:24, 3:18] = True
-    target = read_image(views[0])
+    target = views[0].target
     rng = default_rng(3)
     inside = np.clip(target / 255 + rng.normal(0, 0.1, target.shape), 0, 1)
     good = np.where(where[..., None], inside, target / 255)
     bad = np.where(where[..., None], inside, rng.random(target.shape))
-    evaluation_views = [
-        EvaluationView(views[0], target, {"mask": where}),
-        EvaluationView(views[1], read_image(views[1])),
-    ]
+    views[0] = replace(views[0], regions={"mask": where})
     for image in (good, bad):
         drawn = np.moveaxis(image, 2, 0).astype(np.float32)
-        quality = evaluate(lambda view, drawn=drawn: drawn, evaluation_views)
+        quality = evaluate(lambda view, drawn=drawn: drawn, views)
         region = quality.regions["mask"]
         error = ((inside - target / 255) ** 2)[where]
         assert region.psnr == pytest.approx(-10 * np.log10(error.mean()), abs=1e-3)
@@ -165,23 +162,20 @@ def test_a_rendering_of_one_color_stays_finite():
     assert np.array_equal(match_exposure(flat, target, head, np.zeros_like(head)), flat)
 
 
-def test_nothing_is_fitted_where_the_exposure_is_known(tmp_path):
+def test_nothing_is_fitted_where_the_exposure_is_known():
     """Catches six numbers fitted where training knows the exposure, which hides its errors."""
     head, image = head_and_image()
     gain = np.array([0.8, 1.1, 0.9])
     offset = np.array([4.0, -6.0, 3.0])
     levels = 255 * image.transpose(1, 2, 0)
     target = np.where(head[..., None], gain * levels + offset, levels).round().astype(np.uint8)
-    camera = Camera(SIDE, SIDE, 50.0, 50.0, 16.0, 16.0, np.eye(4))
-    views = [View(0, number, camera, "0.png", tmp_path / "0.png") for number in range(3)]
-    known = known_exposure([[0, *gain, *offset]], views[:2])
-    shown = [[EvaluationView(view, target, {"mask": head}, head)] for view in views]
+    views = evaluation_views(target, target, target)
+    known = known_exposure([[0, *gain, *offset]], [each.view for each in views[:2]])
+    shown = [[replace(each, regions={"mask": head}, interior=head)] for each in views]
     trained, plain, other = (evaluate(lambda _: image, each, exposure=known) for each in shown)
     assert trained.psnr > 45
     assert trained.psnr_unmatched is None
-    assert plain.psnr == pytest.approx(
-        evaluate(lambda view: image, [EvaluationView(views[1], target)]).psnr
-    )
+    assert plain.psnr == pytest.approx(evaluate(lambda view: image, views[:1]).psnr)
     assert plain.psnr_unmatched is None  # trained, and not corrected
     assert other.psnr > 45
     assert other.psnr_unmatched == other.as_json()["psnr_unmatched"] == pytest.approx(plain.psnr)
