@@ -1,6 +1,5 @@
 """Extending a run by takes: what is selected, remembered, and resumed to the same bits."""
 
-import json
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -95,10 +94,7 @@ def test_the_run_remembers_its_takes(takes, parent, tmp_path):
         prepare_extension(out, (moved,), iterations=1)
     again = prepare_extension(out, (takes[1],), iterations=1)
     assert [take.start for take in again.run.takes] == [4, 8]
-    path = moved / "transforms_train.json"
-    values = json.loads(path.read_text())
-    values["frames"] = values["frames"][1:]
-    path.write_text(json.dumps(values))
+    factory.edit(moved / "transforms_train.json", lambda document: document["frames"].pop(0))
     with refusal(r"was extended with .*new .* but it now has other images"):
         open_run(out)
 
@@ -245,12 +241,14 @@ def test_a_take_in_millimeters(takes, parent, tmp_path, what, says):
     """Catches a take of which a part is in another unit, on which training is wasted without an
     error."""
     take = Path(shutil.copytree(takes[0], tmp_path / "new"))
-    for path in sorted(take.glob("transforms_*.json")) if what == "cameras" else ():
-        values = json.loads(path.read_text())
-        for frame in values["frames"]:
+
+    def enlarge(document):
+        for frame in document["frames"]:
             for row in frame["transform_matrix"][:3]:
                 row[3] *= 1000
-        path.write_text(json.dumps(values))
+
+    for path in sorted(take.glob("transforms_*.json")) if what == "cameras" else ():
+        factory.edit(path, enlarge)
     for path in sorted(take.glob("meshes/0*.obj")) if what == "meshes" else ():
         vertices, faces = read_mesh(path)
         factory.write_mesh(path, 1000 * vertices, faces)

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from capture import factory
 from numpy.testing import assert_array_equal, assert_equal
 from refusal import refusal
 
@@ -45,10 +46,6 @@ def make_checkpoint():
     )
 
 
-def edit_json(path, **changes):
-    path.write_text(json.dumps({**json.loads(path.read_text()), **changes}))
-
-
 @pytest.mark.parametrize("strategy", STRATEGIES)
 def test_run_round_trip(tmp_path, strategy):
     """Catches a setting, also of nested ones, that changes its value or kind in run.json."""
@@ -78,7 +75,7 @@ def test_run_round_trip(tmp_path, strategy):
 def test_damaged_runs(tmp_path, field, value, message):
     """Catches a run of another version taken for one's own, and a traceback of one edited."""
     folder.write_run(tmp_path, make_run())
-    edit_json(tmp_path / "run.json", **{field: value})
+    factory.edit(tmp_path / "run.json", lambda document: document.update({field: value}))
     with refusal(rf"run\.json: .*{message}"):
         folder.read_run(tmp_path)
 

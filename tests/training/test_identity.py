@@ -23,7 +23,7 @@ from stga_addon.training.run.folder import device_of, open_run, read_run, write_
 from stga_addon.training.run.identity import difference, identity_of
 from stga_addon.training.run.session import train_run
 
-from .toys import assert_same_run, quick_settings, run_of, stop_at
+from .toys import assert_same_run, iteration_of, quick_settings, run_of, stop_at
 
 ITERATIONS = 12
 
@@ -187,7 +187,7 @@ def test_a_checkpoint_left_from_another_run_is_not_taken(copy, toy):
     run = make_run(toy, seed=5)
 
     def die(progress):
-        if progress.figures().get("iteration", 0):
+        if iteration_of(progress):
             raise OSError("died")
         return False
 
@@ -197,7 +197,7 @@ def test_a_checkpoint_left_from_another_run_is_not_taken(copy, toy):
     reached = []
 
     def report(progress):
-        return bool(reached.append(progress.figures().get("iteration", 0)))
+        return bool(reached.append(iteration_of(progress)))
 
     train_run(toy, copy, run, resume=True, report=report)
     assert sorted(set(reached))[:2] == [0, 1]
@@ -258,7 +258,7 @@ def test_interrupt_saves_and_resumes_to_the_same_bits(toy, tmp_path):
     """Catches Ctrl-C that loses what was trained or half an iteration, or cannot quit at once."""
 
     def interrupt(progress):
-        if progress.figures().get("iteration", 0) == 5 and progress.stage == "Training":
+        if iteration_of(progress) == 5 and progress.stage == "Training":
             signal.raise_signal(signal.SIGINT)
         return False
 
@@ -274,7 +274,7 @@ def test_interrupt_saves_and_resumes_to_the_same_bits(toy, tmp_path):
     assert_same_run(out, unbroken)
 
     def interrupt_twice(progress):
-        if progress.figures().get("iteration", 0) == 5:
+        if iteration_of(progress) == 5:
             signal.raise_signal(signal.SIGINT)
             signal.raise_signal(signal.SIGINT)
         return False

@@ -21,7 +21,7 @@ from stga_addon.training.run.metrics_log import read_metrics
 from stga_addon.training.run.session import train_more, train_run
 from stga_addon.training.settings import STRATEGIES
 
-from .toys import assert_same_run, assert_same_state, run_of, stop_at
+from .toys import assert_same_run, assert_same_state, iteration_of, run_of, stop_at
 
 ITERATIONS = 24
 # Everything that changes a state happens in a few iterations.
@@ -82,7 +82,7 @@ def test_crashed_and_resumed_is_the_unbroken_run(toy, unbroken, tmp_path, monkey
     """Catches evaluations twice, or missing, after going on from a checkpoint before them."""
 
     def crash(progress):
-        iteration = progress.figures().get("iteration", 0)
+        iteration = iteration_of(progress)
         monkeypatch.setattr(run_module, "CHECKPOINT_S", 0.0 if iteration == 7 else 1e9)
         if iteration == 13:
             raise Crash
@@ -155,7 +155,7 @@ def test_a_given_selection_survives_an_early_crash(toy, tmp_path):
     painted = {timestep: np.arange(len(toy.faces)) < 7 for timestep in toy.timesteps}
 
     def crash(progress):
-        if progress.figures().get("iteration", 0) == 2:
+        if iteration_of(progress) == 2:
             raise Crash
         return False
 
@@ -200,7 +200,7 @@ def test_a_folder_that_is_moved_while_training(toy, tmp_path, change):
     moved = tmp_path / "moved"
 
     def move(progress):
-        if progress.figures().get("iteration", 0) == 7:
+        if iteration_of(progress) == 7:
             out.rename(moved)
             if change == "emptied":
                 out.mkdir()
@@ -279,7 +279,7 @@ def test_a_budget_in_seconds(toy, tmp_path, monkeypatch):
 
     def note(progress):
         shares.append(progress.share)
-        return progress.figures().get("iteration", 0) == 6
+        return iteration_of(progress) == 6
 
     run = make_run(toy, iterations=None, seconds=0.6)
     train_run(toy, tmp_path, run, report=note)

@@ -5,7 +5,7 @@ import math
 from dataclasses import replace
 
 import numpy as np
-from avatar.conftest import splats_of
+from avatar.conftest import random_splats as random_avatar_splats
 from numpy.testing import assert_array_equal
 
 from stga_addon.files import read_npz
@@ -17,16 +17,8 @@ from stga_addon.training.settings import make_settings
 
 
 def random_splats(count, faces, seed=0, degree=1):
-    rng = np.random.default_rng(seed)
-    bound = splats_of(
-        0.01 * rng.normal(size=(count, 3)),
-        rotation=rng.normal(size=(count, 4)),
-        log_scale=rng.normal(-5, 0.5, (count, 3)),
-        opacity=rng.normal(size=count),
-        sh=rng.normal(size=(count, (degree + 1) ** 2, 3)),
-        face=rng.integers(0, faces, count),
-    )
-    return replace(bound, unbound=rng.random(count) < 0.3)
+    made = random_avatar_splats(seed, count, faces, degree)
+    return replace(made, xyz=0.01 * made.xyz, log_scale=0.5 * made.log_scale - 3)
 
 
 def random_state(count, faces, seed=0, degree=1):
@@ -72,9 +64,13 @@ def one_camera(capture):
     return replace(capture, views={"train": own})
 
 
+def iteration_of(progress):
+    return progress.figures().get("iteration", 0)
+
+
 def stop_at(iteration):
     """A report that stops a training after so many iterations; None: not at all."""
-    return lambda progress: progress.figures().get("iteration", 0) >= (iteration or math.inf)
+    return lambda progress: iteration_of(progress) >= (iteration or math.inf)
 
 
 def assert_same_state(folder, expected):

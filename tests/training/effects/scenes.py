@@ -1,7 +1,6 @@
 """Captures of a ball that deforms, painted by known causes of its triangles' colors."""
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import trimesh
@@ -20,12 +19,10 @@ NOISE = 1.5  # levels
 WINDOW = np.array([0.9, 0.1, 0.42])
 """Unit vector toward the window."""
 
-Paint = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
-"""(deformation (F, 6), unit direction from the camera (F, 3), unit place on the ball (F, 3)) ->
-levels (F,) that are added to the triangles' own colors."""
-
 
 def nothing(deformed, direction, place):
+    """What a scene is painted by: of deformations (F, 6), unit directions from the camera (F, 3)
+    and unit places on the ball (F, 3), levels (F,) that are added to the triangles' own colors."""
     return np.zeros(len(deformed))
 
 
@@ -63,14 +60,13 @@ class Scene:
 
     cameras: int = 8
     timesteps: int = 8
-    paint: Paint = nothing
+    paint: object = nothing
     gain: np.ndarray | None = None
     offset: np.ndarray | None = None
     drift: np.ndarray | None = None
     background: tuple[int, int, int] = (255, 255, 255)
     deformed: float = 1.0
     masks: bool = True
-    seed: int = 0
     turned: np.ndarray | None = None
     window: float = 0.0
 
@@ -80,7 +76,7 @@ def photograph(folder, scene):
     ball = trimesh.creation.icosphere(3, 0.1)
     vertices = np.array(ball.vertices)
     faces = np.array(ball.faces, np.int32)
-    rng = default_rng(scene.seed)
+    rng = default_rng(0)
     place = vertices[faces].mean(1) / 0.1
     colors = _own_colors(place, rng)
     meshes = {t: _deform(vertices, t, scene.deformed) for t in range(scene.timesteps)}
@@ -123,9 +119,9 @@ def photograph(folder, scene):
     )
 
 
-def own_colors(capture, seed=0):
+def own_colors(capture):
     """Levels (F, 3) of a painted capture's triangles, before whatever else colors depend on."""
-    return _own_colors(capture.neutral[capture.faces].mean(1) / 0.1, default_rng(seed))
+    return _own_colors(capture.neutral[capture.faces].mean(1) / 0.1, default_rng(0))
 
 
 def _own_colors(place, rng):
@@ -175,7 +171,8 @@ def _draw(mesh, faces, camera, colors):
 def _keep(folder, t, c, camera, image, mask):
     name = f"{t:05d}_{c:02d}.png"
     Image.fromarray(np.clip(image, 0, 255).round().astype(np.uint8)).save(folder / name)
-    mask_path = None if mask is None else folder / f"mask_{name}"
-    if mask_path is not None:
-        Image.fromarray(mask).save(mask_path)
-    return View(t, c, camera, name, folder / name, mask_path)
+    view = View(t, c, camera, name, folder / name)
+    if mask is None:
+        return view
+    Image.fromarray(mask).save(folder / f"mask_{name}")
+    return replace(view, mask=folder / f"mask_{name}")
