@@ -13,7 +13,6 @@ from stga_addon.training.evaluate.evaluator import EVALUATION_SHARE
 from stga_addon.training.evaluate.forecast import checked_forecasts
 from stga_addon.training.evaluate.metrics import Quality
 from stga_addon.training.run import session
-from stga_addon.training.run import session as run_module
 from stga_addon.training.run.checkpoint import read_checkpoint
 from stga_addon.training.run.metrics_log import read_metrics
 from stga_addon.training.run.session import train_run
@@ -49,7 +48,7 @@ def clock(monkeypatch):
         clock.now += 3
         return Quality(20 + np.log(clock.now), 0.5)
 
-    monkeypatch.setattr(run_module, "perf_counter", clock)
+    monkeypatch.setattr(session, "perf_counter", clock)
     monkeypatch.setattr(session.Trainer, "step", slow_step)
     monkeypatch.setattr(evaluator, "evaluate", slow_evaluate)
     return clock

@@ -220,17 +220,6 @@ def test_unseen_share(toy):
     assert 0.05 < found[::2].mean() < 0.95
 
 
-def test_render_shows_the_average(toy):
-    """Catches evaluations of other splats than those that the avatar is made of."""
-    trainer = make_trainer(toy)
-    view = view_of(toy, 1)
-    picture = trainer.render(view)
-    trainer.state.parameters.opacity[:] = -20
-    assert_array_equal(trainer.render(view), picture)
-    trainer.state.average.opacity[:] = -20
-    assert trainer.render(view).min() == 1
-
-
 @pytest.mark.parametrize("convention", ["stga", "gaussian_avatars"])
 def test_scale_limits_in_meters(toy, convention):
     """Catches bound and unbound limits mixed up, triangles taken for meters, and large splats on
