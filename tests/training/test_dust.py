@@ -2,6 +2,7 @@
 
 from copy import copy
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -104,7 +105,8 @@ def test_a_turn_comes_once(toy):
     begun = Trainer(toy, quick_settings("global", lattice=0), {})
     trainer = copy(begun)
     turns = []
-    trainer.changes = {"all": Recorded(turns)}
+    changes = {"all": SimpleNamespace(interval=1, apply=lambda _, turn: turns.append(turn))}
+    trainer.changes = changes
     for share in shares:
         trainer.iteration += 1
         trainer._post_step(share)
@@ -115,18 +117,8 @@ def test_a_turn_comes_once(toy):
         for part in (steps[:stop], steps[stop:]):
             resumed = copy(begun)
             resumed.iteration = 0 if part[0] == 0 else stop
-            resumed.changes = {"all": Recorded(turns)}
+            resumed.changes = changes
             for share in part:
                 resumed.iteration += 1
                 resumed._post_step(share)
         assert [n for n, turn in enumerate(turns) if turn.passes(0.6)] == [30]
-
-
-class Recorded:
-    interval = 1
-
-    def __init__(self, turns):
-        self.turns = turns
-
-    def apply(self, backend, turn):
-        self.turns.append(turn)

@@ -110,8 +110,8 @@ def test_another_recording_is_tracked(recording, lost):  # noqa: F811
 def test_the_world_is_turned_as_the_avatars_was(light_turns, keeps_world, recording, lost, person):  # noqa: F811
     """Catches colors that are looked up in other directions than training saw them from, a world
     turned though its light was too, or though it is kept, and heads that do not turn with it."""
-    (run, root) = recording
-    (avatar, settings) = person
+    run, root = recording
+    avatar, settings = person
     turn = Rotation.from_rotvec([0.5, 0.2, 0])
     shutil.rmtree(root)
     shutil.copytree(lost[0].root, root)
@@ -169,7 +169,7 @@ def test_another_person_is_missed(recording, hasty):
 
 def test_parts_of_another_avatar_are_not_taken(recording, tmp_path, monkeypatch):
     """Catches a cancelled tracking that begins anew, or goes on with another avatar's."""
-    (run, root) = recording
+    run, root = recording
     calls = []
     every = [1] * len(TIMESTEPS)
     twice = [len(TIMESTEPS)] * 2
