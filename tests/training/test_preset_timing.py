@@ -138,4 +138,4 @@ def test_one_phones_sides_are_found_before_they_are_timed(toy):
     trainer = Trainer(one_camera(toy), settings, {})
     trainer.prepare_turns()
     assert "outlines" in vars(trainer.changes["outlines"])
-    assert "sides" in vars(trainer.changes["unseen sides"])
+    assert "sides" in vars(trainer.frames)

@@ -17,8 +17,9 @@ from .frames import FrameStore
 from .state import parameters_and_average
 
 WELL_SEEN_COSINE = 0.8
-"""Of the angle between a triangle and the camera that it faces most, above which gradients are
-those that others are compared with."""
+BEHIND_COSINE = -0.5
+"""Of the angle between a triangle and the camera that it faces most: above the first, gradients are
+those that others are compared with; below the second, nothing stands in an outline."""
 DOUBT = 0.3
 MIN_PULL = 0.02
 """Gradient, as a share of the median of well seen splats, at which a splat is pulled halfway to
@@ -147,7 +148,7 @@ class SurfacePrior:
         rotation = columns["parameters/rotation"][rows]
         log_scale = columns["parameters/log_scale"][rows]
         limits = limit / self._frames.unit_lengths[face[rows]]
-        is_layer = self._surface.closed & (self._surface.turned_away == 1)
+        is_layer = self._surface.closed & (self._surface.facing < BEHIND_COSINE)
         least = np.where(is_layer, self._frames.hair_layer_scale, 0.0)[face[rows]]
         off = thickness(rotation, log_scale, axis) > FLAT_TOLERANCE * limits
         off |= width(rotation, log_scale, axis) * FLAT_TOLERANCE < least
