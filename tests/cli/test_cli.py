@@ -28,6 +28,7 @@ from pxr import Usd
 
 from stga_addon.avatar.embedding import to_world
 from stga_addon.avatar.file import read_avatar, write_avatar
+from stga_addon.avatar.filmed import filmed_avatar
 from stga_addon.capture.open import open_capture
 from stga_addon.cli import commands
 from stga_addon.development.package import ROOT
@@ -422,8 +423,12 @@ def test_what_no_camera_saw_is_left_out(tmp_path, capsys):
     assert not out.exists()
     unseen = np.arange(len(whole.faces)) % 3 == 0
     kept = ~unseen[whole.splats.face]
-    base = np.column_stack([whole.splats.sh[:, 0], whole.splats.opacity])
-    write_avatar(path, replace(whole, regions={"unseen": unseen}, linear_base=base))
+    logits = np.linspace(-3, 3, len(kept), dtype=np.float32)
+    base = np.column_stack([whole.splats.sh[:, 0], logits])
+    along = np.tile(np.float32([0, 0, -1]), (len(unseen), 1))
+    marked = replace(whole, regions={"unseen": unseen}, linear_base=base)
+    assert filmed_avatar(path, replace(marked, filmed_along=along)).splats.sh_degree == 0
+    write_avatar(path, marked)
     count = int(kept.sum())
 
     def written(format, name):
@@ -439,6 +444,8 @@ def test_what_no_camera_saw_is_left_out(tmp_path, capsys):
     stage = Usd.Stage.Open(str(tmp_path / "a.usdc"))
     positions = stage.GetPrimAtPath("/Avatar/Splats").GetAttribute("positions")
     assert len(positions.Get(positions.GetTimeSamples()[0])) == count
+    opacities = stage.GetPrimAtPath("/Avatar/Splats").GetAttribute("opacities").Get(0)
+    assert_allclose(opacities, 1 / (1 + np.exp(-logits[kept])), atol=1e-5)
 
 
 def test_what_is_left_of_flame_is_said(tmp_path, capsys):

@@ -11,7 +11,7 @@ from numpy.testing import assert_array_equal
 from refusal import refusal
 
 from stga_addon.avatar.file import read_avatar
-from stga_addon.files import write_npz
+from stga_addon.files import file_digest, write_npz
 from stga_addon.jobs.train import Refine, prepare
 from stga_addon.progress import ignore
 from stga_addon.training.optimize.state import arrays_of
@@ -23,6 +23,7 @@ from stga_addon.training.run.continuation import (
     continued_settings,
     distinct_timesteps,
     replayed_views,
+    starting_state,
     views_of_region,
 )
 from stga_addon.training.run.folder import Continuation, read_run
@@ -31,7 +32,7 @@ from stga_addon.training.run.session import train_run
 from stga_addon.training.schedule import learning_rates
 from stga_addon.training.settings import Rates, TrainingSettings
 
-from .toys import assert_same_run, run_of, stop_at
+from .toys import assert_same_run, one_camera, run_of, stop_at
 
 ITERATIONS = 16
 
@@ -133,6 +134,22 @@ def test_the_avatar_before_is_the_first_evaluation(parent, toy, tmp_path):
     assert (first["iteration"], last["iteration"]) == (0, ITERATIONS)
     assert {"psnr_region", "psnr_frames", "psnr_region_frames", "psnr_other_frames"} <= set(last)
     assert last["psnr_region"] > first["psnr_region"]
+
+
+def test_one_cameras_avatar_goes_on_as_it_was_trained(toy, tmp_path):
+    """Catches colors from aside, plausible only, that are trained on, or taken for another avatar
+    than the checkpoint's, whose moments are lost then."""
+    capture = one_camera(toy)
+    run = run_of(capture, iterations=4, sh_degree=0, sh_steps=(), lattice=1)
+    train_run(capture, tmp_path / "run", run)
+    avatar = tmp_path / "run" / "avatar.npz"
+    assert read_avatar(avatar).splats.sh_degree == 2
+    continuation = Continuation(tmp_path / "run", file_digest(avatar), 0, 4)
+    state = starting_state(continuation, run.settings, len(toy.faces))
+    before = read_checkpoint(tmp_path / "run").state
+    assert_array_equal(state.parameters.sh, before.average.sh)
+    assert_array_equal(state.second.sh, before.second.sh)
+    assert before.second.sh.any()
 
 
 def test_a_region_that_no_camera_faces_is_refused(parent, toy, tmp_path):

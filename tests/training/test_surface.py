@@ -11,6 +11,7 @@ from scipy.ndimage import binary_dilation, binary_erosion
 
 from stga_addon.avatar.file import UNSEEN_REGION, Avatar
 from stga_addon.avatar.filmed import filmed_sides
+from stga_addon.avatar.lattice import NORMAL_AXIS
 from stga_addon.avatar.splats import SH_C0
 from stga_addon.capture.camera import look_at
 from stga_addon.capture.mesh_geometry import rasterize, silhouette
@@ -22,12 +23,15 @@ from stga_addon.render.render import render
 from stga_addon.training.optimize.change import Turn
 from stga_addon.training.optimize.frames import FrameStore
 from stga_addon.training.optimize.initial_splats import voxel_size
+from stga_addon.training.optimize.state import new_state
 from stga_addon.training.optimize.surface import GRAZING_COSINE, Surface
 from stga_addon.training.optimize.surface_prior import (
+    BEHIND_COSINE,
     SurfacePrior,
     flattened,
     hidden_splats,
     thickness,
+    width,
 )
 from stga_addon.training.optimize.trainer import Trainer
 from stga_addon.training.optimize.unseen_sides import unseen_sides
@@ -118,8 +122,9 @@ def test_an_end_of_a_bust_is_no_eye(filmed):
 
 @pytest.mark.parametrize("convention", ["stga", "gaussian_avatars"])
 def test_hidden_sides_are_closed(filmed, convention):
-    """Catches a back of the head through which the inside of the face is seen, at the start or when
-    limits have shrunk its hair, one in the air, and tatters where the mesh ends."""
+    """Catches a back of the head through which the inside of the face is seen, at the start, when
+    limits have shrunk its hair or when training has, one in the air, and tatters where the mesh
+    ends."""
     frames = FrameStore(filmed, convention)
     settings = quick_settings(convention=convention, scale_limit=0.6)
     splats = hidden_splats(frames, settings)
@@ -141,6 +146,13 @@ def test_hidden_sides_are_closed(filmed, convention):
     assert np.quantile(alpha[own], 0.01) > 0.45
     air = ~binary_dilation(silhouette(filmed.neutral, filmed.faces, camera), iterations=18)
     assert alpha[air].max() < 0.02
+    state = new_state(splats)
+    state.parameters.log_scale[:] -= 0.7
+    SurfacePrior(frames).apply(Rows(state), Turn(20, 0.5, len(state)))
+    behind = (frames.surface.facing < BEHIND_COSINE)[splats.face] & hair
+    axis = NORMAL_AXIS[convention]
+    wide = width(state.parameters.rotation, state.parameters.log_scale, axis)
+    assert np.all(wide[behind] > 0.97 * frames.hair_layer_scale[splats.face[behind]])
 
 
 @pytest.mark.parametrize("axis", [1, 2])

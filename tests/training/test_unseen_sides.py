@@ -14,7 +14,7 @@ from stga_addon.capture.camera import look_at
 from stga_addon.capture.images import read_image
 from stga_addon.capture.mesh_geometry import connected_parts, rasterize
 from stga_addon.capture.model import View
-from stga_addon.flame.model import faces_within
+from stga_addon.flame.model import faces_within, torso_faces
 from stga_addon.flame.parts import flame_model, key_regions
 from stga_addon.render.render import render_avatar
 from stga_addon.training.optimize.change import Turn
@@ -23,7 +23,7 @@ from stga_addon.training.optimize.state import state_of_avatar
 from stga_addon.training.optimize.surface import Surface
 from stga_addon.training.optimize.surface_prior import SurfacePrior, hidden_splats
 from stga_addon.training.optimize.trainer import Trainer
-from stga_addon.training.optimize.unseen_sides import unseen_sides
+from stga_addon.training.optimize.unseen_sides import plausible_aside, unseen_sides
 
 from .heads import PLACES, write_head
 from .toys import Rows, quick_settings
@@ -292,9 +292,9 @@ def test_what_sticks_out_of_masks_is_not_closed(bundled, tmp_path):
 
 def test_hair_from_aside(bundled, tmp_path):
     """Catches an avatar of one camera that does not look from there as it was trained, streaks of
-    hair that run around the head as they shine in front, a face that is smoothed with them, a
-    training that goes on with what is plausible only, and views from several sides that are taken
-    for one."""
+    hair that run around the head as they shine in front, a face that is smoothed with them, hair
+    before a neck that turns to skin, a training that goes on with what is plausible only, and views
+    from several sides that are taken for one."""
     color = painted(bundled)
     streak = (np.arange(len(color)) % 4 == 0) & (color == HAIR).all(1)
     color[streak] = GRAY
@@ -320,6 +320,12 @@ def test_hair_from_aside(bundled, tmp_path):
     cheeks = shown & (np.abs(level[splats.face]) < 0.5)
     assert_allclose(aside[cheeks], seen[cheeks], atol=1e-5)
     assert_allclose(state_of_avatar(avatar).parameters.sh, trained.sh, atol=1e-5)
+    sides = trainer.frames.sides
+    before_neck = (sides.changes > 0.5)[splats.face] & ~sides.is_hair[splats.face]
+    hanging = plausible_aside(replace(trained, unbound=before_neck), along, sides)
+    assert before_neck.sum() > 100
+    assert not hanging.sh[before_neck, 1:].any()
+    assert splats.sh[before_neck, 1:].any()
     around = filmed(bundled, color, (-30, 30), 0.0, tmp_path)
     assert Trainer(around, trainer.settings, {}).avatar("", None).filmed_along is None
 
@@ -340,3 +346,17 @@ def test_colors_aside_by_the_squared_sine():
         looked = np.cos(angle) * direction + np.sin(angle) * away
         expected = seen + (np.sin(angle) ** 2 * share)[:, None] * (color - seen)
         assert_allclose(sh_color(colored.sh, looked), expected, atol=1e-5)
+
+
+def test_a_torso_that_is_elsewhere_is_not_flat(bundled, tmp_path):
+    """Catches splats of arms and hands before a chest that are pressed onto a mesh which is not
+    where masks show a body."""
+    capture = filmed(bundled, painted(bundled), (0,), 0.0, tmp_path)
+    (view,) = capture.views["train"]
+    torso = torso_faces(bundled.flame.model)
+    shown = torso & ~Surface(capture).hidden
+    assert Surface(capture).is_flat[shown].mean() > 0.5
+    mask = np.asarray(Image.open(view.mask)).copy()
+    mask[int(view.camera.project(middles(capture)[0][shown])[0][:, 1].min()) :] = 0
+    Image.fromarray(mask).save(view.mask)
+    assert not Surface(capture).is_flat[shown].any()
