@@ -97,7 +97,7 @@ def in_world(
     sh: np.ndarray,
     is_unbound: bool = False,
 ) -> Splats:
-    """World-space splats of numbers before activation. Infinite opacities and scales of
+    """World-space splats of values before activation. Infinite opacities and scales of
     minus infinity, as other programs write 0 and 1, get numbers that show no difference."""
     opacity = np.where(np.isinf(opacity), np.copysign(MAX_LOGIT, opacity), opacity)
     log_scale = np.where(np.isneginf(log_scale), MIN_LOG_SCALE, log_scale)

@@ -56,10 +56,11 @@ MIN_SQUARED_AREA = 1e-28
 """Expressions that pull lids out of their folds, and how much longer they make them; squared
 meters, of triangles without area."""
 MAX_APART_DEG = 8.0
+"""Between the directions in which one camera sees a triangle, and their mean."""
 MAX_BESIDE_SHARE = 0.1
 """Share of the masks in whose image a triangle lies, that it may lie outside of."""
 MAX_STICKING_SHARE = 0.05
-"""Of a torso's triangles, that are where images show the body."""
+"""Of the triangles of a torso that is where images show a body."""
 STANDING_VOXELS = 1.5
 STANDING_REACH_VOXELS = 4
 """A surface is not known to be flat that is so near to where hair, or a collar, is so high."""

@@ -39,7 +39,6 @@ FLAT_TOLERANCE = 1.02
 """Largest standard deviation of splats on skin and clothes along the normal; how much more is worth
 a change. Views of a narrow cone do not tell it."""
 MIN_VARIANCE = 1e-14
-MIN_WIDTH = 1e-7
 PULLED_COLUMNS = (
     "face",
     "parameters/color",
@@ -141,6 +140,7 @@ class SurfacePrior:
     def _flatten(
         self, backend: Backend, bound: np.ndarray, columns: Mapping[str, np.ndarray]
     ) -> None:
+        """Splats on skin and clothes stay thin, those of hair behind as wide as closes it."""
         face = columns["face"]
         limit = FLAT_VOXELS * self._frames.voxel
         axis = NORMAL_AXIS[self._frames.convention]
@@ -209,7 +209,8 @@ def flattened(
     """Splats compressed along a local axis to the standard deviation `limit` (N,), at most, and
     widened across it to a `width` of `least` (N,): rotation (N, 4) wxyz and log_scale (N, 3),
     float32. What is seen along that axis of those wide enough stays as it is."""
-    wider = np.maximum(least / np.maximum(width(rotation, log_scale, axis), MIN_WIDTH), 1)
+    wide = np.maximum(width(rotation, log_scale, axis), np.sqrt(MIN_VARIANCE))
+    wider = np.maximum(least / wide, 1)
     sides = to_matrices(rotation) * np.exp(log_scale)[:, None] * wider[:, None, None]
     thick = np.linalg.norm(sides[:, axis], axis=1)
     sides[:, axis] *= np.minimum(limit / thick, 1)[:, None]

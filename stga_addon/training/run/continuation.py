@@ -42,7 +42,7 @@ MIN_UNLIKE_RESIDUAL = 0.05
 MIN_GROUP_VIEWS = 4
 """Evaluation views of a group at least, where it has so many."""
 ROUNDING = 1e-5
-"""By which values of an avatar differ that went through a file."""
+"""By which colors differ that went through harmonics of what is plausible from aside."""
 
 
 def select_for_takes(
