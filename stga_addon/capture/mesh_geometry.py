@@ -23,10 +23,13 @@ def triangle_normals(corners: np.ndarray) -> np.ndarray:
 
 def vertex_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """(V, 3) unit normals, weighted by the area of triangles; 0 where a vertex has none."""
-    normal = triangle_normals(vertices[faces])
+    corners = np.ascontiguousarray(vertices.T)[:, faces.T]  # a coordinate a row: faster
+    u = corners[:, 1] - corners[:, 0]
+    v = corners[:, 2] - corners[:, 0]
     flat = faces.ravel()
     count = len(vertices)
-    total = np.stack([np.bincount(flat, np.repeat(n, 3), count) for n in normal.T], axis=-1)
+    normal = [u[k - 2] * v[k - 1] - u[k - 1] * v[k - 2] for k in range(3)]
+    total = np.stack([np.bincount(flat, np.repeat(n, 3), count) for n in normal], axis=-1)
     return unit(total, 1e-20)
 
 
