@@ -206,7 +206,7 @@ def colored_aside(
     sine of the angle. Of degree 2, which holds just that."""
     directions = unit(np.random.default_rng(0).normal(size=(64, 3)))
     squared_sine = 1 - (directions @ direction.T) ** 2
-    terms = np.linalg.lstsq(_basis(directions, 9), squared_sine, rcond=None)[0]
+    terms = np.linalg.pinv(_basis(directions, 9)) @ squared_sine
     change = share[:, None] * (color - sh_color(splats.sh, direction))
     sh = at_degree(splats, 2).sh + terms.T[:, :, None] * change[:, None]
     return replace(splats, sh=sh.astype(np.float32))
