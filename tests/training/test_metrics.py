@@ -35,10 +35,11 @@ from stga_addon.training.evaluate.metrics import (
     triangle_residuals,
     visible_pixels,
 )
+from stga_addon.training.optimize.image_preparation import image_preparation
 from stga_addon.training.run.metrics_log import read_metrics
 from stga_addon.training.run.session import train_run
 
-from .toys import run_of
+from .toys import quick_settings, run_of
 
 HEIGHT = 31
 WIDTH = 24
@@ -151,6 +152,20 @@ def head_and_image():
     head[6:26, 8:24] = True
     noise = default_rng(0).uniform(0.2, 0.7, (3, SIDE, SIDE))
     return head, np.where(head, noise, 1.0).astype(np.float32)
+
+
+def test_training_images_lose_their_exposure(toy):
+    """Catches images that are trained with the exposure that analysis has found, gain and offset
+    swapped, mixed channels, and a background that changes."""
+    head, image = head_and_image()
+    gain = np.array([1.1, 0.9, 1.2])
+    offset = np.array([5.0, -8.0, 2.0])
+    levels = 255 * image.transpose(1, 2, 0)
+    target = np.where(head[..., None], gain * levels + offset, levels).round().astype(np.uint8)
+    prepare = image_preparation(toy, quick_settings(exposure=((0.0, *gain, *offset),)))
+    view = evaluation_views(target)[0].view
+    back, _ = prepare(view, target, np.uint8(255 * head))
+    assert np.abs(back - levels).max() < 3
 
 
 def test_a_rendering_of_one_color_stays_finite():
