@@ -81,7 +81,7 @@ class Export:
         "leave out the capture's light: colors are the albedo (docs/light.md)", False
     )
     filmed_only: bool = option(
-        "leave out the splats that no camera saw, which are plausible only", False
+        "leave out what is plausible only: splats that no camera saw, colors from aside", False
     )
 
     def check(self) -> None:

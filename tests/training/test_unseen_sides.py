@@ -321,7 +321,7 @@ def test_hair_from_aside(bundled, tmp_path):
     assert_allclose(aside[cheeks], seen[cheeks], atol=1e-5)
     assert_allclose(state_of_avatar(avatar).parameters.sh, trained.sh, atol=1e-5)
     sides = trainer.frames.sides
-    before_neck = (sides.changes > 0.5)[splats.face] & ~sides.is_hair[splats.face]
+    before_neck = (sides.view_dependence > 0.5)[splats.face] & ~sides.is_hair[splats.face]
     hanging = plausible_aside(replace(trained, unbound=before_neck), along, sides)
     assert before_neck.sum() > 100
     assert not hanging.sh[before_neck, 1:].any()

@@ -45,9 +45,8 @@ SOURCE_TRIANGLES = 100
 """Of whose colors a hidden triangle has the median."""
 SHOWN_COSINE = 0.5
 ASIDE_SHARE = 0.75
-"""Of the angle between a triangle and the camera that it faces most, above which it looks from
-elsewhere as views show it; how far what does not is on the way to its color aside at a right angle
-to the views."""
+"""Of the angle between a triangle and the camera that it faces most, above which its color depends
+on no view; share of the color from aside at a right angle to the views."""
 
 
 @dataclass(frozen=True)
@@ -58,16 +57,16 @@ class UnseenSides:
     shown       (F,) bool: the views whose colors were looked at show them well
     color       (F, 3) in 0…1 that a triangle plausibly has
     is_hair     (F,) bool: hair's triangles, where any is shown
-    changes     (F,) 0…1: how much what views show looks different from elsewhere: hair, in which
-                sheen and strands are others, and what turns away from all views
-    aside       (F, 3) in 0…1: the color that it has there
+    view_dependence  (F,) 0…1 of the color that views show: 1 in hair, for its sheen and strands,
+                more than 0 where a triangle turns away from all views
+    aside       (F, 3) in 0…1: the color from a right angle to the views
     """
 
     triangles: np.ndarray
     shown: np.ndarray
     color: np.ndarray
     is_hair: np.ndarray
-    changes: np.ndarray
+    view_dependence: np.ndarray
     aside: np.ndarray
 
 
@@ -99,7 +98,7 @@ def unseen_sides(surface: Surface) -> UnseenSides:
         own = sources[part[sources] == number] if (part[sources] == number).any() else sources
         near = nearest_rows(centers[own], centers[rows], SOURCE_TRIANGLES)
         found[rows] = np.median(color[own[near]], axis=1)
-    changes = np.where(is_outside, surface.turned_from(SHOWN_COSINE), 0.0)
+    turned = np.where(is_outside, surface.turned_from(SHOWN_COSINE), 0.0)
     aside = color.copy()
     is_hair = np.zeros_like(shown)
     at = head_coordinates(capture)
@@ -129,15 +128,16 @@ def unseen_sides(surface: Surface) -> UnseenSides:
     found[within] = inside_colors(capture, color, shown, within)
     triangles = (is_outside & (cosine < UNSEEN_COSINE)) | inside
     aside = np.where(unseen[:, None], found, aside)
-    return UnseenSides(triangles, shown, found, is_hair, np.where(is_hair, 1.0, changes), aside)
+    return UnseenSides(triangles, shown, found, is_hair, np.where(is_hair, 1.0, turned), aside)
 
 
 def plausible_aside(splats: Splats, along: np.ndarray, sides: UnseenSides) -> Splats:
     """Splats that views show along one direction only, that of their triangle (F, 3), with what is
     plausible from aside: hair, and of the rest what lies on it, not what hangs before it."""
     face = splats.face
-    changes = np.where(splats.unbound & ~sides.is_hair[face], 0.0, sides.changes[face])
-    return colored_aside(splats, along[face], ASIDE_SHARE * changes, sides.aside[face])
+    share = ASIDE_SHARE * sides.view_dependence[face]
+    share[splats.unbound & ~sides.is_hair[face]] = 0
+    return colored_aside(splats, along[face], share, sides.aside[face])
 
 
 def _fringe(at: HeadCoordinates, shown: np.ndarray) -> np.ndarray:
