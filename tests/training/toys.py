@@ -102,7 +102,8 @@ def assert_same_run(folder, expected):
     ours, theirs = (
         {path.name: path.read_bytes() for path in each.iterdir()} for each in (folder, expected)
     )
-    assert ours.keys() == theirs.keys()
+    in_one_only = ours.keys() ^ theirs.keys()
+    assert not in_one_only, in_one_only
     for name, content in ours.items():
         assert content == theirs[name] or name in (CHECKPOINT, METRICS, RUN), name
     lines, right = (without_times(read_metrics(each)) for each in (folder, expected))
