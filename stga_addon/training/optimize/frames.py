@@ -14,6 +14,7 @@ from ...avatar.strain import strain_basis, trained_range
 from ...capture.model import Capture
 from ...raster.cpu.rasterize import moved_frames
 from ..settings import TrainingSettings
+from .backing import Backing, backing_of
 from .initial_splats import voxel_size
 from .surface import Surface
 from .unseen_sides import UnseenSides, unseen_sides
@@ -102,6 +103,10 @@ class FrameStore:
     @cached_property
     def sides(self) -> UnseenSides:
         return unseen_sides(self.surface)
+
+    @cached_property
+    def backing(self) -> Backing:
+        return backing_of(self.surface, self.sides)
 
     @cached_property
     def layer_height(self) -> np.ndarray:

@@ -101,12 +101,18 @@ def head_coordinates(capture: Capture) -> HeadCoordinates | None:
     )
 
 
+def ears_of(at: HeadCoordinates) -> np.ndarray:
+    """(F,) bool: triangles of ears."""
+    angle = np.degrees(np.abs(at.azimuth))
+    ear = (at.side > EAR_SIDE) & (abs(angle - EAR_ANGLE_DEG) < EAR_WIDTH_DEG)
+    return np.asarray(ear & (abs(at.level - EAR_LEVEL) < EAR_HEIGHT))
+
+
 def kinds_of(at: HeadCoordinates, is_outside: np.ndarray) -> dict[str, np.ndarray]:
     """Kind -> (F,) bool: scalp, neck with shoulders, whose unseen parts look as seen ones."""
     angle = np.degrees(np.abs(at.azimuth))
     elevation = np.degrees(at.elevation)
-    ear = (at.side > EAR_SIDE) & (abs(angle - EAR_ANGLE_DEG) < EAR_WIDTH_DEG)
-    ear &= abs(at.level - EAR_LEVEL) < EAR_HEIGHT
+    ear = ears_of(at)
     hairline = np.interp(angle, HAIRLINE_DEG, HAIRLINE)
     hairy = (angle > SCALP_ANGLE_DEG) | (elevation > SCALP_ELEVATION_DEG)
     scalp = is_outside & ~ear & hairy & (at.level > hairline)

@@ -40,9 +40,12 @@ OUTLINE_COSINE = 0.2
 camera and a triangle that lies in the mesh's outline."""
 OUTSIDE_CAMERAS = 15
 OUTSIDE_DISTANCE = 4.0
-OUTSIDE_SIDE_PX = 240
-"""Cameras that tell the neutral head's outside from its inside; their distance, in its radius;
-width and height of their images."""
+OUTSIDE_WIDTH = 2.2
+OUTSIDE_PIXEL_SHARE = 0.7
+MAX_OUTSIDE_PX = 2000
+"""Cameras that tell the neutral head's outside from its inside; their distance and the width of
+what they see, in its radius; a pixel's, in the side of a square as large as the median triangle,
+however far a torso reaches; most pixels of a side."""
 STEPS_PER_VOXEL = 4
 MAX_HEIGHT_VOXELS = 10
 OUTLINE_VOXELS = 1.5
@@ -89,21 +92,32 @@ class Surface:
     @cached_property
     def outside(self) -> np.ndarray:
         """(F,) bool: triangles of the neutral mesh that some camera around it sees."""
-        neutral = np.asarray(self.capture.neutral, np.float64)
-        center = neutral.mean(0)
-        radius = max(float(np.linalg.norm(neutral - center, axis=1).max()), 1e-9)
         seen = np.zeros(len(self.capture.faces), bool)
-        focal = OUTSIDE_SIDE_PX * OUTSIDE_DISTANCE / 2.2
         for number in range(OUTSIDE_CAMERAS):
             angle = 2 * np.pi * number / OUTSIDE_CAMERAS
             height = (-0.5, 0.2, 0.9)[number % 3]
-            eye = center + OUTSIDE_DISTANCE * radius * np.array(
-                [np.sin(angle), height, np.cos(angle)]
-            )
-            camera = look_at(eye, center, OUTSIDE_SIDE_PX, OUTSIDE_SIDE_PX, focal_length=focal)
-            triangle, _ = rasterize(neutral, self.capture.faces, camera)
-            seen[np.unique(triangle[triangle >= 0])] = True
+            seen |= self.seen_from(np.array([np.sin(angle), height, np.cos(angle)]))[0]
         return seen
+
+    def seen_from(self, direction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """(F,) bool: triangles of the neutral mesh that a camera in this direction (3,) from its
+        middle sees; (F,) cosine of the angle at which they face it."""
+        neutral = np.asarray(self.capture.neutral, np.float64)
+        center = neutral.mean(0)
+        radius = max(float(np.linalg.norm(neutral - center, axis=1).max()), 1e-9)
+        corners = neutral[self.capture.faces]
+        normal = triangle_normals(corners)
+        square = np.sqrt(np.median(np.linalg.norm(normal, axis=1)) / 2)
+        wanted = OUTSIDE_WIDTH * radius / max(OUTSIDE_PIXEL_SHARE * square, 1e-9)
+        side = int(min(wanted, MAX_OUTSIDE_PX))
+        eye = center + OUTSIDE_DISTANCE * radius * direction
+        focal_length = side * OUTSIDE_DISTANCE / OUTSIDE_WIDTH
+        camera = look_at(eye, center, side, side, focal_length=focal_length)
+        triangle, _ = rasterize(neutral, self.capture.faces, camera)
+        seen = np.zeros(len(self.capture.faces), bool)
+        seen[np.unique(triangle[triangle >= 0])] = True
+        normal = unit(normal, 1e-20)
+        return seen, facing(camera, corners.mean(1), normal)
 
     @cached_property
     def filmed_along(self) -> np.ndarray | None:
@@ -158,7 +172,7 @@ class Surface:
         """(F,) bool: triangles that lie outside of some masks, or touch one that does, as an ear of
         a head whose turn is tracked too far: they have to be as transparent as images say."""
         seen, beside = np.zeros((2, len(self.outside)), int)
-        for view, mask in self._masks:
+        for view, mask in self.masks:
             center, _ = _centers_and_normals(self.capture, view.timestep)
             column, row, within = pixels_of(center, view.camera)
             seen += within
@@ -168,7 +182,7 @@ class Surface:
         return np.asarray(touched[self.capture.faces].any(1))
 
     @cached_property
-    def _masks(self) -> list[tuple[View, np.ndarray]]:
+    def masks(self) -> list[tuple[View, np.ndarray]]:
         """Views, made small, whose outlines are measured, and their masks (H, W) uint8."""
         found = []
         for view in evenly_spread(self.capture.views["train"], OUTLINE_VIEWS):
@@ -270,7 +284,7 @@ class Surface:
     def _outlines(self) -> tuple[np.ndarray, np.ndarray]:
         """Sum (F,) of the heights, and in how many masks' outlines each triangle lies."""
         total, count = np.zeros((2, len(self.outside)))
-        for view, mask in self._masks:
+        for view, mask in self.masks:
             rows, height = self._heights_in(view, mask)
             total[rows] += height
             count[rows] += 1

@@ -7,7 +7,8 @@ from functools import cached_property
 
 import numpy as np
 
-from ...avatar.lattice import FLATNESS, NORMAL_AXIS, SCALE, lattice_splats
+from ...avatar.embedding import face_frames, to_local, to_world
+from ...avatar.lattice import NORMAL_AXIS, lattice_splats
 from ...avatar.splats import SH_C0, Splats, joined
 from ...flame.quaternions import from_matrices, to_matrices
 from ..settings import TrainingSettings
@@ -27,8 +28,9 @@ what is plausible at a turn; the least share of the way that is worth it."""
 HIDDEN_ORDER = 1
 HIDDEN_OPACITY = 3.0
 HIDDEN_FLATNESS = 0.25
+BACKING_OPACITY = 5.0
 """Of the layer on hidden triangles: order of the lattice where none is chosen, logit, and how much
-thinner it is than the lattice's splats."""
+thinner it is than the lattice's splats; logit of the one behind what views graze."""
 BESIDE_LID_SHARE = 0.6
 """Of the scale of the layer under lids, at their edges and in the mouth, where it would stand out
 beside the eye and the lips."""
@@ -50,7 +52,9 @@ PULLED_COLUMNS = (
     "second/opacity",
 )
 PINNED_KINDS = ("parameters", "average", "first", "second")
-"""What is read of the splats that may be pulled; arrays of those whose color is pinned."""
+KEPT = ("xyz", "rotation", "log_scale", "opacity")
+"""What is read of the splats that may be pulled; arrays of those whose color is pinned; parameters
+of the inner layer that stay."""
 
 
 class SurfacePrior:
@@ -74,6 +78,7 @@ class SurfacePrior:
         surface = self._surface
         sides = self._frames.sides
         may_be = sides.triangles | ~sides.shown | surface.lids | surface.is_flat
+        may_be |= self._frames.backing.triangles
         return np.asarray(may_be | (surface.turned_away > 0))
 
     def prepare(self) -> None:
@@ -89,10 +94,11 @@ class SurfacePrior:
         usual = np.flatnonzero(well_seen if well_seen.any() else is_bound)
         moments = backend.columns(("second/color", "second/opacity"), usual)
         columns = backend.columns(PULLED_COLUMNS, bound)
-        self._pull_colors(backend, bound, columns, moments["second/color"])
+        is_inner = self._is_inner(columns)
+        self._pull_colors(backend, bound, columns, moments["second/color"], is_inner)
         self._pull_shapes(backend, bound, columns, moments["second/opacity"])
         self._flatten(backend, bound, columns)
-        self._keep_layer(backend, bound, columns)
+        self._keep_layer(backend, bound, columns, is_inner)
 
     def _pull_colors(
         self,
@@ -100,13 +106,17 @@ class SurfacePrior:
         bound: np.ndarray,
         columns: Mapping[str, np.ndarray],
         usual: np.ndarray,
+        is_inner: np.ndarray,
     ) -> None:
         sides = self._frames.sides
+        backing = self._frames.backing
         face = columns["face"]
         share = doubt(columns["second/color"], usual) * ~sides.shown[face]
-        is_pinned = sides.triangles[face] | self._is_under_lid(columns)
+        is_pinned = sides.triangles[face] | is_inner
         rows = np.flatnonzero((share > MIN_PULL) & ~is_pinned)
-        plausible = ((sides.color[face] - 0.5) / SH_C0).astype(np.float32)
+        is_backing = (is_inner & backing.triangles[face])[:, None]
+        wanted = np.where(is_backing, backing.color[face], sides.color[face])
+        plausible = ((wanted - 0.5) / SH_C0).astype(np.float32)
         color = columns["parameters/color"][rows]
         color += share[rows, None] * (plausible[rows] - color)
         backend.assign(bound[rows], {"parameters/color": color})
@@ -159,28 +169,39 @@ class SurfacePrior:
         backend.assign(bound[rows[off]], {**values, **moments})
 
     def _keep_layer(
-        self, backend: Backend, bound: np.ndarray, columns: Mapping[str, np.ndarray]
+        self,
+        backend: Backend,
+        bound: np.ndarray,
+        columns: Mapping[str, np.ndarray],
+        is_inner: np.ndarray,
     ) -> None:
-        """Splats of the mouth's unseen inside, and those under lids, stay as `layer_on` has them:
-        views of closed mouths and open eyes would make them any size."""
+        """Splats of the mouth's unseen inside, and those behind lids and sides, stay as
+        `inner_layer` has them: views would make them any size."""
         face = columns["face"]
         is_inside = (self._frames.sides.triangles & ~self._surface.outside)[face]
-        rows = np.flatnonzero(is_inside | self._is_under_lid(columns))
-        backend.assign(bound[rows], parameters_and_average(layer_on(self._frames, face[rows])))
+        rows = np.flatnonzero(is_inside | is_inner)
+        inner = self._inner.rows(np.searchsorted(self._inner.face, face[rows]))
+        kept = {name: getattr(inner, name) for name in KEPT}
+        backend.assign(bound[rows], parameters_and_average(kept))
 
-    def _is_under_lid(self, columns: Mapping[str, np.ndarray]) -> np.ndarray:
-        """(N,) bool: the splats of the layer under lids, each the nearest to its place. By depth,
-        lids' own splats would join it, as training moves them by more than the tenth of a
+    @cached_property
+    def _inner(self) -> Splats:
+        return inner_layer(self._frames)
+
+    def _is_inner(self, columns: Mapping[str, np.ndarray]) -> np.ndarray:
+        """(N,) bool: the splats of the layer behind lids and sides, each the nearest to its place.
+        By depth, lids' own splats would join it, as training moves them by more than the tenth of a
         millimeter that it is deep, and never leave it."""
-        rows = np.flatnonzero(self._surface.lids[columns["face"]])
+        has_inner = self._surface.lids | self._frames.backing.triangles
+        rows = np.flatnonzero(has_inner[columns["face"]])
         face = columns["face"][rows]
-        place = layer_on(self._frames, face)["xyz"]
+        place = self._inner.xyz[np.searchsorted(self._inner.face, face)]
         distance = np.linalg.norm(columns["parameters/xyz"][rows] - place, axis=1)
         order = np.lexsort((distance, face))
         _, first = np.unique(face[order], return_index=True)
-        is_under = np.zeros(len(columns["face"]), bool)
-        is_under[rows[order[first]]] = True
-        return is_under
+        is_inner = np.zeros(len(columns["face"]), bool)
+        is_inner[rows[order[first]]] = True
+        return is_inner
 
 
 def doubt(second: np.ndarray, usual: np.ndarray) -> np.ndarray:
@@ -223,8 +244,8 @@ def flattened(
 
 def hidden_splats(frames: FrameStore, settings: TrainingSettings) -> Splats:
     """A dense opaque layer on the `closed` triangles, in which no view splits splats: on skin and
-    clothes, or where the outer layer of hair is. Under lids as well, whose own splats, trained on
-    open eyes, would leave gaps when they close."""
+    clothes, or where the outer layer of hair is. Behind lids as well, whose own splats, trained on
+    open eyes, would leave gaps when they close, and behind sides that views graze."""
     capture = frames.capture
     surface = frames.surface
     axis = NORMAL_AXIS[frames.convention]
@@ -236,9 +257,9 @@ def hidden_splats(frames: FrameStore, settings: TrainingSettings) -> Splats:
         HIDDEN_OPACITY,
         convention=frames.convention,
     )
-    lids = np.flatnonzero(surface.lids & ~surface.closed)
-    under = layer.rows(np.searchsorted(layer.face, lids))
-    under = replace(under, **layer_on(frames, lids))
+    inner = inner_layer(frames, settings.sh_degree)
+    has_inner = (surface.lids & ~surface.closed) | frames.backing.triangles
+    inner = inner.rows(has_inner[inner.face])
     layer = layer.rows(surface.closed[layer.face])
     face = layer.face
     inset = np.where(surface.border, BORDER_INSET, 1.0)[face]
@@ -247,24 +268,34 @@ def hidden_splats(frames: FrameStore, settings: TrainingSettings) -> Splats:
     log_scale = layer.log_scale + np.log(inset * frames.hair_widening[face])[:, None]
     log_scale[:, axis] += np.log(HIDDEN_FLATNESS)
     layer = replace(layer, xyz=xyz.astype(np.float32), log_scale=log_scale.astype(np.float32))
-    return joined([layer, under])
+    return joined([layer, inner])
 
 
-def layer_on(frames: FrameStore, face: np.ndarray) -> dict[str, np.ndarray]:
-    """xyz, rotation, log_scale and opacity of one splat under the middle of each of these triangles
-    (N,) of lids, so large that closed they have no gaps, and of the mouth's inside."""
+def inner_layer(frames: FrameStore, sh_degree: int = 0) -> Splats:
+    """One gray splat for each triangle of lids, under its middle, so large that closed they have no
+    gaps; of the mouth's unseen inside; and of the `backing`, there. By triangle."""
+    capture = frames.capture
     axis = NORMAL_AXIS[frames.convention]
     lids = frames.surface.lids
-    inner = np.ones(len(frames.capture.neutral), bool)
-    inner[frames.capture.faces[~lids]] = False
-    share = np.where(inner[frames.capture.faces[face]].all(1), 1.0, BESIDE_LID_SHARE)
-    xyz = np.zeros((len(face), 3), np.float32)
-    xyz[:, axis] = frames.layer_height[face]
-    log_scale = np.log(SCALE * share * frames.units[face])[:, None].repeat(3, axis=1)
-    log_scale[:, axis] += np.log(FLATNESS * HIDDEN_FLATNESS)
-    return {
-        "xyz": xyz,
-        "rotation": np.eye(1, 4, dtype=np.float32).repeat(len(face), axis=0),
-        "log_scale": log_scale.astype(np.float32),
-        "opacity": np.full(len(face), HIDDEN_OPACITY, np.float32),
-    }
+    backing = frames.backing
+    layer = lattice_splats(
+        capture.neutral, capture.faces, 0, sh_degree, HIDDEN_OPACITY, frames.convention
+    )
+    around = np.ones(len(capture.neutral), bool)
+    around[capture.faces[~lids]] = False
+    share = np.where(around[capture.faces].all(1), 1.0, BESIDE_LID_SHARE)
+    layer.xyz[:, axis] = frames.layer_height
+    layer.log_scale[:] += np.log(share)[:, None]
+    layer.log_scale[:, axis] += np.log(HIDDEN_FLATNESS)
+    behind = lattice_splats(
+        backing.places, capture.faces, 0, sh_degree, BACKING_OPACITY, frames.convention
+    ).rows(backing.triangles)
+    behind.log_scale[:, axis] += np.log(HIDDEN_FLATNESS)
+    there, here = (
+        face_frames(mesh, capture.faces, mesh, frames.convention)
+        for mesh in (backing.places, capture.neutral)
+    )
+    behind = to_local(to_world(behind, there), here, behind.face)
+    within = lids | (frames.sides.triangles & ~frames.surface.outside)
+    layer = joined([layer.rows((within & ~backing.triangles)[layer.face]), behind])
+    return layer.rows(np.argsort(layer.face))

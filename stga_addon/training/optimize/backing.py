@@ -1,0 +1,158 @@
+"""An opaque layer behind the surface: nobody is to look through a head from where it was not
+filmed. Images make its sides transparent where it is tracked too wide, and of a torso there may be
+the front alone."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.ndimage import binary_erosion
+
+from ...avatar.embedding import face_frames
+from ...avatar.lattice import NORMAL_AXIS
+from ...capture.mesh_geometry import head_axes, pixels_of, vertex_normals
+from ...capture.model import Capture
+from .initial_splats import voxel_size
+from .likeness import CHIN_LEVEL, HeadCoordinates, ears_of, head_coordinates, nearest_rows, skin_of
+from .surface import MAX_BESIDE_SHARE, Surface
+from .unseen_sides import SOURCE_TRIANGLES, UnseenSides
+
+GRAZED_COSINE = 0.7
+"""Of the angle between a triangle and the camera that it faces most, below which it has a layer
+behind it."""
+DEPTH_VOXELS = 0.5
+MAX_DEPTHS = 10
+MARGIN_SHARE = 0.01
+BACK_MARGIN_SHARE = 0.03
+"""Step of the depths at which the layer may lie, and how many are tried: the first that is within
+the masks, with a margin as a share of their height; of a back, whose triangles are large."""
+BEHIND_DEG = (-30.0, 0.0, 30.0)
+"""Directions from behind from which the inner side of a torso's front may show."""
+BACK_SHARE = 0.5
+BACK_LEVELS = 0.5
+BACK_REACH = (0.02, 0.98)
+BACK_GAP_VOXELS = 1.5
+"""Depth of a back, an ellipse, as a share of half of the torso's width; heights, in distances of
+the eyes from the mouth, within which that, between quantiles, and the color are measured; how deep
+it is at the sides."""
+
+
+@dataclass(frozen=True)
+class Backing:
+    """The layer behind some triangles.
+
+    triangles  (F,) bool: those that have it
+    places     (V, 3) meters: where the neutral mesh's vertices are in the layer
+    color      (F, 3) in 0…1 of the layer
+    """
+
+    triangles: np.ndarray
+    places: np.ndarray
+    color: np.ndarray
+
+
+def backing_of(surface: Surface, sides: UnseenSides) -> Backing:
+    """Behind the outside of a head that few cameras see at a grazing angle or not at all, but for
+    ears and the parts of the face: at the least depth that masks allow, in the color from aside.
+    Behind the front of a torso that has no back: a round one in the usual color of its height."""
+    capture = surface.capture
+    faces = capture.faces
+    neutral = np.asarray(capture.neutral, np.float64)
+    at = head_coordinates(capture)
+    if at is None or not surface.has_few_cameras:
+        return Backing(np.zeros(len(faces), bool), neutral, sides.aside)
+    front = _open_fronts(surface, at)
+    color = sides.aside.copy()
+    back = neutral
+    if front.any():
+        back, color[front] = _round_back(capture, front, sides.color)
+        rows = np.flatnonzero(front)
+        turned = face_frames(neutral, faces, neutral, "stga").rotation[rows]
+        away = (back - neutral)[faces[rows]].mean(1)
+        offsets = np.einsum("nji,nj->ni", turned, away)[:, None]
+        front[rows] = _is_within_masks(surface, rows, offsets, BACK_MARGIN_SHARE)[:, 0]
+    of_back = np.zeros(len(neutral), bool)
+    of_back[faces[front]] = True
+    grazed = surface.outside & skin_of(capture) & (surface.facing < GRAZED_COSINE)
+    face_parts = np.any(list(capture.regions.values()), axis=0)
+    grazed &= at.level > CHIN_LEVEL
+    grazed &= ~(of_back[faces].any(1) | ears_of(at) | surface.lids | face_parts)
+    rows = np.flatnonzero(grazed)
+    depths = voxel_size(neutral) * DEPTH_VOXELS * np.arange(1, MAX_DEPTHS + 1)
+    offsets = np.zeros((len(rows), len(depths), 3))
+    offsets[:, :, NORMAL_AXIS["stga"]] = -depths
+    fits = _is_within_masks(surface, rows, offsets, MARGIN_SHARE)
+    grazed[rows] = fits.any(1)
+    deepest = np.zeros(len(neutral))
+    np.maximum.at(deepest, faces[rows], depths[fits.argmax(1), None])
+    skin = np.flatnonzero(grazed & ~sides.is_hair)
+    if len(skin):
+        centers = neutral[faces].mean(1)[skin]
+        around = nearest_rows(centers, centers, SOURCE_TRIANGLES)
+        color[skin] = np.median(color[skin][around], axis=1)
+    behind = neutral - deepest[:, None] * vertex_normals(neutral, faces)
+    places = np.where(of_back[:, None], back, behind)
+    return Backing(grazed | front, places, color)
+
+
+def _open_fronts(surface: Surface, at: HeadCoordinates) -> np.ndarray:
+    """(F,) bool: triangles below the chin whose inner side shows from behind, but for what sticks
+    out of masks."""
+    _, (across, _, ahead), _ = _axes(surface.capture)
+    front = np.zeros(len(surface.outside), bool)
+    for angle in np.radians(BEHIND_DEG):
+        seen, cosine = surface.seen_from(np.sin(angle) * across - np.cos(angle) * ahead)
+        front |= seen & (cosine < 0)
+    return np.asarray(front & (at.level < CHIN_LEVEL) & ~surface.sticks_out)
+
+
+def _is_within_masks(
+    surface: Surface, rows: np.ndarray, offsets: np.ndarray, margin_share: float
+) -> np.ndarray:
+    """(N, K) bool: whether most masks, less a margin as a share of their height, have foreground at
+    K points each of triangles (N,); offsets (N, K, 3): from their origins, meters in the axes of
+    their frames."""
+    capture = surface.capture
+    seen, beside = np.zeros((2, *offsets.shape[:2]), int)
+    for view, mask in surface.masks:
+        mesh = np.asarray(capture.mesh(view.timestep), np.float64)
+        frames = face_frames(mesh, capture.faces, mesh, "stga")
+        points = np.einsum("nij,nkj->nki", frames.rotation[rows], offsets)
+        points += frames.origin[rows, None]
+        column, row, within = pixels_of(points.reshape(-1, 3), view.camera)
+        margin = max(1, round(margin_share * len(mask)))
+        covered = binary_erosion(mask > 127, iterations=margin)
+        seen += within.reshape(seen.shape)
+        beside += (within & ~covered[row, column]).reshape(seen.shape)
+    return np.asarray(beside <= MAX_BESIDE_SHARE * np.maximum(seen, 1))
+
+
+def _round_back(
+    capture: Capture, front: np.ndarray, color: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """The vertices (V, 3), those of the triangles `front` (F,) bool in the back of an elliptic
+    torso as wide as these; the usual color (M, 3) at the height of each of them; color: (F, 3)."""
+    eyes, (across, up, ahead), unit_m = _axes(capture)
+    places = np.array(capture.neutral, np.float64)
+    vertices = np.unique(capture.faces[front])
+    triangles = places[capture.faces[front]].mean(1) - eyes
+    width = triangles @ across
+    level = triangles @ up
+    behind = np.empty(len(vertices))
+    for row, (x, y) in enumerate((places[vertices] - eyes) @ np.stack([across, up], 1)):
+        around = abs(level - y) < BACK_LEVELS * unit_m
+        low, high = np.quantile(width[around] if around.any() else width, BACK_REACH)
+        half = max((high - low) / 2, 1e-9)
+        beside = min(abs(x - (high + low) / 2) / half, 1)
+        behind[row] = BACK_SHARE * half * np.sqrt(1 - beside**2)
+    behind += BACK_GAP_VOXELS * voxel_size(places)
+    places[vertices] -= behind[:, None] * ahead
+    usual = [np.median(color[front][abs(level - y) < BACK_LEVELS * unit_m], axis=0) for y in level]
+    return places, np.array(usual)
+
+
+def _axes(capture: Capture) -> tuple[np.ndarray, np.ndarray, float]:
+    """`head_axes` of a neutral head that has them."""
+    centers = np.asarray(capture.neutral, np.float64)[capture.faces].mean(1)
+    axes = head_axes(centers, capture.regions)
+    assert axes is not None
+    return axes
