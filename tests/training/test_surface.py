@@ -12,7 +12,7 @@ from scipy.ndimage import binary_dilation, binary_erosion
 from stga_addon.avatar.file import UNSEEN_REGION, Avatar
 from stga_addon.avatar.filmed import filmed_sides
 from stga_addon.avatar.lattice import NORMAL_AXIS
-from stga_addon.avatar.splats import SH_C0
+from stga_addon.avatar.splats import SH_C0, joined
 from stga_addon.capture.camera import look_at
 from stga_addon.capture.mesh_geometry import rasterize, silhouette
 from stga_addon.capture.model import Capture, View
@@ -26,10 +26,12 @@ from stga_addon.training.optimize.initial_splats import voxel_size
 from stga_addon.training.optimize.state import new_state
 from stga_addon.training.optimize.surface import GRAZING_COSINE, Surface
 from stga_addon.training.optimize.surface_prior import (
+    BACKING_OPACITY,
     BEHIND_COSINE,
     SurfacePrior,
     flattened,
     hidden_splats,
+    splats_behind,
     thickness,
     width,
 )
@@ -153,12 +155,13 @@ def test_hair_behind_keeps_its_width(filmed, convention):
     frontal = replace(filmed, views={"train": filmed.views["train"][3:6]})
     frames = FrameStore(frontal, convention)
     settings = quick_settings(convention=convention)
-    state = new_state(hidden_splats(frames, settings))
-    state.parameters.log_scale[:] -= 0.7
+    layer = hidden_splats(frames, settings)
+    state = new_state(joined([layer, splats_behind(frames, settings.sh_degree)]))
+    state.parameters.log_scale[: len(layer)] -= 0.7
     SurfacePrior(frames).apply(Rows(state), Turn(20, 0.5, len(state)))
     hair = (frames.surface.facing < BEHIND_COSINE) & (frames.surface.hair_height > 0)
-    behind = hair[state.face]
-    assert behind.sum() > 100
+    behind = np.flatnonzero(hair[layer.face])
+    assert len(behind) > 100
     wide = width(state.parameters.rotation, state.parameters.log_scale, NORMAL_AXIS[convention])
     assert np.all(wide[behind] > 0.97 * frames.hair_layer_scale[state.face[behind]])
 
@@ -196,18 +199,19 @@ def test_what_views_tell_is_kept(filmed):
     surface = frames.surface
     trainer = Trainer(filmed, quick_settings("global", sh_degree=0, sh_steps=()), {})
     state = trainer.state
+    outer = state.parameters.opacity != BACKING_OPACITY
     rng = np.random.default_rng(0)
     told = rng.random(len(state)) < 0.8
     for part in (state.second.sh, state.second.opacity):
         part[:] = 1e-12
         part[told] = 1.0
     state.parameters.sh[:] = rng.normal(size=state.parameters.sh.shape)
-    state.parameters.xyz[:] += rng.normal(0, 0.002, state.parameters.xyz.shape)
+    state.parameters.xyz[outer] += rng.normal(0, 0.002, (outer.sum(), 3))
     before = {name: value.copy() for name, value in state.parameters._asdict().items()}
     prior = SurfacePrior(frames)
     prior.apply(Rows(state), Turn(20, 0.5, len(state)))
     grazing = surface.outside & (surface.facing < GRAZING_COSINE) & (surface.facing > 0)
-    of_grazing = grazing[state.face] & ~state.unbound
+    of_grazing = grazing[state.face] & ~state.unbound & outer
     kept = of_grazing & told & ~frames.sides.triangles[state.face]
     shown = of_grazing & frames.sides.shown[state.face] & ~frames.sides.triangles[state.face]
     assert shown.sum() > 50
@@ -225,10 +229,10 @@ def test_what_views_tell_is_kept(filmed):
     assert_allclose(state.parameters.sh[rows, 0], own + share * (plausible - own), atol=1e-3)
     height = state.parameters.xyz[rows, 2]
     hair = surface.hair_height[state.face[rows]]
-    outer = 0.8 * hair - voxel_size(filmed.neutral) / 2
+    outer_m = 0.8 * hair - voxel_size(filmed.neutral) / 2
     edges = np.diff(filmed.neutral[filmed.faces[state.face[rows]]], axis=1).swapaxes(0, 1)
     skin = -0.1 * np.sqrt(np.linalg.norm(np.cross(*edges), axis=1))
-    plausible = np.where(outer > 0, outer, skin)
+    plausible = np.where(outer_m > 0, outer_m, skin)
     was = before["xyz"][rows, 2]
     assert_allclose(height, was + away[rows] ** 2 * (plausible - was), atol=3e-4)
 

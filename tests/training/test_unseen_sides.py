@@ -21,7 +21,7 @@ from stga_addon.training.optimize.change import Turn
 from stga_addon.training.optimize.frames import FrameStore
 from stga_addon.training.optimize.state import state_of_avatar
 from stga_addon.training.optimize.surface import Surface
-from stga_addon.training.optimize.surface_prior import SurfacePrior, hidden_splats
+from stga_addon.training.optimize.surface_prior import BACKING_OPACITY, SurfacePrior, hidden_splats
 from stga_addon.training.optimize.trainer import Trainer
 from stga_addon.training.optimize.unseen_sides import plausible_aside, unseen_sides
 
@@ -281,9 +281,9 @@ def test_what_sticks_out_of_masks_is_not_closed(bundled, tmp_path):
         np.unique(layer.face[surface.hidden[layer.face]]), np.flatnonzero(surface.closed)
     )
     state = Trainer(capture, quick_settings(iterations=1), {}).state
+    bound = ~state.unbound & (state.parameters.opacity != BACKING_OPACITY)
     state.parameters.opacity[:] = -5
     SurfacePrior(FrameStore(capture, "stga", False)).apply(Rows(state), Turn(20, 0.5, len(state)))
-    bound = ~state.unbound
     assert (state.parameters.opacity[bound & beyond[state.face]] == -5).all()
     assert (
         state.parameters.opacity[bound & (surface.closed & (surface.facing < -0.1))[state.face]] > 2

@@ -12,13 +12,22 @@ from ...avatar.lattice import NORMAL_AXIS
 from ...capture.mesh_geometry import head_axes, pixels_of, vertex_normals
 from ...capture.model import Capture
 from .initial_splats import voxel_size
-from .likeness import CHIN_LEVEL, HeadCoordinates, ears_of, head_coordinates, nearest_rows, skin_of
+from .likeness import (
+    CHIN_LEVEL,
+    HeadCoordinates,
+    ears_of,
+    head_coordinates,
+    kinds_of,
+    nearest_rows,
+    skin_of,
+)
 from .surface import MAX_BESIDE_SHARE, Surface
 from .unseen_sides import SOURCE_TRIANGLES, UnseenSides
 
 GRAZED_COSINE = 0.7
+FACE_ANGLE_DEG = 45.0
 """Of the angle between a triangle and the camera that it faces most, below which it has a layer
-behind it."""
+behind it; from straight ahead, beyond which there is no face, seen from the middle of the head."""
 DEPTH_VOXELS = 0.5
 MAX_DEPTHS = 10
 MARGIN_SHARE = 0.01
@@ -26,7 +35,9 @@ BACK_MARGIN_SHARE = 0.03
 """Step of the depths at which the layer may lie, and how many are tried: the first that is within
 the masks, with a margin as a share of their height; of a back, whose triangles are large."""
 BEHIND_DEG = (-30.0, 0.0, 30.0)
-"""Directions from behind from which the inner side of a torso's front may show."""
+MIN_FRONT_HEIGHT = 2.0
+"""Directions from behind from which the inner side of a torso's front may show; how high that is at
+least, in distances of the eyes from the mouth."""
 BACK_SHARE = 0.5
 BACK_LEVELS = 0.5
 BACK_REACH = (0.02, 0.98)
@@ -60,7 +71,7 @@ def backing_of(surface: Surface, sides: UnseenSides) -> Backing:
     at = head_coordinates(capture)
     if at is None or not surface.has_few_cameras:
         return Backing(np.zeros(len(faces), bool), neutral, sides.aside)
-    front = _open_fronts(surface, at)
+    front = _open_front(surface, at)
     color = sides.aside.copy()
     back = neutral
     if front.any():
@@ -72,10 +83,8 @@ def backing_of(surface: Surface, sides: UnseenSides) -> Backing:
         front[rows] = _is_within_masks(surface, rows, offsets, BACK_MARGIN_SHARE)[:, 0]
     of_back = np.zeros(len(neutral), bool)
     of_back[faces[front]] = True
-    grazed = surface.outside & skin_of(capture) & (surface.facing < GRAZED_COSINE)
-    face_parts = np.any(list(capture.regions.values()), axis=0)
-    grazed &= at.level > CHIN_LEVEL
-    grazed &= ~(of_back[faces].any(1) | ears_of(at) | surface.lids | face_parts)
+    grazed = _beside_face(surface, at) & (surface.facing < GRAZED_COSINE)
+    grazed &= ~of_back[faces].any(1)
     rows = np.flatnonzero(grazed)
     depths = voxel_size(neutral) * DEPTH_VOXELS * np.arange(1, MAX_DEPTHS + 1)
     offsets = np.zeros((len(rows), len(depths), 3))
@@ -94,15 +103,26 @@ def backing_of(surface: Surface, sides: UnseenSides) -> Backing:
     return Backing(grazed | front, places, color)
 
 
-def _open_fronts(surface: Surface, at: HeadCoordinates) -> np.ndarray:
-    """(F,) bool: triangles below the chin whose inner side shows from behind, but for what sticks
-    out of masks."""
+def _beside_face(surface: Surface, at: HeadCoordinates) -> np.ndarray:
+    """(F,) bool: the outside of head and neck, but for the face and ears."""
+    kinds = kinds_of(at, surface.outside)
+    beside = np.degrees(np.abs(at.azimuth)) > FACE_ANGLE_DEG
+    beside |= kinds["scalp"] | kinds["body"]
+    beside &= surface.outside & skin_of(surface.capture) & (at.level > CHIN_LEVEL)
+    return np.asarray(beside & ~ears_of(at))
+
+
+def _open_front(surface: Surface, at: HeadCoordinates) -> np.ndarray:
+    """(F,) bool: triangles of a torso whose inner side shows from behind, but for what sticks out
+    of masks. A bust, which ends soon, has none."""
     _, (across, _, ahead), _ = _axes(surface.capture)
     front = np.zeros(len(surface.outside), bool)
     for angle in np.radians(BEHIND_DEG):
         seen, cosine = surface.seen_from(np.sin(angle) * across - np.cos(angle) * ahead)
         front |= seen & (cosine < 0)
-    return np.asarray(front & (at.level < CHIN_LEVEL) & ~surface.sticks_out)
+    front &= (at.level < CHIN_LEVEL) & ~surface.sticks_out
+    height = np.ptp(at.level[front]) if front.any() else 0.0
+    return np.asarray(front & (height > MIN_FRONT_HEIGHT))
 
 
 def _is_within_masks(

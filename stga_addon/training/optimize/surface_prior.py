@@ -244,8 +244,7 @@ def flattened(
 
 def hidden_splats(frames: FrameStore, settings: TrainingSettings) -> Splats:
     """A dense opaque layer on the `closed` triangles, in which no view splits splats: on skin and
-    clothes, or where the outer layer of hair is. Behind lids as well, whose own splats, trained on
-    open eyes, would leave gaps when they close, and behind sides that views graze."""
+    clothes, or where the outer layer of hair is."""
     capture = frames.capture
     surface = frames.surface
     axis = NORMAL_AXIS[frames.convention]
@@ -257,9 +256,6 @@ def hidden_splats(frames: FrameStore, settings: TrainingSettings) -> Splats:
         HIDDEN_OPACITY,
         convention=frames.convention,
     )
-    inner = inner_layer(frames, settings.sh_degree)
-    has_inner = (surface.lids & ~surface.closed) | frames.backing.triangles
-    inner = inner.rows(has_inner[inner.face])
     layer = layer.rows(surface.closed[layer.face])
     face = layer.face
     inset = np.where(surface.border, BORDER_INSET, 1.0)[face]
@@ -267,8 +263,16 @@ def hidden_splats(frames: FrameStore, settings: TrainingSettings) -> Splats:
     xyz[:, axis] += frames.layer_height[face]
     log_scale = layer.log_scale + np.log(inset * frames.hair_widening[face])[:, None]
     log_scale[:, axis] += np.log(HIDDEN_FLATNESS)
-    layer = replace(layer, xyz=xyz.astype(np.float32), log_scale=log_scale.astype(np.float32))
-    return joined([layer, inner])
+    return replace(layer, xyz=xyz.astype(np.float32), log_scale=log_scale.astype(np.float32))
+
+
+def splats_behind(frames: FrameStore, sh_degree: int) -> Splats:
+    """The opaque layer behind what views show at times or at an angle: lids, whose own splats,
+    trained on open eyes, would leave gaps when they close, and the `backing`."""
+    surface = frames.surface
+    inner = inner_layer(frames, sh_degree)
+    has_inner = (surface.lids & ~surface.closed) | frames.backing.triangles
+    return inner.rows(has_inner[inner.face])
 
 
 def inner_layer(frames: FrameStore, sh_degree: int = 0) -> Splats:

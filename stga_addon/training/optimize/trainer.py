@@ -23,7 +23,7 @@ from .make_backend import make_backend
 from .outlines import OutlinePruning
 from .state import TrainState, new_state, with_offsets
 from .strays import StrayReset
-from .surface_prior import SurfacePrior, hidden_splats
+from .surface_prior import SurfacePrior, hidden_splats, splats_behind
 from .unseen_sides import plausible_aside
 
 EXTEND_LOCAL_SHARE = 0.5
@@ -256,7 +256,7 @@ def _placed_splats(frames: FrameStore, settings: TrainingSettings) -> tuple[Trai
     triangles = len(capture.faces)
     splats = initial_splats(capture, settings)
     closed = ~splats.unbound & frames.surface.closed[splats.face]
-    layer = hidden_splats(frames, settings)
+    layer = joined([hidden_splats(frames, settings), splats_behind(frames, settings.sh_degree)])
     color = np.zeros((triangles, 3), np.float32)
     bound = ~splats.unbound
     color[splats.face[bound]] = splats.sh[bound, 0]
