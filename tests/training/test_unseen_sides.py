@@ -7,21 +7,29 @@ import pytest
 from capture import factory
 from numpy.testing import assert_allclose, assert_array_equal
 from PIL import Image
+from scipy.ndimage import binary_dilation, binary_erosion
 
+from stga_addon.avatar.embedding import points_to_world
 from stga_addon.avatar.lattice import lattice_splats
 from stga_addon.avatar.splats import colored_aside, sh_color
 from stga_addon.capture.camera import look_at
 from stga_addon.capture.images import read_image
-from stga_addon.capture.mesh_geometry import connected_parts, rasterize
+from stga_addon.capture.mesh_geometry import connected_parts, rasterize, silhouette
 from stga_addon.capture.model import View
 from stga_addon.flame.model import faces_within, torso_faces
 from stga_addon.flame.parts import flame_model, key_regions
-from stga_addon.render.render import render_avatar
+from stga_addon.render.render import render, render_avatar
+from stga_addon.tracking.torso_cloth import draped, torso_sheet
 from stga_addon.training.optimize.change import Turn
 from stga_addon.training.optimize.frames import FrameStore
 from stga_addon.training.optimize.state import state_of_avatar
 from stga_addon.training.optimize.surface import Surface
-from stga_addon.training.optimize.surface_prior import BACKING_OPACITY, SurfacePrior, hidden_splats
+from stga_addon.training.optimize.surface_prior import (
+    BACKING_OPACITY,
+    SurfacePrior,
+    hidden_splats,
+    splats_behind,
+)
 from stga_addon.training.optimize.trainer import Trainer
 from stga_addon.training.optimize.unseen_sides import plausible_aside, unseen_sides
 
@@ -191,11 +199,11 @@ def shaded_skin(hair):
     return (0.6 if hair is GRAY else 1.0) * SKIN
 
 
-def filmed(capture, color, angles, height, folder):
+def filmed(capture, color, angles, height, folder, away=1.0):
     """The capture with a view from each of these degrees around the head."""
     views = []
     for number, angle in enumerate(np.radians(angles)):
-        eye = [np.sin(angle), height, np.cos(angle)]
+        eye = [away * np.sin(angle), height, away * np.cos(angle)]
         camera = look_at(eye, [0, -0.02, 0], 160, 200, 480)
         triangle, _ = rasterize(capture.neutral, capture.faces, camera)
         picture = np.full((200, 160, 3), 255, np.uint8)
@@ -360,3 +368,97 @@ def test_a_torso_that_is_elsewhere_is_not_flat(bundled, tmp_path):
     mask[int(view.camera.project(middles(capture)[0][shown])[0][:, 1].min()) :] = 0
     Image.fromarray(mask).save(view.mask)
     assert not Surface(capture).is_flat[shown].any()
+
+
+NARROWER = 0.88
+BASE = np.array([0, -0.11, 0.0])
+"""Width of masks, of a head; the base of the neck."""
+TIE = np.array([200, 20, 20], np.uint8)
+
+
+def alpha_of(splats, camera, frames):
+    black, white = (render(splats, camera, (c, c, c), frames=frames).mean(0) for c in (0, 1))
+    return 1 - white + black
+
+
+def behind(capture):
+    """The layer behind what views graze, in its color, and the frames that it is drawn in."""
+    frames = FrameStore(capture, "stga")
+    layer = splats_behind(frames, 0)
+    layer = layer.rows(frames.backing.triangles[layer.face])
+    layer.sh[:, 0] = (frames.backing.color[layer.face] - 0.5) / 0.28209479177387814
+    return layer, frames.of(0)
+
+
+def beside_masks(capture, layer, frames):
+    """The highest alpha of splats where masks, with a margin, are clear."""
+    found = 0.0
+    for view in capture.views["train"]:
+        mask = binary_dilation(np.asarray(Image.open(view.mask)) > 0, iterations=2)
+        found = max(found, alpha_of(layer, view.camera, frames)[~mask].max())
+    return found
+
+
+def test_nobody_looks_through_a_side(bundled, tmp_path):
+    """Catches a head that is tracked wider than it is, through whose sides, transparent in all
+    images, one sees its inside from there; and a layer that shows beside the masks."""
+    capture = filmed(bundled, painted(bundled), TURNS_DEG, 0.0, tmp_path)
+    for view in capture.views["train"]:
+        narrow = silhouette(capture.neutral * [NARROWER, 1, 1], capture.faces, view.camera)
+        Image.fromarray(np.uint8(255 * narrow)).save(view.mask)
+    layer, frames = behind(capture)
+    assert beside_masks(capture, layer, frames) < 0.1
+    centers, level = middles(capture)
+    camera = look_at([1, 0, 0], [0, -0.02, 0], 160, 200, 480)
+    triangle, _ = rasterize(capture.neutral, capture.faces, camera)
+    for part in ((level > 0.2) & (centers[:, 2] < -0.02), (level < -1) & (centers[:, 2] < -0.01)):
+        part &= level > -1.8
+        own = binary_erosion((triangle >= 0) & part[triangle], iterations=7)
+        assert own.sum() > 100
+        assert alpha_of(layer, camera, frames)[own].min() > 0.9
+
+
+def with_torso(capture, width=0.2, height=0.4):
+    """The capture with the torso that tracking has drawn over a chest of this size in meters."""
+    sheet = torso_sheet(capture.flame.model)
+    neutral = np.array(capture.neutral, np.float64)
+    x, y = np.meshgrid(np.linspace(-width, width, 41), np.linspace(-height, 0, 41))
+    chest = np.stack([x, y, 0.06 - 0.5 * x**2], 2).reshape(-1, 3)
+    neutral[sheet.vertices] = draped(sheet, neutral[sheet.vertices] - BASE, chest) + BASE
+    return replace(capture, neutral=neutral, mesh=lambda _: neutral)
+
+
+def test_a_torso_has_a_back(bundled, tmp_path):
+    """Catches a torso through which, from behind, one sees its front from inside; a back that
+    shows beside the masks; and one below a bust, which ends there."""
+    capture = with_torso(bundled)
+    centers, level = middles(capture)
+    color = painted(capture)
+    color[(np.abs(centers[:, 0]) < 0.03) & (level < -2.2)] = TIE
+    capture = filmed(capture, color, (-20, 0, 20), 0.0, tmp_path, away=2.5)
+    layer, frames = behind(capture)
+    assert beside_masks(capture, layer, frames) < 0.1
+    camera = look_at([0, -0.2, -2], [0, -0.2, 0], 160, 200, 480)
+    triangle, _ = rasterize(capture.neutral, capture.faces, camera)
+    inner = (level < -4) & (level > -6) & (np.abs(centers[:, 0]) < 0.08)
+    own = (triangle >= 0) & inner[triangle]
+    assert own.sum() > 300
+    assert alpha_of(layer, camera, frames)[own].min() > 0.9
+    shown = 255 * render(layer, camera, (1, 1, 1), frames=frames)[:, own]
+    assert np.abs(shown - CLOTH[:, None]).max() < 30
+    away = centers[layer.face] - points_to_world(layer.xyz, frames, layer.face)
+    assert away[inner[layer.face], 2].max() > 0.05
+    bust = FrameStore(filmed(bundled, painted(bundled), (-20, 0, 20), 0.0, tmp_path), "stga")
+    assert not bust.backing.triangles[middles(bundled)[1] < -2.5].any()
+
+
+def test_a_head_is_outside_with_any_torso(bundled):
+    """Catches triangles too small for the cameras that look for the outside, where a torso makes
+    the mesh large: they would be taken for the mouth's inside and ears' folds."""
+    alone, beside = (
+        Surface(capture).outside for capture in (bundled, with_torso(bundled, 0.5, 0.8))
+    )
+    _, level = middles(bundled)
+    head = alone & (level > -1.5)
+    assert head.sum() > 5000
+    assert beside[head].mean() > 0.9
