@@ -108,6 +108,29 @@ def test_hair_is_as_high_as_its_outline(filmed):
     assert not surface.is_flat[shoulder & ~surface.hidden].any()
 
 
+@pytest.mark.parametrize(("sides", "hangs"), [((-1, 1), True), ((1,), False)])
+def test_long_hair_hides_the_neck(sides, hangs, filmed, tmp_path):
+    """Catches long hair that, from behind, ends at the ears like a cap; and a neck that is hidden
+    although hair, as the image shows, hangs over one shoulder."""
+    center = filmed.neutral[filmed.faces].mean(1)
+    views = []
+    for view in filmed.views["train"][3:6]:
+        mask = np.array(Image.open(view.mask))
+        for side in sides:
+            ends = [[0.03 * side, 0.0, 0], [0.1 * side, -0.16, 0]]
+            (left, right), (top, bottom) = np.sort(view.camera.project(np.array(ends))[0].T)
+            mask[int(top) : int(bottom), int(left) : int(right)] = 255
+        path = tmp_path / f"{view.timestep}.png"
+        Image.fromarray(mask).save(path)
+        views.append(replace(view, mask=path))
+    surface = Surface(replace(filmed, views={"train": tuple(views)}))
+    neck = surface.outside & (center[:, 2] < -0.05) & (abs(center[:, 1] + 0.09) < 0.02)
+    assert neck.sum() > 20
+    assert surface.kinds["scalp"][neck].mean() == hangs
+    assert np.all((surface.hair_height[neck] > 0.02) == hangs)
+    assert not surface.kinds["scalp"][center[:, 1] < -0.16].any()
+
+
 def test_an_end_of_a_bust_is_no_eye(filmed):
     """Catches eyelids and lips, whose edges are open too, that are taken for the mesh's end, large
     splats there, and a torso beside a mesh that ends at the neck, of small ones."""

@@ -17,7 +17,6 @@ from .likeness import (
     HeadCoordinates,
     ears_of,
     head_coordinates,
-    kinds_of,
     nearest_rows,
     skin_of,
 )
@@ -105,7 +104,7 @@ def backing_of(surface: Surface, sides: UnseenSides) -> Backing:
 
 def _beside_face(surface: Surface, at: HeadCoordinates) -> np.ndarray:
     """(F,) bool: the outside of head and neck, but for the face and ears."""
-    kinds = kinds_of(at, surface.outside)
+    kinds = surface.kinds
     beside = np.degrees(np.abs(at.azimuth)) > FACE_ANGLE_DEG
     beside |= kinds["scalp"] | kinds["body"]
     beside &= surface.outside & skin_of(surface.capture) & (at.level > CHIN_LEVEL)

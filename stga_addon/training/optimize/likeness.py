@@ -24,7 +24,9 @@ CHIN_LEVEL = -2.0
 eyes and above them; heights over the eyes."""
 HAIRLINE_DEG = (90.0, 140.0)
 HAIRLINE = (-0.55, -1.15)
-"""Angles from straight ahead, and heights over the eyes in that unit, below which no hair grows."""
+LONG_HAIRLINE = (-0.55, -2.3)
+"""Angles from straight ahead, and heights over the eyes in that unit, below which no hair grows, or
+none hangs."""
 EAR_SIDE = 0.93
 EAR_LEVEL = -0.2
 EAR_HEIGHT = 0.75
@@ -108,12 +110,15 @@ def ears_of(at: HeadCoordinates) -> np.ndarray:
     return np.asarray(ear & (abs(at.level - EAR_LEVEL) < EAR_HEIGHT))
 
 
-def kinds_of(at: HeadCoordinates, is_outside: np.ndarray) -> dict[str, np.ndarray]:
-    """Kind -> (F,) bool: scalp, neck with shoulders, whose unseen parts look as seen ones."""
+def kinds_of(
+    at: HeadCoordinates, is_outside: np.ndarray, has_long_hair: bool = False
+) -> dict[str, np.ndarray]:
+    """Kind -> (F,) bool: scalp, with the neck that long hair hides, and neck with shoulders, whose
+    unseen parts look as seen ones."""
     angle = np.degrees(np.abs(at.azimuth))
     elevation = np.degrees(at.elevation)
     ear = ears_of(at)
-    hairline = np.interp(angle, HAIRLINE_DEG, HAIRLINE)
+    hairline = np.interp(angle, HAIRLINE_DEG, LONG_HAIRLINE if has_long_hair else HAIRLINE)
     hairy = (angle > SCALP_ANGLE_DEG) | (elevation > SCALP_ELEVATION_DEG)
     scalp = is_outside & ~ear & hairy & (at.level > hairline)
     beside = (angle > NECK_ANGLE_DEG) | (at.level < CHIN_LEVEL)

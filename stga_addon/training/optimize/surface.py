@@ -21,7 +21,7 @@ from ...capture.model import Capture, View, evenly_spread, views_by_timestep
 from ...flame.model import torso_faces
 from ...flame.quaternions import unit
 from .initial_splats import FEW_CAMERAS, SAMPLED_HEIGHT_PIXELS, mirrored, voxel_size
-from .likeness import head_coordinates, kinds_of, nearest_rows
+from .likeness import HeadCoordinates, head_coordinates, kinds_of, nearest_rows
 from .outlines import clear_of
 
 FACING_TIMESTEPS = 300
@@ -58,6 +58,13 @@ LID_STRETCH = 1.8
 MIN_SQUARED_AREA = 1e-28
 """Expressions that pull lids out of their folds, and how much longer they make them; squared
 meters, of triangles without area."""
+NECK_LEVEL = -1.1
+NECK_HALF_HEIGHT = 0.4
+NECK_SIDE_DEG = 95.0
+NECK_WIDTH_DEG = 45.0
+HANGING_HEIGHT = 0.4
+"""Where sides of a neck are, as `HeadCoordinates` have it, and how far long hair stands out there,
+in distances of the eyes from the mouth."""
 MAX_APART_DEG = 8.0
 """Between the directions in which one camera sees a triangle, and their mean."""
 MAX_BESIDE_SHARE = 0.1
@@ -265,11 +272,27 @@ class Surface:
         return np.asarray(bare | self.hidden)
 
     @cached_property
-    def _scalp(self) -> np.ndarray:
+    def kinds(self) -> dict[str, np.ndarray]:
+        """`kinds_of` the triangles; none where it is not known where on a head they are."""
         at = head_coordinates(self.capture)
         if at is None:
-            return np.zeros(len(self.outside), bool)
-        return kinds_of(at, self.outside)["scalp"]
+            return {}
+        return kinds_of(at, self.outside, self._has_long_hair(at))
+
+    def _has_long_hair(self, at: HeadCoordinates) -> bool:
+        """Whether something stands out on both sides of the neck just below the ears, where no
+        collar reaches, so that nobody has seen the neck from behind."""
+        turn = np.degrees(at.azimuth)
+        beside = self._is_measured & (abs(at.level - NECK_LEVEL) < NECK_HALF_HEIGHT)
+        sides = (beside & (abs(side * turn - NECK_SIDE_DEG) < NECK_WIDTH_DEG) for side in (-1, 1))
+        return all(
+            side.any() and np.median(self._measured_height[side]) > HANGING_HEIGHT * at.unit
+            for side in sides
+        )
+
+    @property
+    def _scalp(self) -> np.ndarray:
+        return self.kinds.get("scalp", np.zeros(len(self.outside), bool))
 
     @property
     def _is_measured(self) -> np.ndarray:

@@ -16,7 +16,6 @@ from .likeness import (
     hairy_triangles,
     head_coordinates,
     inside_colors,
-    kinds_of,
     lining_of,
     nearest_rows,
     skin_of,
@@ -103,7 +102,7 @@ def unseen_sides(surface: Surface) -> UnseenSides:
     is_hair = np.zeros_like(shown)
     at = head_coordinates(capture)
     if at is not None:
-        kinds = kinds_of(at, is_outside)
+        kinds = surface.kinds
         is_face = is_source & ~kinds["scalp"] & ~kinds["body"] & (at.level < BROWS_LEVEL)
         for kind, members in kinds.items():
             own = np.flatnonzero(members & is_source)
