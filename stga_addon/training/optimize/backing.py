@@ -53,11 +53,16 @@ class Backing:
     triangles  (F,) bool: those that have it
     places     (V, 3) meters: where the neutral mesh's vertices are in the layer
     color      (F, 3) in 0…1 of the layer
+    back       (F,) bool: those of a torso's front, whose layer is its back
+    marked     (F,) whose splats each triangle's are in an avatar: of a back, those of the nearest
+               triangle that no camera saw, by which that is known of the back, too
     """
 
     triangles: np.ndarray
     places: np.ndarray
     color: np.ndarray
+    back: np.ndarray
+    marked: np.ndarray
 
 
 def backing_of(surface: Surface, sides: UnseenSides) -> Backing:
@@ -69,7 +74,8 @@ def backing_of(surface: Surface, sides: UnseenSides) -> Backing:
     neutral = np.asarray(capture.neutral, np.float64)
     at = head_coordinates(capture)
     if at is None or not surface.has_few_cameras:
-        return Backing(np.zeros(len(faces), bool), neutral, sides.aside)
+        none = np.zeros(len(faces), bool)
+        return Backing(none, neutral, sides.aside, none, np.arange(len(faces)))
     front = _open_front(surface, at)
     color = sides.aside.copy()
     back = neutral
@@ -99,7 +105,12 @@ def backing_of(surface: Surface, sides: UnseenSides) -> Backing:
         color[skin] = np.median(color[skin][around], axis=1)
     behind = neutral - deepest[:, None] * vertex_normals(neutral, faces)
     places = np.where(of_back[:, None], back, behind)
-    return Backing(grazed | front, places, color)
+    marked = np.arange(len(faces))
+    unseen = np.flatnonzero(surface.hidden & (at.level < CHIN_LEVEL))
+    if len(unseen):
+        centers = places[faces].mean(1)
+        marked[front] = unseen[nearest_rows(centers[unseen], centers[front], 1)[:, 0]]
+    return Backing(grazed | front, places, color, front, marked)
 
 
 def _beside_face(surface: Surface, at: HeadCoordinates) -> np.ndarray:

@@ -50,6 +50,7 @@ class FrameStore:
     """Meshes (V, 3) and face frames by timestep, float64; those of the latest CACHE_BYTES are kept.
 
     strain    `strain_basis` of the neutral mesh, None if nothing depends on strain
+    neutral   face frames of the neutral mesh
     units     (F,) float32: the length that a triangle's limits are multiples of, in local units
     unit_lengths  (F,) meters of the neutral mesh that are a triangle's local unit
     voxel     meters between hull points
@@ -77,8 +78,8 @@ class FrameStore:
             areas = face_areas(capture.neutral, capture.faces)
             self.units = np.asarray(np.sqrt(2 * areas), np.float32)
         neutral = capture.neutral
-        frames = face_frames(neutral, capture.faces, neutral, convention)
-        self.unit_lengths = np.maximum(frames.scale, MIN_DIVISOR)
+        self.neutral = face_frames(neutral, capture.faces, neutral, convention)
+        self.unit_lengths = np.maximum(self.neutral.scale, MIN_DIVISOR)
         self.voxel = voxel_size(neutral)
         self.surface = Surface(capture)
         self._most = int(CACHE_BYTES / BYTES_PER_TRIANGLE / len(capture.faces))

@@ -100,6 +100,20 @@ class SurfacePrior:
         self._flatten(backend, bound, columns)
         self._keep_layer(backend, bound, columns, is_inner)
 
+    def with_marked_back(self, splats: Splats) -> Splats:
+        """With a torso's back on the triangles by which it is known that no camera saw it."""
+        backing = self._frames.backing
+        rows = np.flatnonzero(~splats.unbound & backing.back[splats.face])
+        if not len(rows):
+            return splats
+        columns = {"face": splats.face[rows], "parameters/xyz": splats.xyz[rows]}
+        rows = rows[self._is_inner(columns)]
+        own = splats.rows(rows)
+        neutral = self._frames.neutral
+        moved = to_local(to_world(own, neutral), neutral, backing.marked[own.face])
+        rest = np.delete(np.arange(len(splats)), rows)
+        return joined([splats.rows(rest), moved])
+
     def _pull_colors(
         self,
         backend: Backend,
@@ -109,14 +123,13 @@ class SurfacePrior:
         is_inner: np.ndarray,
     ) -> None:
         sides = self._frames.sides
-        backing = self._frames.backing
         face = columns["face"]
         share = doubt(columns["second/color"], usual) * ~sides.shown[face]
         is_pinned = sides.triangles[face] | is_inner
         rows = np.flatnonzero((share > MIN_PULL) & ~is_pinned)
-        is_backing = (is_inner & backing.triangles[face])[:, None]
-        wanted = np.where(is_backing, backing.color[face], sides.color[face])
-        plausible = ((wanted - 0.5) / SH_C0).astype(np.float32)
+        plausible = ((sides.color[face] - 0.5) / SH_C0).astype(np.float32)
+        inner = np.searchsorted(self._inner.face, face[is_inner])
+        plausible[is_inner] = self._inner.sh[inner, 0]
         color = columns["parameters/color"][rows]
         color += share[rows, None] * (plausible[rows] - color)
         backend.assign(bound[rows], {"parameters/color": color})
@@ -276,8 +289,9 @@ def splats_behind(frames: FrameStore, sh_degree: int) -> Splats:
 
 
 def inner_layer(frames: FrameStore, sh_degree: int = 0) -> Splats:
-    """One gray splat for each triangle of lids, under its middle, so large that closed they have no
-    gaps; of the mouth's unseen inside; and of the `backing`, there. By triangle."""
+    """One splat in its plausible color for each triangle of lids, under its middle, so large that
+    closed they have no gaps; of the mouth's unseen inside; and of the `backing`, there. By
+    triangle."""
     capture = frames.capture
     axis = NORMAL_AXIS[frames.convention]
     lids = frames.surface.lids
@@ -295,11 +309,11 @@ def inner_layer(frames: FrameStore, sh_degree: int = 0) -> Splats:
         backing.places, capture.faces, 0, sh_degree, BACKING_OPACITY, frames.convention
     ).rows(backing.triangles)
     behind.log_scale[:, axis] += np.log(HIDDEN_FLATNESS)
-    there, here = (
-        face_frames(mesh, capture.faces, mesh, frames.convention)
-        for mesh in (backing.places, capture.neutral)
-    )
-    behind = to_local(to_world(behind, there), here, behind.face)
+    there = face_frames(backing.places, capture.faces, backing.places, frames.convention)
+    behind = to_local(to_world(behind, there), frames.neutral, behind.face)
     within = lids | (frames.sides.triangles & ~frames.surface.outside)
     layer = joined([layer.rows((within & ~backing.triangles)[layer.face]), behind])
-    return layer.rows(np.argsort(layer.face))
+    layer = layer.rows(np.argsort(layer.face))
+    color = np.where(backing.triangles[:, None], backing.color, frames.sides.color)
+    layer.sh[:, 0] = (color[layer.face] - 0.5) / SH_C0
+    return layer

@@ -135,8 +135,9 @@ class Trainer:
         if settings.random_background:  # alpha is learned from masks
             self.changes["outlines"] = OutlinePruning(capture, settings.seed, self.frames.moved)
         self.changes["dust"] = DustPruning(capture)
-        if self.strategy.region is None:
-            self.changes["unseen sides"] = SurfacePrior(self.frames)
+        self._prior = SurfacePrior(self.frames) if self.strategy.region is None else None
+        if self._prior is not None:
+            self.changes["unseen sides"] = self._prior
 
     def __len__(self) -> int:
         """How many splats there are."""
@@ -207,6 +208,8 @@ class Trainer:
         along = self.frames.surface.filmed_along if splats.sh_degree == 0 else None
         if along is not None:
             splats = plausible_aside(splats, along, self.frames.sides)
+        if self._prior is not None:
+            splats = self._prior.with_marked_back(splats)
         return Avatar(
             splats=splats,
             convention=settings.convention,
@@ -256,7 +259,7 @@ def _placed_splats(frames: FrameStore, settings: TrainingSettings) -> tuple[Trai
     triangles = len(capture.faces)
     splats = initial_splats(capture, settings)
     closed = ~splats.unbound & frames.surface.closed[splats.face]
-    layer = joined([hidden_splats(frames, settings), splats_behind(frames, settings.sh_degree)])
+    layer = hidden_splats(frames, settings)
     color = np.zeros((triangles, 3), np.float32)
     bound = ~splats.unbound
     color[splats.face[bound]] = splats.sh[bound, 0]
@@ -265,7 +268,7 @@ def _placed_splats(frames: FrameStore, settings: TrainingSettings) -> tuple[Trai
     orders = settings.lattice_order, settings.first_lattice_order
     whole, first = (splats_per_triangle(order(triangles)) for order in orders)
     lattice = int((~splats.unbound).sum())
-    splats = joined([splats, layer])
+    splats = joined([splats, layer, splats_behind(frames, settings.sh_degree)])
     splats = splats.rows(np.argsort(splats.face, kind="stable"))
     state = new_state(splats, unseen_share(capture, settings.convention, splats))
     state = with_offsets(state, settings.driven_offsets, triangles)
