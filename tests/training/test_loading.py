@@ -17,6 +17,7 @@ from stga_addon.training.optimize.frames import FrameStore
 from stga_addon.training.optimize.initial_splats import MAX_LATER_TIMESTEPS
 from stga_addon.training.optimize.surface import Surface
 from stga_addon.training.optimize.surface_prior import SurfacePrior
+from stga_addon.training.optimize.unseen_sides import UnseenSides
 from stga_addon.training.run import session
 from stga_addon.training.run.session import train_run
 
@@ -49,8 +50,13 @@ def test_no_mesh_is_read_on_the_training_thread(tmp_path, monkeypatch):
     capture = replace(opened, mesh=mesh, views={"train": opened.views["train"]})
     run = make_run(capture, "global", iterations=len(timesteps) - 1)
     # which read meshes once, before training and after it
-    monkeypatch.setattr(Surface, "facing", np.ones(len(opened.faces)))
-    monkeypatch.setattr(Surface, "sticks_out", np.zeros(len(opened.faces), bool))
+    count = len(opened.faces)
+    none = np.zeros(count, bool)
+    color = np.zeros((count, 3))
+    sides = UnseenSides(none, ~none, color, none, color[:, 0], color)
+    monkeypatch.setattr(Surface, "facing", np.ones(count))
+    monkeypatch.setattr(Surface, "sticks_out", none)
+    monkeypatch.setattr(frames, "unseen_sides", lambda _: sides)
     for name in ("prepare", "apply"):
         monkeypatch.setattr(SurfacePrior, name, lambda *_: None)
     monkeypatch.setattr(session, "triangle_residuals", no_residuals)

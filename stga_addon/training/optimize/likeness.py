@@ -25,8 +25,9 @@ eyes and above them; heights over the eyes."""
 HAIRLINE_DEG = (90.0, 140.0)
 HAIRLINE = (-0.55, -1.15)
 LONG_HAIRLINE = (-0.55, -2.3)
+HANGING_RISE = 0.6
 """Angles from straight ahead, and heights over the eyes in that unit, below which no hair grows, or
-none hangs."""
+none hangs; how far below the first it has come away from the neck."""
 EAR_SIDE = 0.93
 EAR_LEVEL = -0.2
 EAR_HEIGHT = 0.75
@@ -124,6 +125,14 @@ def kinds_of(
     beside = (angle > NECK_ANGLE_DEG) | (at.level < CHIN_LEVEL)
     body = is_outside & ~ear & ~scalp & beside & (at.level < JAW_LEVEL)
     return {"scalp": scalp, "body": body}
+
+
+def hanging_share(at: HeadCoordinates) -> np.ndarray:
+    """(F,) in 0…1: how far long hair has come away from what it hangs down before, at the neck."""
+    angle = np.degrees(np.abs(at.azimuth))
+    below = np.interp(angle, HAIRLINE_DEG, HAIRLINE) - at.level
+    behind = np.interp(angle, HAIRLINE_DEG, (0, 1))
+    return np.asarray(behind * np.clip(below / HANGING_RISE, 0, 1))
 
 
 def nearest_rows(known: np.ndarray, places: np.ndarray, count: int) -> np.ndarray:

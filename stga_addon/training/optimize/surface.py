@@ -21,7 +21,13 @@ from ...capture.model import Capture, View, evenly_spread, views_by_timestep
 from ...flame.model import torso_faces
 from ...flame.quaternions import unit
 from .initial_splats import FEW_CAMERAS, SAMPLED_HEIGHT_PIXELS, mirrored, voxel_size
-from .likeness import HeadCoordinates, head_coordinates, kinds_of, nearest_rows
+from .likeness import (
+    HeadCoordinates,
+    hanging_share,
+    head_coordinates,
+    kinds_of,
+    nearest_rows,
+)
 from .outlines import clear_of
 
 FACING_TIMESTEPS = 300
@@ -239,7 +245,8 @@ class Surface:
     @cached_property
     def hair_height(self) -> np.ndarray:
         """(F,) meters that hair stands above the scalp's triangles: as measured, else as where it
-        is measured around there, on both sides of the head alike. 0 elsewhere."""
+        is measured around there, on both sides of the head alike; behind the neck, of long hair, as
+        beside it at least. 0 elsewhere."""
         height = np.zeros(len(self.outside))
         scalp = np.flatnonzero(self._scalp)
         measured = scalp[self._is_measured[scalp]] if len(scalp) else scalp
@@ -249,6 +256,12 @@ class Surface:
         sources = np.concatenate([center[measured], mirrored(center)[measured]])
         near = measured[nearest_rows(sources, center[scalp], AROUND) % len(measured)]
         height[scalp] = np.median(self._measured_height[near], axis=1)
+        at = head_coordinates(self.capture)
+        if at is not None and self._has_long_hair(at):
+            share = hanging_share(at)
+            below = self._scalp & (share > 0)
+            grown = np.median(height[self._scalp & ~below])
+            height[below] = grown + share[below] * (HANGING_HEIGHT * at.unit - grown)
         return height
 
     @cached_property
