@@ -27,9 +27,11 @@ GRAZED_COSINE = 0.7
 FACE_ANGLE_DEG = 45.0
 """Of the angle between a triangle and the camera that it faces most, below which it has a layer
 behind it; from straight ahead, beyond which there is no face, seen from the middle of the head."""
+CELL_VOXELS = 2
+"""Behind how large a part of the head one splat is enough."""
 DEPTH_VOXELS = 0.5
 MAX_DEPTHS = 10
-MARGIN_SHARE = 0.01
+MARGIN_SHARE = 0.015
 BACK_MARGIN_SHARE = 0.03
 """Step of the depths at which the layer may lie, and how many are tried: the first that is within
 the masks, with a margin as a share of their height; of a back, whose triangles are large."""
@@ -50,7 +52,7 @@ it is at the sides."""
 class Backing:
     """The layer behind some triangles.
 
-    triangles  (F,) bool: those that have it
+    triangles  (F,) bool: those behind which it has a splat
     places     (V, 3) meters: where the neutral mesh's vertices are in the layer
     color      (F, 3) in 0…1 of the layer
     back       (F,) bool: those of a torso's front, whose layer is its back
@@ -98,6 +100,7 @@ def backing_of(surface: Surface, sides: UnseenSides) -> Backing:
     grazed[rows] = fits.any(1)
     deepest = np.zeros(len(neutral))
     np.maximum.at(deepest, faces[rows], depths[fits.argmax(1), None])
+    grazed &= _spread(neutral[faces].mean(1), grazed, CELL_VOXELS * voxel_size(neutral))
     skin = np.flatnonzero(grazed & ~sides.is_hair)
     if len(skin):
         centers = neutral[faces].mean(1)[skin]
@@ -111,6 +114,15 @@ def backing_of(surface: Surface, sides: UnseenSides) -> Backing:
         centers = places[faces].mean(1)
         marked[front] = unseen[nearest_rows(centers[unseen], centers[front], 1)[:, 0]]
     return Backing(grazed | front, places, color, front, marked)
+
+
+def _spread(centers: np.ndarray, members: np.ndarray, cell: float) -> np.ndarray:
+    """(F,) bool: one of the members (F,) bool in each cell of a grid."""
+    rows = np.flatnonzero(members)
+    _, first = np.unique(np.floor(centers[rows] / cell), axis=0, return_index=True)
+    chosen = np.zeros(len(members), bool)
+    chosen[rows[first]] = True
+    return chosen
 
 
 def _beside_face(surface: Surface, at: HeadCoordinates) -> np.ndarray:

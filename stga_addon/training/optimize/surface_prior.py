@@ -13,6 +13,7 @@ from ...avatar.splats import SH_C0, Splats, joined
 from ...flame.quaternions import from_matrices, to_matrices
 from ..settings import TrainingSettings
 from .backend import Backend
+from .backing import CELL_VOXELS
 from .change import Turn
 from .frames import FrameStore
 from .state import parameters_and_average
@@ -29,8 +30,10 @@ HIDDEN_ORDER = 1
 HIDDEN_OPACITY = 3.0
 HIDDEN_FLATNESS = 0.25
 BACKING_OPACITY = 5.0
+CELL_WIDTH = 0.6
 """Of the layer on hidden triangles: order of the lattice where none is chosen, logit, and how much
-thinner it is than the lattice's splats; logit of the one behind what views graze."""
+thinner it is than the lattice's splats; logit, and least standard deviation in cells, of the one
+behind what views graze."""
 BESIDE_LID_SHARE = 0.6
 """Of the scale of the layer under lids, at their edges and in the mouth, where it would stand out
 beside the eye and the lips."""
@@ -310,7 +313,10 @@ def inner_layer(frames: FrameStore, sh_degree: int = 0) -> Splats:
     ).rows(backing.triangles)
     behind.log_scale[:, axis] += np.log(HIDDEN_FLATNESS)
     there = face_frames(backing.places, capture.faces, backing.places, frames.convention)
-    behind = to_local(to_world(behind, there), frames.neutral, behind.face)
+    world = to_world(behind, there)
+    least = np.where(np.arange(3) == axis, 0, CELL_WIDTH * CELL_VOXELS * frames.voxel)
+    world = replace(world, log_scale=np.log(np.maximum(np.exp(world.log_scale), least)))
+    behind = to_local(world, frames.neutral, behind.face)
     within = lids | (frames.sides.triangles & ~frames.surface.outside)
     layer = joined([layer.rows((within & ~backing.triangles)[layer.face]), behind])
     layer = layer.rows(np.argsort(layer.face))
