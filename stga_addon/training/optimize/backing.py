@@ -78,51 +78,47 @@ def backing_of(surface: Surface, sides: UnseenSides) -> Backing:
     if at is None or not surface.has_few_cameras:
         none = np.zeros(len(faces), bool)
         return Backing(none, neutral, sides.aside, none, np.arange(len(faces)))
-    front = _open_front(surface, at)
-    color = sides.aside.copy()
-    back = neutral
-    if front.any():
-        back, color[front] = _round_back(capture, front, sides.color)
-        rows = np.flatnonzero(front)
-        turned = face_frames(neutral, faces, neutral, "stga").rotation[rows]
-        away = (back - neutral)[faces[rows]].mean(1)
-        offsets = np.einsum("nji,nj->ni", turned, away)[:, None]
-        front[rows] = _is_within_masks(surface, rows, offsets, BACK_MARGIN_SHARE)[:, 0]
+    front, back, usual = _back(surface, at, sides.color)
     of_back = np.zeros(len(neutral), bool)
     of_back[faces[front]] = True
-    grazed = _beside_face(surface, at) & (surface.facing < GRAZED_COSINE)
-    grazed &= ~of_back[faces].any(1)
-    rows = np.flatnonzero(grazed)
-    depths = voxel_size(neutral) * DEPTH_VOXELS * np.arange(1, MAX_DEPTHS + 1)
-    offsets = np.zeros((len(rows), len(depths), 3))
-    offsets[:, :, NORMAL_AXIS["stga"]] = -depths
-    fits = _is_within_masks(surface, rows, offsets, MARGIN_SHARE)
-    grazed[rows] = fits.any(1)
-    deepest = np.zeros(len(neutral))
-    np.maximum.at(deepest, faces[rows], depths[fits.argmax(1), None])
-    grazed &= _spread(neutral[faces].mean(1), grazed, CELL_VOXELS * voxel_size(neutral))
+    grazed, behind = _behind_sides(surface, at, ~of_back[faces].any(1))
+    centers = neutral[faces].mean(1)
+    color = sides.aside.copy()
+    color[front] = usual
     skin = np.flatnonzero(grazed & ~sides.is_hair)
     if len(skin):
-        centers = neutral[faces].mean(1)[skin]
-        around = nearest_rows(centers, centers, SOURCE_TRIANGLES)
+        around = nearest_rows(centers[skin], centers[skin], SOURCE_TRIANGLES)
         color[skin] = np.median(color[skin][around], axis=1)
-    behind = neutral - deepest[:, None] * vertex_normals(neutral, faces)
-    places = np.where(of_back[:, None], back, behind)
     marked = np.arange(len(faces))
     unseen = np.flatnonzero(surface.hidden & (at.level < CHIN_LEVEL))
     if len(unseen):
-        centers = places[faces].mean(1)
-        marked[front] = unseen[nearest_rows(centers[unseen], centers[front], 1)[:, 0]]
+        near = nearest_rows(centers[unseen], back[faces[front]].mean(1), 1)
+        marked[front] = unseen[near[:, 0]]
+    places = np.where(of_back[:, None], back, behind)
     return Backing(grazed | front, places, color, front, marked)
 
 
-def _spread(centers: np.ndarray, members: np.ndarray, cell: float) -> np.ndarray:
-    """(F,) bool: one of the members (F,) bool in each cell of a grid."""
-    rows = np.flatnonzero(members)
-    _, first = np.unique(np.floor(centers[rows] / cell), axis=0, return_index=True)
-    chosen = np.zeros(len(members), bool)
-    chosen[rows[first]] = True
-    return chosen
+def _behind_sides(
+    surface: Surface, at: HeadCoordinates, may_be: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """(F,) bool: those of the triangles `may_be` (F,) bool, one in each cell, that few cameras see
+    well; (V, 3): the vertices, as far inside as masks want it there."""
+    faces = surface.capture.faces
+    neutral = np.asarray(surface.capture.neutral, np.float64)
+    voxel = voxel_size(neutral)
+    rows = np.flatnonzero(may_be & _beside_face(surface, at) & (surface.facing < GRAZED_COSINE))
+    depths = voxel * DEPTH_VOXELS * np.arange(1, MAX_DEPTHS + 1)
+    offsets = np.zeros((len(rows), len(depths), 3))
+    offsets[:, :, NORMAL_AXIS["stga"]] = -depths
+    fits = _is_within_masks(surface, rows, offsets, MARGIN_SHARE)
+    deepest = np.zeros(len(neutral))
+    np.maximum.at(deepest, faces[rows], depths[fits.argmax(1), None])
+    rows = rows[fits.any(1)]
+    cells = np.floor(neutral[faces[rows]].mean(1) / (CELL_VOXELS * voxel))
+    _, first = np.unique(cells, axis=0, return_index=True)
+    grazed = np.zeros(len(faces), bool)
+    grazed[rows[first]] = True
+    return grazed, neutral - deepest[:, None] * vertex_normals(neutral, faces)
 
 
 def _beside_face(surface: Surface, at: HeadCoordinates) -> np.ndarray:
@@ -166,6 +162,26 @@ def _is_within_masks(
         seen += within.reshape(seen.shape)
         beside += (within & ~covered[row, column]).reshape(seen.shape)
     return np.asarray(beside <= MAX_BESIDE_SHARE * np.maximum(seen, 1))
+
+
+def _back(
+    surface: Surface, at: HeadCoordinates, color: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """(F,) bool: the triangles of a torso's open front behind which a back is within masks; (V, 3):
+    the vertices, those of the front in that; (M, 3): its color; color (F, 3): of the front."""
+    faces = surface.capture.faces
+    neutral = np.asarray(surface.capture.neutral, np.float64)
+    front = _open_front(surface, at)
+    if not front.any():
+        return front, neutral, color[front]
+    places, usual = _round_back(surface.capture, front, color)
+    rows = np.flatnonzero(front)
+    turned = face_frames(neutral, faces, neutral, "stga").rotation[rows]
+    away = (places - neutral)[faces[rows]].mean(1)
+    offsets = np.einsum("nji,nj->ni", turned, away)[:, None]
+    fits = _is_within_masks(surface, rows, offsets, BACK_MARGIN_SHARE)[:, 0]
+    front[rows] = fits
+    return front, places, usual[fits]
 
 
 def _round_back(
