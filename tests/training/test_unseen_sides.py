@@ -10,7 +10,6 @@ from PIL import Image
 from scipy.ndimage import binary_dilation, binary_erosion
 
 from stga_addon.avatar.embedding import points_to_world
-from stga_addon.avatar.filmed import filmed_avatar
 from stga_addon.avatar.lattice import lattice_splats
 from stga_addon.avatar.splats import colored_aside, sh_color
 from stga_addon.capture.camera import look_at
@@ -431,7 +430,7 @@ def with_torso(capture, width=0.2, height=0.4):
 
 def test_a_torso_has_a_back(bundled, tmp_path):
     """Catches a torso through which, from behind, one sees its front from inside; a back that
-    shows beside the masks, or counts as filmed; and one below a bust, which ends there."""
+    shows beside the masks; and one below a bust, which ends there."""
     capture = with_torso(bundled)
     centers, level = middles(capture)
     color = painted(capture)
@@ -452,11 +451,6 @@ def test_a_torso_has_a_back(bundled, tmp_path):
     avatar = Trainer(capture, quick_settings(iterations=1), {}).avatar("center", None)
     shown = render_avatar(avatar, capture.neutral, camera, (1, 1, 1))[:, own]
     assert_allclose(255 * shown, CLOTH[:, None].repeat(own.sum(), 1), atol=40)
-    splats = filmed_avatar(tmp_path, avatar).splats
-    at = points_to_world(splats.xyz, frames, splats.face)
-    low = at[:, 1] < -0.3
-    assert low.sum() > 300
-    assert (centers[splats.face] - at)[low, 2].max() < 0.01
     bust = FrameStore(filmed(bundled, painted(bundled), (-20, 0, 20), 0.0, tmp_path), "stga")
     assert not bust.backing.triangles[middles(bundled)[1] < -2.5].any()
 

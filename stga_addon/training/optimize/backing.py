@@ -55,16 +55,11 @@ class Backing:
     triangles  (F,) bool: those behind which it has a splat
     places     (V, 3) meters: where the neutral mesh's vertices are in the layer
     color      (F, 3) in 0…1 of the layer
-    back       (F,) bool: those of a torso's front, whose layer is its back
-    marked     (F,) whose splats each triangle's are in an avatar: of a back, those of the nearest
-               triangle that no camera saw, by which that is known of the back, too
     """
 
     triangles: np.ndarray
     places: np.ndarray
     color: np.ndarray
-    back: np.ndarray
-    marked: np.ndarray
 
 
 def backing_of(surface: Surface, sides: UnseenSides) -> Backing:
@@ -76,8 +71,7 @@ def backing_of(surface: Surface, sides: UnseenSides) -> Backing:
     neutral = np.asarray(capture.neutral, np.float64)
     at = head_coordinates(capture)
     if at is None or not surface.has_few_cameras:
-        none = np.zeros(len(faces), bool)
-        return Backing(none, neutral, sides.aside, none, np.arange(len(faces)))
+        return Backing(np.zeros(len(faces), bool), neutral, sides.aside)
     front, back, usual = _back(surface, at, sides.color)
     of_back = np.zeros(len(neutral), bool)
     of_back[faces[front]] = True
@@ -89,13 +83,8 @@ def backing_of(surface: Surface, sides: UnseenSides) -> Backing:
     if len(skin):
         around = nearest_rows(centers[skin], centers[skin], SOURCE_TRIANGLES)
         color[skin] = np.median(color[skin][around], axis=1)
-    marked = np.arange(len(faces))
-    unseen = np.flatnonzero(surface.hidden & (at.level < CHIN_LEVEL))
-    if len(unseen):
-        near = nearest_rows(centers[unseen], back[faces[front]].mean(1), 1)
-        marked[front] = unseen[near[:, 0]]
     places = np.where(of_back[:, None], back, behind)
-    return Backing(grazed | front, places, color, front, marked)
+    return Backing(grazed | front, places, color)
 
 
 def _behind_sides(

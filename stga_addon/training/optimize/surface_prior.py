@@ -103,20 +103,6 @@ class SurfacePrior:
         self._flatten(backend, bound, columns)
         self._keep_layer(backend, bound, columns, is_inner)
 
-    def with_marked_back(self, splats: Splats) -> Splats:
-        """With a torso's back on the triangles by which it is known that no camera saw it."""
-        backing = self._frames.backing
-        rows = np.flatnonzero(~splats.unbound & backing.back[splats.face])
-        if not len(rows):
-            return splats
-        columns = {"face": splats.face[rows], "parameters/xyz": splats.xyz[rows]}
-        rows = rows[self._is_inner(columns)]
-        own = splats.rows(rows)
-        neutral = self._frames.neutral
-        moved = to_local(to_world(own, neutral), neutral, backing.marked[own.face])
-        rest = np.delete(np.arange(len(splats)), rows)
-        return joined([splats.rows(rest), moved])
-
     def _pull_colors(
         self,
         backend: Backend,

@@ -135,9 +135,8 @@ class Trainer:
         if settings.random_background:  # alpha is learned from masks
             self.changes["outlines"] = OutlinePruning(capture, settings.seed, self.frames.moved)
         self.changes["dust"] = DustPruning(capture)
-        self._prior = SurfacePrior(self.frames) if self.strategy.region is None else None
-        if self._prior is not None:
-            self.changes["unseen sides"] = self._prior
+        if self.strategy.region is None:
+            self.changes["unseen sides"] = SurfacePrior(self.frames)
 
     def __len__(self) -> int:
         """How many splats there are."""
@@ -208,8 +207,6 @@ class Trainer:
         along = self.frames.surface.filmed_along if splats.sh_degree == 0 else None
         if along is not None:
             splats = plausible_aside(splats, along, self.frames.sides)
-        if self._prior is not None:
-            splats = self._prior.with_marked_back(splats)
         return Avatar(
             splats=splats,
             convention=settings.convention,
