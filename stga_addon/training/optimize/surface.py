@@ -48,10 +48,10 @@ OUTSIDE_CAMERAS = 15
 OUTSIDE_DISTANCE = 4.0
 OUTSIDE_WIDTH = 2.2
 OUTSIDE_PIXEL_SHARE = 0.7
-MAX_OUTSIDE_PX = 2000
+OUTSIDE_SIDES_PX = (240, 2000)
 """Cameras that tell the neutral head's outside from its inside; their distance and the width of
 what they see, in its radius; a pixel's, in the side of a square as large as the median triangle,
-however far a torso reaches; most pixels of a side."""
+however far a torso reaches; least and most pixels of a side."""
 STEPS_PER_VOXEL = 4
 MAX_HEIGHT_VOXELS = 10
 OUTLINE_VOXELS = 1.5
@@ -122,7 +122,7 @@ class Surface:
         normal = triangle_normals(corners)
         square = np.sqrt(np.median(np.linalg.norm(normal, axis=1)) / 2)
         wanted = OUTSIDE_WIDTH * radius / max(OUTSIDE_PIXEL_SHARE * square, 1e-9)
-        side = int(min(wanted, MAX_OUTSIDE_PX))
+        side = int(np.clip(wanted, *OUTSIDE_SIDES_PX))
         eye = center + OUTSIDE_DISTANCE * radius * direction
         focal_length = side * OUTSIDE_DISTANCE / OUTSIDE_WIDTH
         camera = look_at(eye, center, side, side, focal_length=focal_length)
