@@ -3,13 +3,14 @@ filmed. Images make its sides transparent where it is tracked too wide, and of a
 the front alone."""
 
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from scipy.ndimage import binary_erosion
 
 from ...avatar.embedding import face_frames
 from ...avatar.lattice import NORMAL_AXIS
-from ...capture.mesh_geometry import head_axes, pixels_of, vertex_normals
+from ...capture.mesh_geometry import head_axes, vertex_normals
 from ...capture.model import Capture
 from .initial_splats import voxel_size
 from .likeness import (
@@ -20,7 +21,7 @@ from .likeness import (
     nearest_rows,
     skin_of,
 )
-from .surface import MAX_BESIDE_SHARE, Surface
+from .surface import Surface
 from .unseen_sides import SOURCE_TRIANGLES, UnseenSides
 
 GRAZED_COSINE = 0.7
@@ -99,7 +100,8 @@ def _behind_sides(
     depths = voxel * DEPTH_VOXELS * np.arange(1, MAX_DEPTHS + 1)
     offsets = np.zeros((len(rows), len(depths), 3))
     offsets[:, :, NORMAL_AXIS["stga"]] = -depths
-    fits = _is_within_masks(surface, rows, offsets, MARGIN_SHARE)
+    clear = partial(_clear_with_margin, margin_share=MARGIN_SHARE)
+    fits = ~surface.beside_masks(rows, offsets, clear)
     deepest = np.zeros(len(neutral))
     np.maximum.at(deepest, faces[rows], depths[fits.argmax(1), None])
     rows = rows[fits.any(1)]
@@ -132,25 +134,11 @@ def _open_front(surface: Surface, at: HeadCoordinates) -> np.ndarray:
     return np.asarray(front & (height > MIN_FRONT_HEIGHT))
 
 
-def _is_within_masks(
-    surface: Surface, rows: np.ndarray, offsets: np.ndarray, margin_share: float
-) -> np.ndarray:
-    """(N, K) bool: whether most masks, less a margin as a share of their height, have foreground at
-    K points each of triangles (N,); offsets (N, K, 3): from their origins, meters in the axes of
-    their frames."""
-    capture = surface.capture
-    seen, beside = np.zeros((2, *offsets.shape[:2]), int)
-    for view, mask in surface.masks:
-        mesh = np.asarray(capture.mesh(view.timestep), np.float64)
-        frames = face_frames(mesh, capture.faces, mesh, "stga")
-        points = np.einsum("nij,nkj->nki", frames.rotation[rows], offsets)
-        points += frames.origin[rows, None]
-        column, row, within = pixels_of(points.reshape(-1, 3), view.camera)
-        margin = max(1, round(margin_share * len(mask)))
-        covered = binary_erosion(mask > 127, iterations=margin)
-        seen += within.reshape(seen.shape)
-        beside += (within & ~covered[row, column]).reshape(seen.shape)
-    return np.asarray(beside <= MAX_BESIDE_SHARE * np.maximum(seen, 1))
+def _clear_with_margin(covered: np.ndarray, margin_share: float) -> np.ndarray:
+    """(H, W) bool: pixels that a mask leaves clear, which covers these (H, W) bool, and a margin
+    within, as a share of the height."""
+    margin = max(1, round(margin_share * len(covered)))
+    return np.asarray(~binary_erosion(covered, iterations=margin))
 
 
 def _back(
@@ -168,7 +156,8 @@ def _back(
     turned = face_frames(neutral, faces, neutral, "stga").rotation[rows]
     away = (places - neutral)[faces[rows]].mean(1)
     offsets = np.einsum("nji,nj->ni", turned, away)[:, None]
-    fits = _is_within_masks(surface, rows, offsets, BACK_MARGIN_SHARE)[:, 0]
+    clear = partial(_clear_with_margin, margin_share=BACK_MARGIN_SHARE)
+    fits = ~surface.beside_masks(rows, offsets, clear)[:, 0]
     front[rows] = fits
     return front, places, usual[fits]
 

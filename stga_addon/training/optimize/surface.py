@@ -1,12 +1,15 @@
 """What training views tell of a head's surface: which triangles face a camera, where something
 stands above them, where the mesh ends."""
 
+from collections.abc import Callable
 from functools import cached_property
 
 import numpy as np
 from scipy.ndimage import binary_dilation
 from scipy.spatial import cKDTree
 
+from ...avatar.embedding import face_frames
+from ...avatar.lattice import NORMAL_AXIS
 from ...capture.camera import look_at
 from ...capture.images import read_view
 from ...capture.mesh_geometry import (
@@ -54,9 +57,10 @@ what they see, in its radius; a pixel's, in the side of a square as large as the
 however far a torso reaches; least and most pixels of a side."""
 STEPS_PER_VOXEL = 4
 MAX_HEIGHT_VOXELS = 10
+HEIGHTS = 4
 OUTLINE_VOXELS = 1.5
-"""Heights that are tried above a triangle; within the last, it must come out of the mesh's
-silhouette."""
+"""Heights that are tried above a triangle, and shares of the height of hair; within the last, it
+must come out of the mesh's silhouette."""
 AROUND = 30
 """Measured triangles of whose heights one that is in no outline has the median."""
 BLINKS = ("eyeBlinkLeft", "eyeBlinkRight")
@@ -184,15 +188,32 @@ class Surface:
     def sticks_out(self) -> np.ndarray:
         """(F,) bool: triangles that lie outside of some masks, or touch one that does, as an ear of
         a head whose turn is tracked too far: they have to be as transparent as images say."""
-        seen, beside = np.zeros((2, len(self.outside)), int)
-        for view, mask in self.masks:
-            center, _ = _centers_and_normals(self.capture, view.timestep)
-            column, row, within = pixels_of(center, view.camera)
-            seen += within
-            beside += within & clear_of(mask > 127)[row, column]
+        every = np.arange(len(self.outside))
         touched = np.zeros(len(self.capture.neutral), bool)
-        touched[self.capture.faces[beside > MAX_BESIDE_SHARE * np.maximum(seen, 1)]] = True
+        touched[self.capture.faces[self.beside_masks(every, np.zeros((1, 3)))[:, 0]]] = True
         return np.asarray(touched[self.capture.faces].any(1))
+
+    def beside_masks(
+        self,
+        rows: np.ndarray,
+        offsets: np.ndarray,
+        clear: Callable[[np.ndarray], np.ndarray] = clear_of,
+    ) -> np.ndarray:
+        """(N, K) bool: whether some masks leave K points each of triangles (N,) clear, as `clear`
+        says of what they cover (H, W) bool; offsets (N, K, 3) or (K, 3): from their origins, meters
+        in the axes of their frames."""
+        capture = self.capture
+        offsets = np.broadcast_to(offsets, (len(rows), *offsets.shape[-2:]))
+        seen, beside = np.zeros((2, *offsets.shape[:2]), int)
+        for view, mask in self.masks:
+            mesh = np.asarray(capture.mesh(view.timestep), np.float64)
+            frames = face_frames(mesh, capture.faces, mesh, "stga")
+            points = np.einsum("nij,nkj->nki", frames.rotation[rows], offsets)
+            points += frames.origin[rows, None]
+            column, row, within = pixels_of(points.reshape(-1, 3), view.camera)
+            seen += within.reshape(seen.shape)
+            beside += (within & clear(mask > 127)[row, column]).reshape(seen.shape)
+        return np.asarray(beside > MAX_BESIDE_SHARE * np.maximum(seen, 1))
 
     @cached_property
     def masks(self) -> list[tuple[View, np.ndarray]]:
@@ -245,8 +266,8 @@ class Surface:
     @cached_property
     def hair_height(self) -> np.ndarray:
         """(F,) meters that hair stands above the scalp's triangles: as measured, else as where it
-        is measured around there, on both sides of the head alike; behind the neck, of long hair, as
-        beside it at least. 0 elsewhere."""
+        is measured around there, on both sides of the head alike, but within masks; of long hair
+        behind the neck as beside it at least. 0 elsewhere."""
         height = np.zeros(len(self.outside))
         scalp = np.flatnonzero(self._scalp)
         measured = scalp[self._is_measured[scalp]] if len(scalp) else scalp
@@ -262,6 +283,12 @@ class Surface:
             below = self._scalp & (share > 0)
             grown = np.median(height[self._scalp & ~below])
             height[below] = grown + share[below] * (HANGING_HEIGHT * at.unit - grown)
+        # hair on the one side may be higher than on the other, and a head beside its images
+        offsets = np.zeros((len(scalp), HEIGHTS + 1, 3))
+        offsets[:, :, NORMAL_AXIS["stga"]] = height[scalp, None] * np.linspace(1, 0, HEIGHTS + 1)
+        fits = ~self.beside_masks(scalp, offsets)
+        fits[:, -1] = True
+        height[scalp] = offsets[np.arange(len(scalp)), fits.argmax(1), NORMAL_AXIS["stga"]]
         return height
 
     @cached_property
