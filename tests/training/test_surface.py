@@ -8,6 +8,7 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from PIL import Image
 from scipy.ndimage import binary_dilation, binary_erosion
+from scipy.spatial import cKDTree
 
 from stga_addon.avatar.file import UNSEEN_REGION, Avatar
 from stga_addon.avatar.filmed import filmed_sides
@@ -106,6 +107,31 @@ def test_hair_is_as_high_as_its_outline(filmed):
     assert surface.is_flat[face].mean() > 0.9
     shoulder = surface.outside & (center[:, 1] < -0.17) & (np.abs(center[:, 0]) > 0.09)
     assert not surface.is_flat[shoulder & ~surface.hidden].any()
+
+
+def test_hair_is_no_higher_than_masks(filmed, tmp_path):
+    """Catches hair of the one side, mirrored to the other, that stands out of its outline there."""
+    views = []
+    for view in filmed.views["train"][3:6]:
+        mask = np.array(Image.open(view.mask))
+        bare = silhouette(filmed.neutral, filmed.faces, view.camera)
+        middle = view.camera.width // 2
+        mask[:, :middle] = 255 * bare[:, :middle]
+        path = tmp_path / f"{view.timestep}.png"
+        Image.fromarray(mask).save(path)
+        views.append(replace(view, mask=path))
+    surface = Surface(replace(filmed, views={"train": tuple(views)}))
+    center = filmed.neutral[filmed.faces].mean(1)
+    normal = normals(filmed.neutral, filmed.faces)[filmed.faces].mean(1)
+    partner = cKDTree(center).query(center * [-1, 1, 1])[1]
+    beside = surface.outside & (center[:, 0] < -0.03)
+    beside &= surface.hair_height[partner] > 0.9 * HAIR_M
+    assert beside.sum() > 20
+    points = (center + surface.hair_height[:, None] * normal)[beside]
+    for view in views:
+        covered = binary_dilation(np.asarray(Image.open(view.mask)) > 0, iterations=6)
+        column, row = np.floor(view.camera.project(points)[0]).astype(int).T
+        assert covered[row, column].all()
 
 
 @pytest.mark.parametrize(("sides", "hangs"), [((-1, 1), True), ((1,), False)])
