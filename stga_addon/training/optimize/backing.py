@@ -15,6 +15,7 @@ from ...capture.model import Capture
 from .initial_splats import voxel_size
 from .likeness import (
     CHIN_LEVEL,
+    TORSO_HEIGHT,
     HeadCoordinates,
     ears_of,
     head_coordinates,
@@ -37,9 +38,7 @@ BACK_MARGIN_SHARE = 0.03
 """Step of the depths at which the layer may lie, and how many are tried: the first that is within
 the masks, with a margin as a share of their height; of a back, whose triangles are large."""
 BEHIND_DEG = (-30.0, 0.0, 30.0)
-MIN_FRONT_HEIGHT = 2.0
-"""Directions from behind from which the inner side of a torso's front may show; how high that is at
-least, in distances of the eyes from the mouth."""
+"""Directions from behind from which the inner side of a torso's front may show."""
 BACK_SHARE = 0.5
 BACK_LEVELS = 0.5
 BACK_REACH = (0.02, 0.98)
@@ -131,7 +130,7 @@ def _open_front(surface: Surface, at: HeadCoordinates) -> np.ndarray:
         front |= seen & (cosine < 0)
     front &= (at.level < CHIN_LEVEL) & ~surface.sticks_out
     height = np.ptp(at.level[front]) if front.any() else 0.0
-    return np.asarray(front & (height > MIN_FRONT_HEIGHT))
+    return np.asarray(front & (height > TORSO_HEIGHT))
 
 
 def _clear_with_margin(covered: np.ndarray, margin_share: float) -> np.ndarray:

@@ -20,8 +20,9 @@ BROWS_OVER_EYES = 0.15
 BROWS_LEVEL = 0.45
 JAW_LEVEL = -0.5
 CHIN_LEVEL = -2.0
+TORSO_HEIGHT = 2.0
 """Places on a head, in distances of its eyes from its mouth: how far its middle lies behind the
-eyes and above them; heights over the eyes."""
+eyes and above them; heights over the eyes; of a torso, which a bust's end has not."""
 HAIRLINE_DEG = (90.0, 140.0)
 HAIRLINE = (-0.55, -1.15)
 LONG_HAIRLINE = (-0.55, -2.3)

@@ -25,6 +25,7 @@ from ...flame.model import torso_faces
 from ...flame.quaternions import unit
 from .initial_splats import FEW_CAMERAS, SAMPLED_HEIGHT_PIXELS, mirrored, voxel_size
 from .likeness import (
+    TORSO_HEIGHT,
     HeadCoordinates,
     hanging_share,
     head_coordinates,
@@ -247,7 +248,8 @@ class Surface:
 
     @cached_property
     def border(self) -> np.ndarray:
-        """(F,) bool: triangles at the longest edge of the mesh, where a bust ends."""
+        """(F,) bool: triangles at the longest edge of the mesh, where a bust ends; none of a torso,
+        which ends where images do."""
         faces = self.capture.faces
         count = len(self.capture.neutral)
         edges = np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
@@ -261,7 +263,10 @@ class Surface:
         longest = np.bincount(part[edges[:, 0]], length).argmax()
         is_border = np.zeros(count, bool)
         is_border[edges[part[edges[:, 0]] == longest]] = True
-        return np.asarray(is_border[faces].any(1))
+        border = is_border[faces].any(1)
+        at = head_coordinates(self.capture)
+        is_torso = at is not None and np.ptp(at.level[border]) > TORSO_HEIGHT
+        return np.zeros(len(faces), bool) if is_torso else np.asarray(border)
 
     @cached_property
     def hair_height(self) -> np.ndarray:
