@@ -430,7 +430,7 @@ def with_torso(capture, width=0.2, height=0.4):
 
 def test_a_torso_has_a_back(bundled, tmp_path):
     """Catches a torso through which, from behind, one sees its front from inside; a back that
-    shows beside the masks; one below a bust, which ends there; and small splats at a torso's edge."""
+    shows beside the masks; one below a bust; and small splats at a torso's edge."""
     capture = with_torso(bundled)
     assert not Surface(capture).border.any()
     centers, level = middles(capture)
