@@ -34,7 +34,7 @@ from stga_addon.training.optimize.trainer import Trainer
 from stga_addon.training.optimize.unseen_sides import plausible_aside, unseen_sides
 
 from .heads import PLACES, write_head
-from .toys import Rows, quick_settings
+from .toys import Rows, alpha_of, quick_settings
 
 CAMERA = 3
 """Sees the ball's +x side and front, from 40° beside the middle."""
@@ -376,18 +376,11 @@ BASE = np.array([0, -0.11, 0.0])
 TIE = np.array([200, 20, 20], np.uint8)
 
 
-def alpha_of(splats, camera, frames):
-    black, white = (render(splats, camera, (c, c, c), frames=frames).mean(0) for c in (0, 1))
-    return 1 - white + black
-
-
 def behind(capture):
-    """The layer behind what views graze, in its color, and the frames that it is drawn in."""
+    """The layer behind what views graze, and the frames that it is drawn in."""
     frames = FrameStore(capture, "stga")
     layer = splats_behind(frames, 0)
-    layer = layer.rows(frames.backing.triangles[layer.face])
-    layer.sh[:, 0] = (frames.backing.color[layer.face] - 0.5) / 0.28209479177387814
-    return layer, frames.of(0)
+    return layer.rows(frames.backing.triangles[layer.face]), frames.of(0)
 
 
 def beside_masks(capture, layer, frames):

@@ -9,6 +9,7 @@ from avatar.conftest import random_splats as random_avatar_splats
 from numpy.testing import assert_array_equal
 
 from stga_addon.files import read_npz
+from stga_addon.render.render import render
 from stga_addon.training.optimize.cpu_backend import CpuBackend
 from stga_addon.training.optimize.state import arrays_of, new_state
 from stga_addon.training.run.folder import CHECKPOINT, RUN, Run
@@ -108,6 +109,12 @@ def assert_same_run(folder, expected):
         assert content == theirs[name] or name in (CHECKPOINT, METRICS, RUN), name
     lines, right = (without_times(read_metrics(each)) for each in (folder, expected))
     assert lines == right
+
+
+def alpha_of(splats, camera, frames):
+    """(H, W) of splats in these triangles' frames."""
+    black, white = (render(splats, camera, (c, c, c), frames=frames).mean(0) for c in (0, 1))
+    return 1 - white + black
 
 
 class Rows(CpuBackend):

@@ -1,6 +1,5 @@
-"""An opaque layer behind the surface: nobody is to look through a head from where it was not
-filmed. Images make its sides transparent where it is tracked too wide, and of a torso there may be
-the front alone."""
+"""An opaque layer behind the surface, so that nobody looks through a head from aside: images make
+its sides transparent where it is tracked too wide, and a torso may have a front only."""
 
 from dataclasses import dataclass
 from functools import partial
@@ -10,7 +9,7 @@ from scipy.ndimage import binary_erosion
 
 from ...avatar.embedding import face_frames
 from ...avatar.lattice import NORMAL_AXIS
-from ...capture.mesh_geometry import head_axes, vertex_normals
+from ...capture.mesh_geometry import vertex_normals
 from ...capture.model import Capture
 from .initial_splats import voxel_size
 from .likeness import (
@@ -18,7 +17,6 @@ from .likeness import (
     TORSO_HEIGHT,
     HeadCoordinates,
     ears_of,
-    head_coordinates,
     nearest_rows,
     skin_of,
 )
@@ -69,7 +67,7 @@ def backing_of(surface: Surface, sides: UnseenSides) -> Backing:
     capture = surface.capture
     faces = capture.faces
     neutral = np.asarray(capture.neutral, np.float64)
-    at = head_coordinates(capture)
+    at = surface.at
     if at is None or not surface.has_few_cameras:
         return Backing(np.zeros(len(faces), bool), neutral, sides.aside)
     front, back, usual = _back(surface, at, sides.color)
@@ -88,14 +86,14 @@ def backing_of(surface: Surface, sides: UnseenSides) -> Backing:
 
 
 def _behind_sides(
-    surface: Surface, at: HeadCoordinates, may_be: np.ndarray
+    surface: Surface, at: HeadCoordinates, allowed: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """(F,) bool: those of the triangles `may_be` (F,) bool, one in each cell, that few cameras see
-    well; (V, 3): the vertices, as far inside as masks want it there."""
+    """One triangle in each cell, of those `allowed` (F,) bool that no camera sees well, as (F,)
+    bool; the neutral vertices (V, 3), moved inside the head until masks cover them."""
     faces = surface.capture.faces
     neutral = np.asarray(surface.capture.neutral, np.float64)
     voxel = voxel_size(neutral)
-    rows = np.flatnonzero(may_be & _beside_face(surface, at) & (surface.facing < GRAZED_COSINE))
+    rows = np.flatnonzero(allowed & _beside_face(surface, at) & (surface.facing < GRAZED_COSINE))
     depths = voxel * DEPTH_VOXELS * np.arange(1, MAX_DEPTHS + 1)
     offsets = np.zeros((len(rows), len(depths), 3))
     offsets[:, :, NORMAL_AXIS["stga"]] = -depths
@@ -123,7 +121,7 @@ def _beside_face(surface: Surface, at: HeadCoordinates) -> np.ndarray:
 def _open_front(surface: Surface, at: HeadCoordinates) -> np.ndarray:
     """(F,) bool: triangles of a torso whose inner side shows from behind, but for what sticks out
     of masks. A bust, which ends soon, has none."""
-    _, (across, _, ahead), _ = _axes(surface.capture)
+    across, _, ahead = at.axes
     front = np.zeros(len(surface.outside), bool)
     for angle in np.radians(BEHIND_DEG):
         seen, cosine = surface.seen_from(np.sin(angle) * across - np.cos(angle) * ahead)
@@ -134,8 +132,8 @@ def _open_front(surface: Surface, at: HeadCoordinates) -> np.ndarray:
 
 
 def _clear_with_margin(covered: np.ndarray, margin_share: float) -> np.ndarray:
-    """(H, W) bool: pixels that a mask leaves clear, which covers these (H, W) bool, and a margin
-    within, as a share of the height."""
+    """(H, W) bool: the pixels that a mask does not cover, and those within a margin along its edge;
+    covered (H, W) bool; margin_share: of the mask's height."""
     margin = max(1, round(margin_share * len(covered)))
     return np.asarray(~binary_erosion(covered, iterations=margin))
 
@@ -143,14 +141,15 @@ def _clear_with_margin(covered: np.ndarray, margin_share: float) -> np.ndarray:
 def _back(
     surface: Surface, at: HeadCoordinates, color: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """(F,) bool: the triangles of a torso's open front behind which a back is within masks; (V, 3):
-    the vertices, those of the front in that; (M, 3): its color; color (F, 3): of the front."""
+    """Triangles (F,) bool of a torso's open front whose places in the back lie within masks; the
+    neutral vertices (V, 3), those of the front moved into the back; the back's colors (M, 3) behind
+    these triangles. color (F, 3): of the front."""
     faces = surface.capture.faces
     neutral = np.asarray(surface.capture.neutral, np.float64)
     front = _open_front(surface, at)
     if not front.any():
         return front, neutral, color[front]
-    places, usual = _round_back(surface.capture, front, color)
+    places, usual = _round_back(surface.capture, at, front, color)
     rows = np.flatnonzero(front)
     turned = face_frames(neutral, faces, neutral, "stga").rotation[rows]
     away = (places - neutral)[faces[rows]].mean(1)
@@ -162,32 +161,26 @@ def _back(
 
 
 def _round_back(
-    capture: Capture, front: np.ndarray, color: np.ndarray
+    capture: Capture, at: HeadCoordinates, front: np.ndarray, color: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The vertices (V, 3), those of the triangles `front` (F,) bool in the back of an elliptic
-    torso as wide as these; the usual color (M, 3) at the height of each of them; color: (F, 3)."""
-    eyes, (across, up, ahead), unit_m = _axes(capture)
+    """The neutral vertices (V, 3), those of the triangles `front` (F,) bool moved into the back of
+    an elliptic torso as wide as these; at each of these triangles' heights, the median color (M, 3)
+    of the front's colors (F, 3)."""
+    across, up, ahead = at.axes
+    reach_m = BACK_LEVELS * at.unit
     places = np.array(capture.neutral, np.float64)
     vertices = np.unique(capture.faces[front])
-    triangles = places[capture.faces[front]].mean(1) - eyes
+    triangles = places[capture.faces[front]].mean(1) - at.eyes
     width = triangles @ across
     level = triangles @ up
     behind = np.empty(len(vertices))
-    for row, (x, y) in enumerate((places[vertices] - eyes) @ np.stack([across, up], 1)):
-        around = abs(level - y) < BACK_LEVELS * unit_m
+    for row, (x, y) in enumerate((places[vertices] - at.eyes) @ np.stack([across, up], 1)):
+        around = abs(level - y) < reach_m
         low, high = np.quantile(width[around] if around.any() else width, BACK_REACH)
         half = max((high - low) / 2, 1e-9)
         beside = min(abs(x - (high + low) / 2) / half, 1)
         behind[row] = BACK_SHARE * half * np.sqrt(1 - beside**2)
     behind += BACK_GAP_VOXELS * voxel_size(places)
     places[vertices] -= behind[:, None] * ahead
-    usual = [np.median(color[front][abs(level - y) < BACK_LEVELS * unit_m], axis=0) for y in level]
+    usual = [np.median(color[front][abs(level - y) < reach_m], axis=0) for y in level]
     return places, np.array(usual)
-
-
-def _axes(capture: Capture) -> tuple[np.ndarray, np.ndarray, float]:
-    """`head_axes` of a neutral head that has them."""
-    centers = np.asarray(capture.neutral, np.float64)[capture.faces].mean(1)
-    axes = head_axes(centers, capture.regions)
-    assert axes is not None
-    return axes

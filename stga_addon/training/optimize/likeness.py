@@ -28,7 +28,7 @@ HAIRLINE = (-0.55, -1.15)
 LONG_HAIRLINE = (-0.55, -2.3)
 HANGING_RISE = 0.6
 """Angles from straight ahead, and heights over the eyes in that unit, below which no hair grows, or
-none hangs; how far below the first it has come away from the neck."""
+none hangs; how far below the first it has its full distance from the neck."""
 EAR_SIDE = 0.93
 EAR_LEVEL = -0.2
 EAR_HEIGHT = 0.75
@@ -78,6 +78,8 @@ class HeadCoordinates:
     level      (F,) height over the eyes, in distances of the eyes from the mouth
     side       (F,) distance from the middle plane, in the same unit
     unit       meters from the eyes to the mouth
+    eyes       (3,) their middle
+    axes       (3, 3) unit vectors to the head's left, up and ahead
     """
 
     azimuth: np.ndarray
@@ -85,15 +87,18 @@ class HeadCoordinates:
     level: np.ndarray
     side: np.ndarray
     unit: float
+    eyes: np.ndarray
+    axes: np.ndarray
 
 
 def head_coordinates(capture: Capture) -> HeadCoordinates | None:
     """None for a mesh whose eyes and mouth are not known, or not apart."""
     centers = np.asarray(capture.neutral, np.float64)[capture.faces].mean(1)
-    axes = head_axes(centers, capture.regions)
-    if axes is None:
+    found = head_axes(centers, capture.regions)
+    if found is None:
         return None
-    eyes, (across, up, ahead), unit = axes
+    eyes, axes, unit = found
+    across, up, ahead = axes
     middle = eyes + unit * (BROWS_OVER_EYES * up - EYES_TO_MIDDLE * ahead)
     x, y, z = ((centers - middle) @ axis for axis in (across, up, ahead))
     return HeadCoordinates(
@@ -102,6 +107,8 @@ def head_coordinates(capture: Capture) -> HeadCoordinates | None:
         level=(centers - eyes) @ up / unit,
         side=np.abs(x) / unit,
         unit=unit,
+        eyes=eyes,
+        axes=axes,
     )
 
 
@@ -115,8 +122,8 @@ def ears_of(at: HeadCoordinates) -> np.ndarray:
 def kinds_of(
     at: HeadCoordinates, is_outside: np.ndarray, has_long_hair: bool = False
 ) -> dict[str, np.ndarray]:
-    """Kind -> (F,) bool: scalp, with the neck that long hair hides, and neck with shoulders, whose
-    unseen parts look as seen ones."""
+    """Kind -> (F,) bool: scalp, which includes the back of a neck that long hair hides, and body,
+    which is neck and shoulders; unseen parts of each look as seen ones."""
     angle = np.degrees(np.abs(at.azimuth))
     elevation = np.degrees(at.elevation)
     ear = ears_of(at)
@@ -129,7 +136,8 @@ def kinds_of(
 
 
 def hanging_share(at: HeadCoordinates) -> np.ndarray:
-    """(F,) in 0…1: how far long hair has come away from what it hangs down before, at the neck."""
+    """(F,) share of its full distance from the neck that long hair has: 0 at the hairline and
+    beside the neck, 1 behind it and further down."""
     angle = np.degrees(np.abs(at.azimuth))
     below = np.interp(angle, HAIRLINE_DEG, HAIRLINE) - at.level
     behind = np.interp(angle, HAIRLINE_DEG, (0, 1))

@@ -25,6 +25,7 @@ from ...flame.model import torso_faces
 from ...flame.quaternions import unit
 from .initial_splats import FEW_CAMERAS, SAMPLED_HEIGHT_PIXELS, mirrored, voxel_size
 from .likeness import (
+    JAW_LEVEL,
     TORSO_HEIGHT,
     HeadCoordinates,
     hanging_share,
@@ -72,14 +73,14 @@ meters, of triangles without area."""
 NECK_LEVEL = -1.1
 NECK_HALF_HEIGHT = 0.4
 NECK_SIDE_DEG = 95.0
-NECK_WIDTH_DEG = 45.0
+NECK_HALF_WIDTH_DEG = 45.0
 HANGING_HEIGHT = 0.4
 """Where sides of a neck are, as `HeadCoordinates` have it, and how far long hair stands out there,
 in distances of the eyes from the mouth."""
 MAX_APART_DEG = 8.0
 """Between the directions in which one camera sees a triangle, and their mean."""
 MAX_BESIDE_SHARE = 0.1
-"""Share of the masks in whose image a triangle lies, that it may lie outside of."""
+"""Share of the masks in whose image a point lies, that it may lie outside of."""
 MAX_STICKING_SHARE = 0.05
 """Of the triangles of a torso that is where images show a body."""
 STANDING_VOXELS = 1.5
@@ -92,6 +93,11 @@ class Surface:
 
     def __init__(self, capture: Capture) -> None:
         self.capture = capture
+
+    @cached_property
+    def at(self) -> HeadCoordinates | None:
+        """Where on the head the triangles are; None where that is not known."""
+        return head_coordinates(self.capture)
 
     @cached_property
     def facing(self) -> np.ndarray:
@@ -200,9 +206,13 @@ class Surface:
         offsets: np.ndarray,
         clear: Callable[[np.ndarray], np.ndarray] = clear_of,
     ) -> np.ndarray:
-        """(N, K) bool: whether some masks leave K points each of triangles (N,) clear, as `clear`
-        says of what they cover (H, W) bool; offsets (N, K, 3) or (K, 3): from their origins, meters
-        in the axes of their frames."""
+        """(N, K) bool: whether K points at each of the triangles `rows` (N,) lie outside of more
+        than MAX_BESIDE_SHARE of the masks in whose image they lie.
+
+        offsets  (N, K, 3) or (K, 3) of the points from the triangles' origins, meters along the
+                 axes of their frames
+        clear    what a mask covers (H, W) bool -> pixels (H, W) bool that lie outside of it
+        """
         capture = self.capture
         offsets = np.broadcast_to(offsets, (len(rows), *offsets.shape[-2:]))
         seen, beside = np.zeros((2, *offsets.shape[:2]), int)
@@ -264,9 +274,11 @@ class Surface:
         is_border = np.zeros(count, bool)
         is_border[edges[part[edges[:, 0]] == longest]] = True
         border = is_border[faces].any(1)
-        at = head_coordinates(self.capture)
-        is_torso = at is not None and np.ptp(at.level[border]) > TORSO_HEIGHT
-        return np.zeros(len(faces), bool) if is_torso else np.asarray(border)
+        if self.at is not None:
+            level = self.at.level[border]
+            if level.max() < JAW_LEVEL and np.ptp(level) > TORSO_HEIGHT:
+                return np.zeros(len(faces), bool)
+        return np.asarray(border)
 
     @cached_property
     def hair_height(self) -> np.ndarray:
@@ -282,13 +294,13 @@ class Surface:
         sources = np.concatenate([center[measured], mirrored(center)[measured]])
         near = measured[nearest_rows(sources, center[scalp], AROUND) % len(measured)]
         height[scalp] = np.median(self._measured_height[near], axis=1)
-        at = head_coordinates(self.capture)
-        if at is not None and self._has_long_hair(at):
-            share = hanging_share(at)
-            below = self._scalp & (share > 0)
-            grown = np.median(height[self._scalp & ~below])
-            height[below] = grown + share[below] * (HANGING_HEIGHT * at.unit - grown)
-        # hair on the one side may be higher than on the other, and a head beside its images
+        if self.at is not None and self._has_long_hair:
+            share = hanging_share(self.at)
+            hanging = self._scalp & (share > 0)
+            growing = self._scalp & ~hanging
+            usual = np.median(height[growing]) if growing.any() else 0.0
+            height[hanging] = usual + share[hanging] * (HANGING_HEIGHT * self.at.unit - usual)
+        # one side's hair may be higher than the other's, which it is mirrored from
         offsets = np.zeros((len(scalp), HEIGHTS + 1, 3))
         offsets[:, :, NORMAL_AXIS["stga"]] = height[scalp, None] * np.linspace(1, 0, HEIGHTS + 1)
         fits = ~self.beside_masks(scalp, offsets)
@@ -301,7 +313,7 @@ class Surface:
         """(F,) bool: hidden triangles and, where few cameras do not tell how thick it is, skin and
         clothes, above which no outline shows anything to stand. Not the torso where parts of it
         stick out of masks: what images show there, as arms and hands, is elsewhere."""
-        if head_coordinates(self.capture) is None or not self.has_few_cameras:
+        if self.at is None or not self.has_few_cameras:
             return self.hidden
         voxel = voxel_size(np.asarray(self.capture.neutral))
         bare = self.outside & ~self._scalp
@@ -319,21 +331,24 @@ class Surface:
     @cached_property
     def kinds(self) -> dict[str, np.ndarray]:
         """`kinds_of` the triangles; none where it is not known where on a head they are."""
-        at = head_coordinates(self.capture)
-        if at is None:
+        if self.at is None:
             return {}
-        return kinds_of(at, self.outside, self._has_long_hair(at))
+        return kinds_of(self.at, self.outside, self._has_long_hair)
 
-    def _has_long_hair(self, at: HeadCoordinates) -> bool:
-        """Whether something stands out on both sides of the neck just below the ears, where no
-        collar reaches, so that nobody has seen the neck from behind."""
-        turn = np.degrees(at.azimuth)
-        beside = self._is_measured & (abs(at.level - NECK_LEVEL) < NECK_HALF_HEIGHT)
-        sides = (beside & (abs(side * turn - NECK_SIDE_DEG) < NECK_WIDTH_DEG) for side in (-1, 1))
-        return all(
-            side.any() and np.median(self._measured_height[side]) > HANGING_HEIGHT * at.unit
-            for side in sides
-        )
+    @cached_property
+    def _has_long_hair(self) -> bool:
+        """Whether something stands out on both sides of the neck, just below the ears, where no
+        collar reaches."""
+        if self.at is None:
+            return False
+        angle = np.degrees(self.at.azimuth)
+        measured = self._is_measured & (abs(self.at.level - NECK_LEVEL) < NECK_HALF_HEIGHT)
+        for sign in (-1, 1):
+            beside = measured & (abs(sign * angle - NECK_SIDE_DEG) < NECK_HALF_WIDTH_DEG)
+            height = self._measured_height[beside]
+            if not len(height) or np.median(height) < HANGING_HEIGHT * self.at.unit:
+                return False
+        return True
 
     @property
     def _scalp(self) -> np.ndarray:

@@ -55,7 +55,7 @@ PULLED_COLUMNS = (
     "second/opacity",
 )
 PINNED_KINDS = ("parameters", "average", "first", "second")
-KEPT = ("xyz", "rotation", "log_scale", "opacity")
+INNER_PARAMETERS = ("xyz", "rotation", "log_scale", "opacity")
 """What is read of the splats that may be pulled; arrays of those whose color is pinned; parameters
 of the inner layer that stay."""
 
@@ -183,7 +183,7 @@ class SurfacePrior:
         is_inside = (self._frames.sides.triangles & ~self._surface.outside)[face]
         rows = np.flatnonzero(is_inside | is_inner)
         inner = self._inner.rows(np.searchsorted(self._inner.face, face[rows]))
-        kept = {name: getattr(inner, name) for name in KEPT}
+        kept = {name: getattr(inner, name) for name in INNER_PARAMETERS}
         backend.assign(bound[rows], parameters_and_average(kept))
 
     @cached_property
@@ -269,8 +269,8 @@ def hidden_splats(frames: FrameStore, settings: TrainingSettings) -> Splats:
 
 
 def splats_behind(frames: FrameStore, sh_degree: int) -> Splats:
-    """The opaque layer behind what views show at times or at an angle: lids, whose own splats,
-    trained on open eyes, would leave gaps when they close, and the `backing`."""
+    """The opaque layer under lids, whose own splats, trained on open eyes, would leave gaps when
+    they close, and the `backing`."""
     surface = frames.surface
     inner = inner_layer(frames, sh_degree)
     has_inner = (surface.lids & ~surface.closed) | frames.backing.triangles
@@ -278,9 +278,9 @@ def splats_behind(frames: FrameStore, sh_degree: int) -> Splats:
 
 
 def inner_layer(frames: FrameStore, sh_degree: int = 0) -> Splats:
-    """One splat in its plausible color for each triangle of lids, under its middle, so large that
-    closed they have no gaps; of the mouth's unseen inside; and of the `backing`, there. By
-    triangle."""
+    """One splat in its plausible color, sorted by triangle, for each triangle of lids, under its
+    middle and so large that closed lids have no gaps, of the mouth's unseen inside, and of the
+    `backing`."""
     capture = frames.capture
     axis = NORMAL_AXIS[frames.convention]
     lids = frames.surface.lids

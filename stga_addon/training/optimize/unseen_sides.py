@@ -14,7 +14,6 @@ from .likeness import (
     SMOOTHED,
     HeadCoordinates,
     hairy_triangles,
-    head_coordinates,
     inside_colors,
     lining_of,
     nearest_rows,
@@ -100,7 +99,7 @@ def unseen_sides(surface: Surface) -> UnseenSides:
     turned = np.where(is_outside, surface.turned_from(SHOWN_COSINE), 0.0)
     aside = color.copy()
     is_hair = np.zeros_like(shown)
-    at = head_coordinates(capture)
+    at = surface.at
     if at is not None:
         kinds = surface.kinds
         is_face = is_source & ~kinds["scalp"] & ~kinds["body"] & (at.level < BROWS_LEVEL)
