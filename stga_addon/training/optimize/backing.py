@@ -2,10 +2,8 @@
 its sides transparent where it is tracked too wide, and a torso may have a front only."""
 
 from dataclasses import dataclass
-from functools import partial
 
 import numpy as np
-from scipy.ndimage import binary_erosion
 
 from ...avatar.embedding import face_frames
 from ...avatar.lattice import NORMAL_AXIS
@@ -97,8 +95,7 @@ def _behind_sides(
     depths = voxel * DEPTH_VOXELS * np.arange(1, MAX_DEPTHS + 1)
     offsets = np.zeros((len(rows), len(depths), 3))
     offsets[:, :, NORMAL_AXIS["stga"]] = -depths
-    clear = partial(_clear_with_margin, margin_share=MARGIN_SHARE)
-    fits = ~surface.beside_masks(rows, offsets, clear)
+    fits = ~surface.beside_masks(rows, offsets, -MARGIN_SHARE)
     deepest = np.zeros(len(neutral))
     np.maximum.at(deepest, faces[rows], depths[fits.argmax(1), None])
     rows = rows[fits.any(1)]
@@ -131,13 +128,6 @@ def _open_front(surface: Surface, at: HeadCoordinates) -> np.ndarray:
     return np.asarray(front & (height > TORSO_HEIGHT))
 
 
-def _clear_with_margin(covered: np.ndarray, margin_share: float) -> np.ndarray:
-    """(H, W) bool: the pixels that a mask does not cover, and those within a margin along its edge;
-    covered (H, W) bool; margin_share: of the mask's height."""
-    margin = max(1, round(margin_share * len(covered)))
-    return np.asarray(~binary_erosion(covered, iterations=margin))
-
-
 def _back(
     surface: Surface, at: HeadCoordinates, color: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -154,8 +144,7 @@ def _back(
     turned = face_frames(neutral, faces, neutral, "stga").rotation[rows]
     away = (places - neutral)[faces[rows]].mean(1)
     offsets = np.einsum("nji,nj->ni", turned, away)[:, None]
-    clear = partial(_clear_with_margin, margin_share=BACK_MARGIN_SHARE)
-    fits = ~surface.beside_masks(rows, offsets, clear)[:, 0]
+    fits = ~surface.beside_masks(rows, offsets, -BACK_MARGIN_SHARE)[:, 0]
     front[rows] = fits
     return front, places, usual[fits]
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from scipy.ndimage import binary_dilation
+from scipy.ndimage import binary_dilation, binary_erosion
 
 from ...avatar.embedding import FaceFrames
 from ...capture.camera import Camera
@@ -53,11 +53,12 @@ def read_outlines(capture: Capture, seed: int) -> list[Outline]:
     return outlines
 
 
-def clear_of(covered: np.ndarray) -> np.ndarray:
-    """(H, W) bool: pixels that a mask, which covers these (H, W) bool, leaves clear, with a
-    margin."""
-    margin = max(1, round(TOLERANCE_SHARE * len(covered)))
-    return np.asarray(~binary_dilation(covered, iterations=margin))
+def clear_of(covered: np.ndarray, margin_share: float = TOLERANCE_SHARE) -> np.ndarray:
+    """(H, W) bool: pixels that a mask, which covers these (H, W) bool, leaves clear, but for a
+    margin beside it; with a negative one, also a margin within it. margin_share: of the height."""
+    margin = max(1, round(abs(margin_share) * len(covered)))
+    moved = binary_dilation if margin_share > 0 else binary_erosion
+    return np.asarray(~moved(covered, iterations=margin))
 
 
 class OutlinePruning:

@@ -1,7 +1,6 @@
 """What training views tell of a head's surface: which triangles face a camera, where something
 stands above them, where the mesh ends."""
 
-from collections.abc import Callable
 from functools import cached_property
 
 import numpy as np
@@ -33,7 +32,7 @@ from .likeness import (
     kinds_of,
     nearest_rows,
 )
-from .outlines import clear_of
+from .outlines import TOLERANCE_SHARE, clear_of
 
 FACING_TIMESTEPS = 300
 FACING_MESHES = 48
@@ -204,14 +203,14 @@ class Surface:
         self,
         rows: np.ndarray,
         offsets: np.ndarray,
-        clear: Callable[[np.ndarray], np.ndarray] = clear_of,
+        margin_share: float = TOLERANCE_SHARE,
     ) -> np.ndarray:
         """(N, K) bool: whether K points at each of the triangles `rows` (N,) lie outside of more
         than MAX_BESIDE_SHARE of the masks in whose image they lie.
 
-        offsets  (N, K, 3) or (K, 3) of the points from the triangles' origins, meters along the
-                 axes of their frames
-        clear    what a mask covers (H, W) bool -> pixels (H, W) bool that lie outside of it
+        offsets       (N, K, 3) or (K, 3) of the points from the triangles' origins, meters along
+                      the axes of their frames
+        margin_share  of the masks' height, which still counts as inside; negative: as outside
         """
         capture = self.capture
         offsets = np.broadcast_to(offsets, (len(rows), *offsets.shape[-2:]))
@@ -223,7 +222,7 @@ class Surface:
             points += frames.origin[rows, None]
             column, row, within = pixels_of(points.reshape(-1, 3), view.camera)
             seen += within.reshape(seen.shape)
-            beside += (within & clear(mask > 127)[row, column]).reshape(seen.shape)
+            beside += (within & clear_of(mask > 127, margin_share)[row, column]).reshape(seen.shape)
         return np.asarray(beside > MAX_BESIDE_SHARE * np.maximum(seen, 1))
 
     @cached_property
