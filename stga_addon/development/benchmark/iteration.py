@@ -206,7 +206,7 @@ def listing_stages(image: Rendered) -> dict[str, Stage]:
     output = image.output
     n = len(state.face)
     tiles_x, tiles_y = tile_grid(*frames.size.tolist())
-    everything = np.arange(n)
+    everything = np.ones(n, bool)
     everywhere = sum_tiles(np.ones((tiles_y, tiles_x), bool))
 
     def project() -> object:

@@ -31,7 +31,7 @@ def compose(
             *(np.ascontiguousarray(getattr(splats, name)) for name in Parameters._fields)
         )
         project_forward(
-            np.arange(len(splats)),
+            np.ones(len(splats), bool),
             everywhere,
             parameters,
             splats.face,

@@ -287,15 +287,26 @@ def _store(b, q, i, color, projection, depth_as_color):
     columns[i, BLUE] = max(ZERO, color[2])
 
 
-@parallel(lambda rows, *_: len(rows), piece=SPLATS_PER_PIECE)
-def project_forward(
-    work, rows, covered, splats, face, frames, degree, depth_as_color, antialiased, projection
-):
-    """Write the listed rows of `projection`; the tuples are those of `layout.py`.
+@inline_jit
+def _list_wanted(begin, end, wanted, rows):
+    """List the wanted splats from `begin` to before `end`. Returns how many there are."""
+    found = np.uint64(0)
+    for i in range(np.uint64(begin), np.uint64(end)):
+        rows[found] = i
+        found += np.uint64(wanted[i])
+    return np.int64(found)
 
-    rows (M,): the splats to project. covered (tiles_y + 1, tiles_x + 1) int32: how many tiles above
-    and to the left are rendered; a splat's bounds end at these, and one that reaches none of them
-    counts as not visible. face (N,) int32.
+
+@parallel(lambda wanted, *_: len(wanted), piece=SPLATS_PER_PIECE)
+def project_forward(
+    work, wanted, covered, splats, face, frames, degree, depth_as_color, antialiased, projection
+):
+    """Write the rows of `projection` of the splats that are wanted, (N,) bool; the tuples are those
+    of `layout.py`.
+
+    covered (tiles_y + 1, tiles_x + 1) int32: how many tiles above and to the left are rendered; a
+    splat's bounds end at these, and one that reaches none of them counts as not visible. face (N,)
+    int32.
     degree: of the spherical harmonics used, at most the stored one.
     depth_as_color: blend (depth, 0, 0) instead of the color. antialiased: what LOW_PASS_PX2 adds to
     a splat's area is taken from its opacity (Mip-Splatting's 2D filter, gsplat's "antialiased"
@@ -308,9 +319,11 @@ def project_forward(
     coefficients = np.uint64((degree + 1) * (degree + 1))
     b = np.zeros(block.FORWARD_SIZE, np.float32)
     seen = np.empty(BLOCK_SPLATS, np.uint64)
+    rows = np.empty(SPLATS_PER_PIECE, np.int64)
     for begin, end in pieces(work):
-        for first in range(begin, end, BLOCK_SPLATS):
-            some = rows[first : min(end, first + BLOCK_SPLATS)]
+        found = _list_wanted(begin, end, wanted, rows)
+        for first in range(0, found, BLOCK_SPLATS):
+            some = rows[first : min(found, first + BLOCK_SPLATS)]
             _load(some, splats, face, frames, b)
             block.project_geometry(b, frames.intrinsics, limits)
             if antialiased:

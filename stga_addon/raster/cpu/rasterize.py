@@ -164,25 +164,23 @@ def render_forward(
     tiles_x, tiles_y = tile_grid(width, height)
     projection = new_projection(len(splats.xyz), buffers)
 
-    def project(rows: np.ndarray, covered: np.ndarray) -> None:
+    def project(wanted: np.ndarray, covered: np.ndarray) -> None:
         options = degree, depth_as_color, antialiased
-        project_forward(rows, covered, splats, face, frames, *options, projection)
+        project_forward(wanted, covered, splats, face, frames, *options, projection)
 
     touched = buffers.kept("all_tiles", (tiles_y, tiles_x), lambda *shape: np.ones(shape, bool))
     everywhere = buffers.kept(
         "everywhere", (tiles_y, tiles_x), lambda *shape: tiling.sum_tiles(np.ones(shape, bool))
     )
     if focus is None:
-        project(buffers.kept("everything", (len(splats.xyz),), np.arange), everywhere)
+        project(_every_splat(len(splats.xyz), buffers), everywhere)
         tile_blocks = buffers.kept("whole_tiles", (tiles_x * tiles_y,), tiling.whole_tiles)
     else:
-        room = (buffers.get(name, focus.shape, np.int64) for name in ("focused", "others"))
-        focused, others = tiling.split_splats(focus, *room)
-        project(focused, everywhere)
+        project(focus, everywhere)
         touched, covered, tile_blocks = tiling.find_needed_blocks(
-            projection, focused, np.float32(reach), tiles_x, tiles_y
+            projection, np.flatnonzero(focus), np.float32(reach), tiles_x, tiles_y
         )
-        project(others, covered)
+        project(np.logical_not(focus, buffers.get("others", focus.shape, bool)), covered)
     lists, tiles = sort_into_tiles(projection, tiles_x, tile_blocks, buffers)
     background = np.asarray(background, np.float32)
     blended = new_image(width, height, lists, buffers)
@@ -291,10 +289,14 @@ def _in_focus(
     """The tiles and the visible splats that the backward pass looks at, and whether each of the n
     splats is wanted."""
     if output.focus is None:
-        wanted = buffers.kept("wanted", (n,), lambda n: np.ones(n, bool))
-        return output.tiles, output.lists.visible, wanted
+        return output.tiles, output.lists.visible, _every_splat(n, buffers)
     tiles = output.tiles[output.touched.ravel()[output.tiles]]
     return tiles, tiling.listed_rows(output.lists.visible, output.focus), output.focus
+
+
+def _every_splat(n: int, buffers: BufferPool) -> np.ndarray:
+    """(N,) bool: all are wanted."""
+    return buffers.kept("every_splat", (n,), lambda n: np.ones(n, bool))
 
 
 def new_projection(n: int, buffers: BufferPool) -> Projection:

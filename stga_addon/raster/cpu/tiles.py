@@ -380,21 +380,14 @@ def _add_box(count, x0, y0, x1, y1):
 @part_jit
 def _sum_boxes(count):
     """Turn the differences of `_add_box` into counts."""
+    for y in range(1, count.shape[0]):
+        for x in range(count.shape[1]):
+            count[y, x] += count[y - 1, x]
     for y in range(count.shape[0]):
         along = 0
         for x in range(count.shape[1]):
             along += count[y, x]
-            count[y, x] = along + (count[y - 1, x] if y > 0 else 0)
-
-
-@jit
-def split_splats(focus, inside, outside):
-    """The splats (M,) that are in focus (N,) bool, and the others, in room for N int64 each."""
-    found = 0
-    for i in range(np.uint64(len(focus))):
-        inside[found] = outside[i - np.uint64(found)] = i
-        found += focus[i]
-    return inside[:found], outside[: len(focus) - found]
+            count[y, x] = along
 
 
 @jit
@@ -452,14 +445,15 @@ def find_needed_blocks(projection, splats, reach, tiles_x, tiles_y):
     _sum_boxes(near)
     tile_blocks = np.zeros(tiles_y * tiles_x, np.uint16)
     covered = np.zeros((tiles_y + 1, tiles_x + 1), np.int32)
-    for row in range(rows):
-        for column in range(columns):
-            bit = column % BLOCKS_ALONG * BLOCKS_ALONG + row % BLOCKS_ALONG
-            tile = row // BLOCKS_ALONG * tiles_x + column // BLOCKS_ALONG
-            tile_blocks[tile] |= np.uint16((near[row, column] > 0) << bit)
     for ty in range(tiles_y):
         for tx in range(tiles_x):
-            covered[ty + 1, tx + 1] = tile_blocks[ty * tiles_x + tx] != 0
+            bits = np.uint16(0)
+            for bit in range(BLOCKS):
+                row = ty * BLOCKS_ALONG + bit % BLOCKS_ALONG
+                column = tx * BLOCKS_ALONG + bit // BLOCKS_ALONG
+                bits |= np.uint16((near[row, column] > 0) << bit)
+            tile_blocks[ty * tiles_x + tx] = bits
+            covered[ty + 1, tx + 1] = bits != 0
     _sum_boxes(covered)
     return reached[:-1, :-1] > 0, covered, tile_blocks
 
