@@ -15,7 +15,7 @@ from ..errors import StgaError, shorten
 from ..files import is_file, is_folder, matching, naming, read_json, read_npy, read_npz
 from ..flame.forward import FlameFrame
 from ..flame.model import BUNDLED_HEAD, EXPRESSION_NAMES
-from ..flame.parts import flame_model, key_regions
+from ..flame.parts import flame_model, found_regions, key_regions
 from ..flame.sequence import (
     FlameSequence,
     expression_mesh,
@@ -268,7 +268,10 @@ def _mesh_capture(
             "STL has no shared vertices: of the topology, only the number of triangles can be "
             "checked"
         )
-    regions = {} if regions_file is None else meshes.read_regions(regions_file, faces, len(neutral))
+    if regions_file is not None:
+        regions = meshes.read_regions(regions_file, faces, len(neutral))
+    elif regions := found_regions(neutral, faces):
+        warnings.append("no regions are given: eyes, mouth and nose are found on FLAME's mesh")
     empty = [name for name, members in regions.items() if not members.any()]
     if empty:
         warnings.append(f"{regions_file}: no triangle lies in {', '.join(empty)}")
@@ -390,9 +393,12 @@ def sequence_capture(
 ) -> Capture:
     """The capture of layout "flame" whose meshes a sequence makes; where both are from."""
     model = sequence.model
-    regions = key_regions(sequence.model)
-    missing = "the FLAME model has no vertex masks (FLAME_masks.pkl beside it)"
-    unmasked = () if regions else (f"{missing}: triangles are selected one by one",)
+    regions = key_regions(model)
+    unmasked = []
+    if not regions or model.has_found_masks:
+        found = "eyes, mouth and nose are found on its mesh"
+        used = found if regions else "triangles are selected one by one"
+        unmasked = [f"the FLAME model has no vertex masks (FLAME_masks.pkl beside it): {used}"]
     return Capture(
         root=root,
         layout="flame",

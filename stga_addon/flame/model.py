@@ -47,6 +47,7 @@ class FlameModel:
     weights      (V, 5) skinning weights
     faces        (F, 3) int32
     masks        region name -> vertex ids
+    has_found_masks  whether these are of no file, but found on the mesh
     expression_names  ARKit's name of each expression, whose coefficient is then a weight from 0 to
                       1; else ()
     """
@@ -61,6 +62,7 @@ class FlameModel:
     faces: np.ndarray
     masks: Mapping[str, np.ndarray] = field(default_factory=dict)
     expression_names: tuple[str, ...] = ()
+    has_found_masks: bool = False
 
     @property
     def n_expression(self) -> int:

@@ -1,13 +1,15 @@
 """Parts that FLAME's mesh is given, in one table, and head models with them."""
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from itertools import accumulate
 from pathlib import Path
 
 import numpy as np
 
+from ..errors import StgaError
+from .key_masks import found_masks
 from .model import BUNDLED_HEAD, FlameModel, faces_within, read_flame
 from .teeth import TEETH_FACES, TEETH_VERTICES, TEMPLATE_VERTICES, with_teeth
 
@@ -50,8 +52,8 @@ eyes, mouth and nose); parts are added."""
 
 
 def flame_model(path: Path | None) -> FlameModel:
-    """The FLAME model file, with all parts where it has FLAME's 5023 vertices; None: the bundled
-    head. Raises StgaError."""
+    """The FLAME model file, with all parts where it has FLAME's 5023 vertices, and masks where it
+    has none; None: the bundled head. Raises StgaError."""
     path = path or BUNDLED_HEAD
     try:
         # its masks may lie beside it
@@ -68,6 +70,9 @@ def _remembered(path: Path, *state: int) -> FlameModel:
     it again, and some the bundled one besides."""
     model = read_flame(path)
     if len(model.v_template) == TEMPLATE_VERTICES:
+        if not model.masks:
+            masks = found_masks(model.v_template, model.faces)
+            model = replace(model, masks=masks, has_found_masks=bool(masks))
         for part in PARTS.values():
             model = part.graft(model)
     return model
@@ -75,10 +80,28 @@ def _remembered(path: Path, *state: int) -> FlameModel:
 
 def key_regions(model: FlameModel) -> dict[str, np.ndarray]:
     """left_eye, right_eye, mouth, nose as (F,) bool; those without any mask are left out."""
+    return _in_regions(model.masks, model.faces)
+
+
+def found_regions(vertices: np.ndarray, faces: np.ndarray) -> dict[str, np.ndarray]:
+    """`key_regions` that are found on a mesh (V, 3) of FLAME's size; none where it is of another
+    make."""
+    if len(vertices) not in FLAME_SIZES:
+        return {}
+    try:
+        masks = found_masks(vertices, faces)
+    except StgaError:  # of a mouth that is closed at the throat
+        return {}
+    ends = zip(PARTS, FLAME_SIZES, FLAME_SIZES[1:], strict=False)
+    parts = {name: np.arange(first, past) for name, first, past in ends if past <= len(vertices)}
+    return _in_regions({**masks, **parts} if masks else {}, faces)
+
+
+def _in_regions(masks: Mapping[str, np.ndarray], faces: np.ndarray) -> dict[str, np.ndarray]:
     regions = {}
     for region, names in KEY_MASKS.items():
         parts = [name for name, part in PARTS.items() if part.region == region]
-        present = [model.masks[name] for name in (*names, *parts) if name in model.masks]
+        present = [masks[name] for name in (*names, *parts) if name in masks]
         if present:
-            regions[region] = faces_within(model.faces, np.concatenate(present))
+            regions[region] = faces_within(faces, np.concatenate(present))
     return regions

@@ -49,7 +49,7 @@ def with_teeth(model: FlameModel) -> FlameModel:
     upper row follows the neck joint, which turns the head, and the lower row the jaw; both follow
     identity as the inside of the mouth does, neither expression nor pose correctives. Adds the mask
     "teeth". Raises StgaError for a mesh without an open mouth."""
-    rings, lips = _mouth(model)
+    rings, lips = mouth_rings(model.v_template, model.faces)
     inside = np.concatenate(rings)
     teeth = _positions(model.v_template, rings, lips)
     identity = model.shapedirs[inside, :, : model.n_identity]
@@ -75,7 +75,7 @@ def lip_pairs(model: FlameModel) -> tuple[np.ndarray, np.ndarray]:
         distances = np.linalg.norm(at[upper, None] - at[lower], axis=2)
         near = np.flatnonzero(distances.min(axis=1) < MAX_LIP_DISTANCE_M)
         return upper[near], lower[distances[near].argmin(axis=1)]
-    _, lips = _mouth(model)
+    _, lips = mouth_rings(model.v_template, model.faces)
     half = len(lips) // 2
     sides = lips[1:half], lips[:half:-1]
     heights = [model.v_template[side, 1].mean() for side in sides]
@@ -93,19 +93,20 @@ def teeth_faces(first: int) -> np.ndarray:
     return np.array(faces, np.int32).reshape(-1, 3)
 
 
-def _mouth(model: FlameModel) -> tuple[list[np.ndarray], np.ndarray]:
-    """Vertex ids of rings of neighbors from the open end of the throat, the mesh's foremost hole,
-    up to the one that lies foremost: the lips; and this one in order around the mouth."""
-    faces = model.faces[(model.faces < TEMPLATE_VERTICES).all(axis=1)]
-    depth = model.v_template[:, 2]
-    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]).astype(np.int64)
+def mouth_rings(vertices: np.ndarray, faces: np.ndarray) -> tuple[list[np.ndarray], np.ndarray]:
+    """Vertex ids of rings of neighbors from the open end of the throat, the foremost hole of
+    FLAME's mesh, up to the one that lies foremost: the lips; and this one in order around the
+    mouth. The head looks along z. Raises StgaError for a mesh without an open mouth."""
+    faces = faces[(faces < TEMPLATE_VERTICES).all(axis=1)]
+    depth = vertices[:, 2]
+    edges = _edges(faces)
     # the neck's is farther back
-    holes = [hole for hole in _holes(edges) if depth[hole].mean() > depth[faces].mean()]
+    holes = [hole for hole in holes_of(faces) if depth[hole].mean() > depth[faces].mean()]
     if not holes:
         closed = "has a closed mouth, expected one that is open at the throat"
         raise StgaError(f"teeth: the FLAME model's mesh {closed}")
     rings = [max(holes, key=lambda hole: float(depth[hole].mean()))]
-    reached = np.zeros(len(model.v_template), bool)
+    reached = np.zeros(len(vertices), bool)
     for _ in range(MAX_MOUTH_RINGS):
         reached[rings[-1]] = True
         touched = edges[reached[edges].any(axis=1)]
@@ -114,13 +115,19 @@ def _mouth(model: FlameModel) -> tuple[list[np.ndarray], np.ndarray]:
             break
         rings.append(ring)
     lips = _ring_order(edges, rings[-1])
-    x = model.v_template[lips, 0]  # from the left corner on; the right one is half a ring further
+    x = vertices[lips, 0]  # from the left corner on; the right one is half a ring further
     lips = np.roll(lips, -int((x - np.roll(x, len(lips) // 2)).argmax()))
     return rings, lips
 
 
-def _holes(edges: np.ndarray) -> list[np.ndarray]:
-    """Vertex ids of each hole of the mesh, from its directed edges (E, 2)."""
+def _edges(faces: np.ndarray) -> np.ndarray:
+    """(3F, 2) int64: directed edges of triangles."""
+    return faces[:, [[0, 1], [1, 2], [2, 0]]].swapaxes(0, 1).reshape(-1, 2).astype(np.int64)
+
+
+def holes_of(faces: np.ndarray) -> list[np.ndarray]:
+    """Vertex ids of each hole of a mesh, in order around it."""
+    edges = _edges(faces)
     key = edges.max() + 1
     forth = edges @ (key, 1)
     back = edges @ (1, key)

@@ -240,10 +240,10 @@ def test_flame_capture_without_paths_or_masks(tmp_path):
 
 
 @pytest.mark.parametrize("rows", [5023, 5143])
-def test_published_topology_gets_teeth(tmp_path, shared_data, rows):
-    """Catches a mesh of 9976 triangles where VHAP tracked 10144, whichever size its offsets have.
-    The real template and triangles; skinning and expressions are filled in, for they are not
-    published openly."""
+def test_published_topology_gets_teeth_and_regions(tmp_path, shared_data, rows):
+    """Catches a mesh of 9976 triangles where VHAP tracked 10144, whichever size its offsets have,
+    and a head without FLAME_masks.pkl that has no eyes, or has them in silence. The real template
+    and triangles; skinning and expressions are filled in, for they are not published openly."""
     with np.load(shared_data / "flame_open/flame2023_open_basis.npz") as data:
         template = data["v_template"].astype(float)
         faces = data["faces"]
@@ -252,7 +252,12 @@ def test_published_topology_gets_teeth(tmp_path, shared_data, rows):
     offset = np.full((1, rows, 3), 0.001, np.float32)
     parameters = factory.flame_parameters(0) | {"static_offset": offset, "shape": np.zeros(4)}
     np.savez(root / "flame_param/00000.npz", **parameters)
+    with np.load(model_file) as data:
+        bare = {key: data[key] for key in data.files if not key.startswith("masks/")}
+    np.savez(model_file, **bare)
     capture = open_capture(root, model_file)
+    assert set(capture.regions) == {"left_eye", "right_eye", "mouth", "nose"}
+    assert "found on its mesh" in capture.warnings[0]
     assert capture.neutral.shape == (5143, 3)
     assert capture.faces.shape == (10144, 3)
     assert_allclose(capture.neutral[:5023], template + np.float32(0.001), atol=1e-7)
