@@ -10,6 +10,7 @@ from PIL import Image
 from scipy.ndimage import binary_dilation, binary_erosion
 from scipy.spatial import cKDTree
 
+from stga_addon.avatar.embedding import to_world
 from stga_addon.avatar.file import UNSEEN_REGION, Avatar
 from stga_addon.avatar.filmed import filmed_sides
 from stga_addon.avatar.lattice import NORMAL_AXIS
@@ -23,13 +24,14 @@ from stga_addon.flame.quaternions import to_matrices
 from stga_addon.render.render import render
 from stga_addon.training.optimize.change import Turn
 from stga_addon.training.optimize.frames import FrameStore
-from stga_addon.training.optimize.initial_splats import voxel_size
+from stga_addon.training.optimize.initial_splats import hull_points, voxel_size
 from stga_addon.training.optimize.state import new_state
 from stga_addon.training.optimize.surface import GRAZING_COSINE, Surface
 from stga_addon.training.optimize.surface_prior import (
     BACKING_OPACITY,
     BEHIND_COSINE,
     SurfacePrior,
+    above_unseen_hair,
     flattened,
     hidden_splats,
     splats_behind,
@@ -207,6 +209,23 @@ def test_hidden_sides_are_closed(filmed, convention):
     assert np.quantile(alpha[own], 0.01) > 0.45
     air = ~binary_dilation(silhouette(filmed.neutral, filmed.faces, camera), iterations=18)
     assert alpha[air].max() < 0.02
+
+
+def test_no_tuft_hangs_behind_the_head(filmed):
+    """Catches hull points behind a head, where masks from in front do not end the hull: in the air,
+    for all cameras that nobody has put there. Those of hair that outlines show stay."""
+    views = filmed.views["train"]
+    views = tuple(replace(view, timestep=0, camera_index=view.timestep) for view in views)
+    capture = replace(filmed, views={"train": views}, timesteps=(0,))
+    frames = FrameStore(capture, "stga")
+    splats = hull_points(capture, views, "stga", 0)
+    gone = above_unseen_hair(frames, splats)
+    at = to_world(splats, frames.of(0)).xyz
+    distance = cKDTree(filmed.neutral).query(at)[0]
+    behind = (at[:, 2] < -0.06) & (at[:, 1] > 0.04)
+    assert distance[behind].max() > HAIR_M + 0.012
+    assert distance[behind & ~gone].max() < HAIR_M + 0.008
+    assert not gone[at[:, 2] > 0].any()
 
 
 @pytest.mark.parametrize("convention", ["stga", "gaussian_avatars"])

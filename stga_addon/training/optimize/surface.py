@@ -43,7 +43,7 @@ HIDDEN_COSINE = 0.0
 GRAZING_COSINE = 0.2
 """Of the angle between a triangle and the camera that it faces most: below the first, not even hair
 stands in an outline; below the second, the triangle is hidden; below the third, it fills little of
-any image. In many cameras' outlines, the last two are seen well enough."""
+any image. Many cameras' outlines tell shapes well enough."""
 OUTLINE_VIEWS = 16
 OUTLINE_COSINE = 0.2
 """Views whose outlines are measured, spread over all; the largest cosine of the angle between a
@@ -159,12 +159,6 @@ class Surface:
     def has_few_cameras(self) -> bool:
         cameras = {view.camera_index for view in self.capture.views["train"]}
         return len(cameras) <= FEW_CAMERAS
-
-    @property
-    def grazing_cosine(self) -> float:
-        """Of the angle between a triangle and the camera that it faces most, below which views tell
-        little of it."""
-        return GRAZING_COSINE if self.has_few_cameras else UNSEEN_COSINE
 
     @cached_property
     def turned_away(self) -> np.ndarray:

@@ -244,6 +244,16 @@ def flattened(
     return turned.astype(np.float32), scale.astype(np.float32)
 
 
+def above_unseen_hair(frames: FrameStore, splats: Splats) -> np.ndarray:
+    """(N,) bool: unbound splats that stand over hidden hair's layer. Masks do not end the hull
+    behind a head, where it hangs in the air for all cameras that nobody has put there."""
+    surface = frames.surface
+    top = (surface.hair_height + frames.voxel) / frames.unit_lengths
+    height = splats.xyz[:, NORMAL_AXIS[frames.convention]]
+    is_hair = surface.hidden & (surface.hair_height > 0)
+    return np.asarray(splats.unbound & is_hair[splats.face] & (height > top[splats.face]))
+
+
 def hidden_splats(frames: FrameStore, settings: TrainingSettings) -> Splats:
     """A dense opaque layer on the `closed` triangles, in which no view splits splats: on skin and
     clothes, or where the outer layer of hair is."""

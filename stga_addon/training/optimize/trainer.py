@@ -23,7 +23,7 @@ from .make_backend import make_backend
 from .outlines import OutlinePruning
 from .state import TrainState, new_state, with_offsets
 from .strays import StrayReset
-from .surface_prior import SurfacePrior, hidden_splats, splats_behind
+from .surface_prior import SurfacePrior, above_unseen_hair, hidden_splats, splats_behind
 from .unseen_sides import plausible_aside
 
 EXTEND_LOCAL_SHARE = 0.5
@@ -255,13 +255,14 @@ def _placed_splats(frames: FrameStore, settings: TrainingSettings) -> tuple[Trai
     capture = frames.capture
     triangles = len(capture.faces)
     splats = initial_splats(capture, settings)
-    closed = ~splats.unbound & frames.surface.closed[splats.face]
+    replaced = ~splats.unbound & frames.surface.closed[splats.face]
+    replaced |= above_unseen_hair(frames, splats)
     layer = hidden_splats(frames, settings)
     color = np.zeros((triangles, 3), np.float32)
     bound = ~splats.unbound
     color[splats.face[bound]] = splats.sh[bound, 0]
     layer.sh[:, 0] = color[layer.face]
-    splats = splats.rows(~closed)
+    splats = splats.rows(~replaced)
     orders = settings.lattice_order, settings.first_lattice_order
     whole, first = (splats_per_triangle(order(triangles)) for order in orders)
     lattice = int((~splats.unbound).sum())

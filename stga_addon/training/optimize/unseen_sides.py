@@ -21,7 +21,7 @@ from .likeness import (
     sources_around_head,
     teeth_of,
 )
-from .surface import FACING_TIMESTEPS, UNSEEN_COSINE, Surface
+from .surface import FACING_TIMESTEPS, GRAZING_COSINE, UNSEEN_COSINE, Surface
 
 SPREAD_VIEWS = 12
 OPEN_VIEWS = 6
@@ -86,7 +86,7 @@ def unseen_sides(surface: Surface) -> UnseenSides:
     if not len(sources):
         none = np.zeros_like(shown)
         return UnseenSides(none, shown, color, none, none.astype(float), color)
-    unseen = is_outside & (cosine < surface.grazing_cosine)
+    unseen = is_outside & (cosine < GRAZING_COSINE)
     found = color.copy()
     centers = np.asarray(capture.neutral)[capture.faces].mean(1)
     part = connected_parts(len(capture.neutral), capture.faces)[capture.faces[:, 0]]
