@@ -12,6 +12,8 @@ from ..capture.mesh_geometry import connected_parts
 from .quaternions import unit
 from .teeth import TEMPLATE_VERTICES, holes_of, mouth_rings
 
+EYEBALL_VERTICES = 546
+"""Of each eyeball of FLAME's, the left one's before the right one's."""
 EYE_REGION_RADII = 2.0
 """How far from the middle of an eyeball the region of the eye reaches, in its radius."""
 LIP_HEIGHT_SHARE = 0.18
@@ -29,16 +31,16 @@ NECK_TILT = np.radians(29.3)
 
 def found_masks(vertices: np.ndarray, faces: np.ndarray) -> dict[str, np.ndarray]:
     """Masks of eyeballs, the regions around them, lips and nose of FLAME's mesh, with or without
-    parts, posed and placed as it may be; none of a mesh without two eyeballs of one size, the left
-    one first, as FLAME's has. Raises StgaError for a mesh without an open mouth."""
+    parts, posed and placed as it may be; none of a mesh without its two eyeballs. Raises StgaError
+    for a mesh without an open mouth."""
     faces = faces[(faces < TEMPLATE_VERTICES).all(axis=1)]
     part = connected_parts(TEMPLATE_VERTICES, faces)
     sizes = np.bincount(part)
-    largest, *others = np.argsort(-sizes, kind="stable")[:3]
-    if len(others) < 2 or sizes[others[0]] != sizes[others[1]]:
+    balls = np.flatnonzero(sizes == EYEBALL_VERTICES)
+    if len(balls) != 2:
         return {}
-    skin = part == largest
-    left, right = (np.flatnonzero(part == number) for number in sorted(others))
+    skin = part == sizes.argmax()
+    left, right = (np.flatnonzero(part == number) for number in balls)
     at = _upright(vertices[:TEMPLATE_VERTICES], faces, left, right)
     _, lips = mouth_rings(at, faces)
     width = np.ptp(at[lips, 0])
@@ -84,6 +86,8 @@ def _on_nose(at: np.ndarray, skin: np.ndarray, around: Sequence[np.ndarray]) -> 
     middle = skin & (abs(at[:, 0] - between[0]) < MIDDLE_SHARE * (left - right)[0])
     below = between[1] - at[:, 1]
     ridge = at[middle & (below > 0) & (below < height)]
+    if not len(ridge):
+        return np.zeros(len(at), bool)
     tip = ridge[ridge[:, 2].argmax()]
     root = ridge[ridge[:, 1].argmax()]
     line = np.linspace(tip, root, RIDGE_POINTS)

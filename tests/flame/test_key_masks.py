@@ -52,6 +52,8 @@ def test_eyeballs_are_the_mesh_s_own(shared_data):
     assert [len(masks[f"{side}_eyeball"]) for side in ("left", "right")] == [546, 546]
     without = ~np.isin(model.faces, masks["left_eyeball"]).any(1)
     assert not found_masks(model.v_template, model.faces[without])
+    flat = np.zeros_like(model.v_template)  # of FLAME's triangles, but no head
+    assert not any(region.any() for region in found_regions(flat, model.faces).values())
 
 
 def test_heads_look_ahead_however_much_of_a_mouth_is_known(shared_data):
