@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ...avatar.embedding import face_frames
+from ...avatar.embedding import face_areas, face_frames
 from ...avatar.lattice import NORMAL_AXIS
 from ...capture.mesh_geometry import vertex_normals
 from ...capture.model import Capture
@@ -26,7 +26,9 @@ FACE_ANGLE_DEG = 45.0
 """Of the angle between a triangle and the camera that it faces most, below which it has a layer
 behind it; from straight ahead, beyond which there is no face, seen from the middle of the head."""
 CELL_VOXELS = 2
-"""Behind how large a part of the head one splat is enough."""
+MAX_TRIANGLE_VOXELS = 5
+"""Behind how large a part of the head one splat is enough; the side of a triangle from which on it
+has none, because it would stand out of masks beside the triangle."""
 DEPTH_VOXELS = 0.5
 MAX_DEPTHS = 10
 MARGIN_SHARE = 0.015
@@ -80,7 +82,9 @@ def backing_of(surface: Surface, sides: UnseenSides) -> Backing:
         around = nearest_rows(centers[skin], centers[skin], SOURCE_TRIANGLES)
         color[skin] = np.median(color[skin][around], axis=1)
     places = np.where(of_back[:, None], back, behind)
-    return Backing(grazed | front, places, color)
+    size = np.sqrt(2 * face_areas(places, faces))
+    is_small = size < MAX_TRIANGLE_VOXELS * voxel_size(neutral)
+    return Backing((grazed | front) & is_small, places, color)
 
 
 def _behind_sides(
