@@ -423,8 +423,8 @@ def with_torso(capture, width=0.2, height=0.4):
 
 def test_a_torso_has_a_back(bundled, tmp_path):
     """Catches a torso through which, from behind, one sees its front from inside; a back that
-    shows beside the masks, or is of splats as large as its triangles; one below a bust; and small
-    splats at a torso's edge."""
+    shows beside the masks, as large splats do; one below a bust; and small splats at a torso's
+    edge."""
     capture = with_torso(bundled)
     assert not Surface(capture).border.any()
     centers, level = middles(capture)
@@ -432,8 +432,7 @@ def test_a_torso_has_a_back(bundled, tmp_path):
     color[(np.abs(centers[:, 0]) < 0.03) & (level < -2.2)] = TIE
     capture = filmed(capture, color, (-20, 0, 20), 0.0, tmp_path, away=2.5)
     layer, frames = behind(capture)
-    assert beside_masks(capture, layer, frames) < 0.1
-    assert (np.exp(layer.log_scale).max(1) * frames.scale[layer.face]).max() < 0.014
+    assert beside_masks(capture, layer, frames) < 0.03
     camera = look_at([0, -0.2, -2], [0, -0.2, 0], 160, 200, 480)
     triangle, _ = rasterize(capture.neutral, capture.faces, camera)
     inner = (level < -4) & (level > -6) & (np.abs(centers[:, 0]) < 0.08)

@@ -26,15 +26,15 @@ FACE_ANGLE_DEG = 45.0
 """Of the angle between a triangle and the camera that it faces most, below which it has a layer
 behind it; from straight ahead, beyond which there is no face, seen from the middle of the head."""
 CELL_VOXELS = 2
-MAX_TRIANGLE_VOXELS = 5
-"""Behind how large a part of the head one splat is enough; the side of a triangle from which on it
-has none, because it would stand out of masks beside the triangle."""
+"""Behind how large a part of the head one splat is enough."""
 DEPTH_VOXELS = 0.5
 MAX_DEPTHS = 10
 MARGIN_SHARE = 0.015
 BACK_MARGIN_SHARE = 0.03
+SPLAT_REACH = 1.8
 """Step of the depths at which the layer may lie, and how many are tried: the first that is within
-the masks, with a margin as a share of their height; of a back, whose triangles are large."""
+the masks, with a margin as a share of their height; of a back, whose triangles are large; how far
+the splats of these reach, three standard deviations, in the side of a square as large as two triangles."""
 BEHIND_DEG = (-30.0, 0.0, 30.0)
 """Directions from behind from which the inner side of a torso's front may show."""
 BACK_SHARE = 0.5
@@ -82,9 +82,7 @@ def backing_of(surface: Surface, sides: UnseenSides) -> Backing:
         around = nearest_rows(centers[skin], centers[skin], SOURCE_TRIANGLES)
         color[skin] = np.median(color[skin][around], axis=1)
     places = np.where(of_back[:, None], back, behind)
-    size = np.sqrt(2 * face_areas(places, faces))
-    is_small = size < MAX_TRIANGLE_VOXELS * voxel_size(neutral)
-    return Backing((grazed | front) & is_small, places, color)
+    return Backing(grazed | front, places, color)
 
 
 def _behind_sides(
@@ -146,9 +144,16 @@ def _back(
     places, usual = _round_back(surface.capture, at, front, color)
     rows = np.flatnonzero(front)
     turned = face_frames(neutral, faces, neutral, "stga").rotation[rows]
-    away = (places - neutral)[faces[rows]].mean(1)
-    offsets = np.einsum("nji,nj->ni", turned, away)[:, None]
-    fits = ~surface.beside_masks(rows, offsets, -BACK_MARGIN_SHARE)[:, 0]
+    there = face_frames(places, faces, places, "stga")
+    plane = np.delete(there.rotation[rows], NORMAL_AXIS["stga"], axis=2).swapaxes(1, 2)
+    size = np.sqrt(2 * face_areas(places, faces[rows]))[:, None, None]
+    reach = SPLAT_REACH * size * np.concatenate([plane, -plane], axis=1)
+    center = there.origin[rows, None]
+    points = np.concatenate([center, center + reach], axis=1)
+    away = points - neutral[faces[rows]].mean(1, keepdims=True)
+    offsets = np.einsum("nji,nkj->nki", turned, away)
+    fits = ~surface.beside_masks(rows, offsets[:, :1], -BACK_MARGIN_SHARE)[:, 0]
+    fits &= ~surface.beside_masks(rows, offsets[:, 1:]).any(1)
     front[rows] = fits
     return front, places, usual[fits]
 
