@@ -34,7 +34,7 @@ BACK_MARGIN_SHARE = 0.03
 SPLAT_REACH = 1.8
 """Step of the depths at which the layer may lie, and how many are tried: the first that is within
 the masks, with a margin as a share of their height; of a back, whose triangles are large; how far
-the splats of these reach, three standard deviations, in the side of a square as large as two triangles."""
+the splats of these reach, three standard deviations, in the side of a square of two triangles."""
 BEHIND_DEG = (-30.0, 0.0, 30.0)
 """Directions from behind from which the inner side of a torso's front may show."""
 BACK_SHARE = 0.5
