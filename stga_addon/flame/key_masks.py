@@ -6,14 +6,13 @@ They stand in for those of FLAME_masks.pkl, which not everyone has, under the sa
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.spatial import cKDTree
 
-from ..capture.mesh_geometry import connected_parts
 from .quaternions import unit
 from .teeth import TEMPLATE_VERTICES, holes_of, mouth_rings
 
-EYEBALL_VERTICES = 546
-"""Of each eyeball of FLAME's, the left one's before the right one's."""
+EYEBALLS = (3931, 4477, TEMPLATE_VERTICES)
+"""Index layout: the first vertices of FLAME's left eyeball, after the skin, and of its right one,
+and the end of that."""
 EYE_REGION_RADII = 2.0
 """How far from the middle of an eyeball the region of the eye reaches, in its radius."""
 LIP_HEIGHT_SHARE = 0.18
@@ -34,13 +33,12 @@ def found_masks(vertices: np.ndarray, faces: np.ndarray) -> dict[str, np.ndarray
     parts, posed and placed as it may be; none of a mesh without its two eyeballs. Raises StgaError
     for a mesh without an open mouth."""
     faces = faces[(faces < TEMPLATE_VERTICES).all(axis=1)]
-    part = connected_parts(TEMPLATE_VERTICES, faces)
-    sizes = np.bincount(part)
-    balls = np.flatnonzero(sizes == EYEBALL_VERTICES)
-    if len(balls) != 2:
+    part = np.searchsorted(EYEBALLS, np.arange(TEMPLATE_VERTICES), side="right")
+    corners = part[faces]
+    if (corners.min(1) != corners.max(1)).any() or len(np.unique(corners)) < len(EYEBALLS):
         return {}
-    skin = part == sizes.argmax()
-    left, right = (np.flatnonzero(part == number) for number in balls)
+    skin = part == 0
+    left, right = (np.flatnonzero(part == number) for number in (1, 2))
     at = _upright(vertices[:TEMPLATE_VERTICES], faces, left, right)
     _, lips = mouth_rings(at, faces)
     width = np.ptp(at[lips, 0])
@@ -96,4 +94,4 @@ def _on_nose(at: np.ndarray, skin: np.ndarray, around: Sequence[np.ndarray]) -> 
 
 def _distance(at: np.ndarray, points: np.ndarray) -> np.ndarray:
     """(V,) of vertices (V, 3) from the nearest of the points."""
-    return np.asarray(cKDTree(points).query(at)[0])
+    return np.asarray(np.linalg.norm(at[:, None] - points, axis=2).min(1))

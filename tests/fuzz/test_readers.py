@@ -45,7 +45,7 @@ from stga_addon.training.run import checkpoint as checkpoints
 from .damages import damage_content
 from .readers import TARGETS
 
-MAX_READ_S = 2.0
+MAX_READ_S = 10.0
 MAX_READ_BYTES = 200e6
 GIGA = 10**9
 """As many values as a malformed file says it holds."""
