@@ -13,7 +13,7 @@ MAX_ITERATIONS = 100
 MIN_RESIDUAL = 1e-7  # Share of the mesh's size below which residuals are rounding
 CHUNK_PIXELS = 1 << 21  # Candidate pixels that are tested at a time, to bound the memory
 LIPS_AHEAD = np.radians(12.4)
-"""Angle between straight down and where the lips are, seen from between the eyes."""
+"""Radians between straight down and where the lips are, seen from between the eyes."""
 MIN_EYE_HEIGHT_SHARE = 0.1  # Of the eyes' distance from each other, over the mouth
 MIN_DEPTH_M = 0.01  # Triangles nearer to the camera's plane, or behind it, are not drawn
 
@@ -298,7 +298,7 @@ def head_axes(
     height = float(np.linalg.norm(up))
     if not height > MIN_EYE_HEIGHT_SHARE * np.linalg.norm(left - right):
         return None
-    # how far in a mouth is known differs from head to head: its front half is of all
+    # The inside of the mouth is in some heads' regions only; lips are in the front half of all.
     depth = centers[found[2]] @ np.cross(across, up)
     lips = centers[found[2]][depth >= np.median(depth)].mean(0)
     up = eyes - lips

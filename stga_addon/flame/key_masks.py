@@ -25,7 +25,7 @@ MIDDLE_SHARE = 0.1
 RIDGE_POINTS = 9
 """Of a nose, from the tip to between the eyes."""
 NECK_TILT = np.radians(29.3)
-"""By which the eyes lie ahead, seen from the end of FLAME's neck."""
+"""Radians between straight up and where the eyes are, seen from the end of FLAME's neck."""
 
 
 def found_masks(vertices: np.ndarray, faces: np.ndarray) -> dict[str, np.ndarray]:
@@ -63,8 +63,8 @@ def _upright(at: np.ndarray, faces: np.ndarray, left: np.ndarray, right: np.ndar
     across = unit(at[left].mean(0) - at[right].mean(0))
     along = eyes - neck
     along = unit(along - (along @ across) * across)
-    before = np.cross(across, along)
-    up = np.cos(NECK_TILT) * along - np.sin(NECK_TILT) * before
+    forward = np.cross(across, along)
+    up = np.cos(NECK_TILT) * along - np.sin(NECK_TILT) * forward
     return np.asarray((at - eyes) @ np.stack([across, up, np.cross(across, up)]).T)
 
 

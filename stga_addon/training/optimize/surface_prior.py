@@ -245,8 +245,8 @@ def flattened(
 
 
 def above_unseen_hair(frames: FrameStore, splats: Splats) -> np.ndarray:
-    """(N,) bool: unbound splats that stand over hidden hair's layer. Masks do not end the hull
-    behind a head, where it hangs in the air for all cameras that nobody has put there."""
+    """(N,) bool: unbound splats that stand higher than hair which faces no camera. Masks from
+    in front do not end the hull behind a head: what stands there hangs in the air from aside."""
     surface = frames.surface
     top = (surface.hair_height + frames.voxel) / frames.unit_lengths
     height = splats.xyz[:, NORMAL_AXIS[frames.convention]]
