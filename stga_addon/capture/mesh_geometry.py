@@ -208,25 +208,25 @@ def rasterize(vertices: np.ndarray, faces: np.ndarray, camera: Camera) -> ArrayP
 
 
 def silhouette(vertices: np.ndarray, faces: np.ndarray, camera: Camera) -> np.ndarray:
-    """(H, W) bool: the pixels that a mesh covers; faster than `rasterize`."""
-    pixels, depth = camera.project(vertices)
+    """(H, W) bool: the pixels whose centers a mesh covers, as those of `rasterize`, in a fraction
+    of its time. Triangles that reach near the camera's plane are left out."""
+    flat, depth = camera.project(vertices)
     drawn = faces[(depth > MIN_DEPTH_M)[faces].all(1)]
-    return painted("1", camera, pixels[drawn], [1] * len(drawn))
-
-
-def painted(
-    mode: str, camera: Camera, pixels: np.ndarray, values: Sequence[int], empty: int = 0
-) -> np.ndarray:
-    """(H, W) in a mode of Pillow: triangles, at pixels (F, 3, 2), drawn whole one over the other,
-    each with its value."""
-    from PIL import Image, ImageDraw  # Blender lacks it, and needs `rasterize` alone
-
-    picture = Image.new(mode, (camera.width, camera.height), empty)
-    draw = ImageDraw.Draw(picture)
-    corners = (pixels - 0.5).reshape(-1, 6).tolist()  # Pillow's centers lie at whole numbers
-    for polygon, value in zip(corners, values, strict=True):
-        draw.polygon(polygon, fill=value)
-    return np.asarray(picture)
+    corners = flat[drawn]
+    high = corners[..., 1].max(1)
+    face, line = _counted(
+        np.arange(len(corners)), *_whole(corners[..., 1].min(1), high, camera.height)
+    )
+    first, count = _whole(*_crossings(corners, face, line + 0.5), camera.width)
+    # where triangles begin along a line of the image, and behind their ends
+    stride = camera.width + 1
+    size = camera.height * stride
+    begin = line * stride + first
+    change = np.zeros(size + 1, np.int64)
+    np.add.at(change, begin, 1)
+    np.subtract.at(change, begin + count, 1)
+    covered = np.cumsum(change[:size].reshape(camera.height, stride), axis=1) > 0
+    return covered[:, :-1]
 
 
 def _whole(low: np.ndarray, high: np.ndarray, size: int) -> ArrayPair:

@@ -13,7 +13,12 @@ from refusal import refusal
 from scipy.spatial.transform import Rotation
 
 from stga_addon.capture.camera import look_at
-from stga_addon.capture.mesh_geometry import rasterize, weighted_procrustes, without_head_motion
+from stga_addon.capture.mesh_geometry import (
+    rasterize,
+    silhouette,
+    weighted_procrustes,
+    without_head_motion,
+)
 from stga_addon.capture.meshes import (
     CACHE_BYTES,
     cached_meshes,
@@ -241,8 +246,8 @@ def by_equations(vertices, faces, camera):
 
 def test_every_pixel_shows_the_nearest_triangle():
     """Catches a triangle that is farther, a gap between neighbors, lines cut off at the image's
-    edge, and barycentric coordinates of another corner; triangles are from a tenth of a pixel to
-    larger than the image."""
+    edge, barycentric coordinates of another corner, and a silhouette of other pixels; triangles are
+    from a tenth of a pixel to larger than the image."""
     rng = default_rng(0)
     camera = replace(look_at((0.2, 0.1, 2.0), (0, 0, 0), 37, 29, 40.0), cx=17.0, cy=15.5)
     sizes = np.repeat([0.005, 0.05, 0.3, 3.0], [150, 60, 30, 8])
@@ -257,6 +262,7 @@ def test_every_pixel_shows_the_nearest_triangle():
     assert (expected >= 0).mean() > 0.4
     assert_array_equal(triangle, expected)
     assert_allclose(weights, expected_weights, atol=1e-7)
+    assert_array_equal(silhouette(vertices, faces[in_front], camera), expected >= 0)
 
 
 def test_a_closed_mesh_has_no_holes():

@@ -10,7 +10,7 @@ from ...avatar.embedding import face_frames
 from ...avatar.offsets import SIGNALS
 from ...avatar.strain import strain_basis, trained_range
 from ...capture.images import WHITE_LEVEL, read_view
-from ...capture.mesh_geometry import MIN_DEPTH_M, facing, painted, triangle_normals
+from ...capture.mesh_geometry import facing, rasterize, triangle_normals
 from ...capture.model import Capture, View, evenly_spread
 from ...flame.quaternions import unit
 
@@ -127,11 +127,7 @@ def _sample_view(capture: Capture, view: View, faces: np.ndarray) -> dict[str, n
     depths = depth[capture.faces].mean(1)
     places = mesh[capture.faces]
     towards = facing(camera, places.mean(1), unit(triangle_normals(places), 1e-20))
-    drawn = (towards > 0) & (depth[capture.faces] > MIN_DEPTH_M).all(1)
-    far_first = np.flatnonzero(drawn)[np.argsort(-depths[drawn], kind="stable")]
-    # by the painter's algorithm
-    shown = corners[capture.faces[far_first]]
-    nearest = painted("I", camera, shown, far_first.tolist(), empty=-1)
+    nearest, _ = rasterize(mesh, capture.faces, camera)
     triangles = corners[capture.faces[faces]]
     center = triangles.mean(1)
     x, y = np.round(center - 0.5).astype(int).T

@@ -18,7 +18,7 @@ from ...avatar.file import Avatar
 from ...avatar.splats import SH_C0, Splats
 from ...capture.images import read_image, read_mask, read_view
 from ...capture.loader import Preparation
-from ...capture.mesh_geometry import MIN_DEPTH_M, painted
+from ...capture.mesh_geometry import rasterize
 from ...capture.model import Capture, View, ViewExposure, evenly_spread
 from ...raster.cpu.layout import Parameters
 from ...raster.cpu.rasterize import BufferPool, frames_in_camera, render_backward, render_forward
@@ -105,12 +105,8 @@ def read_evaluation_view(
 
 def visible_pixels(capture: Capture, view: View, faces: np.ndarray) -> np.ndarray:
     """(H, W) bool: pixels at which the nearest triangle is one of `faces` (F,) bool."""
-    corners, depth = view.camera.project(np.asarray(capture.mesh(view.timestep)))
-    rows = np.flatnonzero((depth > MIN_DEPTH_M)[capture.faces].all(1))
-    # painter's algorithm: far to near
-    rows = rows[np.argsort(-depth[capture.faces[rows]].mean(1), kind="stable")]
-    shown = corners[capture.faces[rows]]
-    return painted("1", view.camera, shown, faces[rows].astype(int).tolist())
+    triangle, _ = rasterize(np.asarray(capture.mesh(view.timestep)), capture.faces, view.camera)
+    return (triangle >= 0) & faces[triangle]
 
 
 def known_exposure(rows: Sequence[Sequence[float]], training_views: Iterable[View]) -> ViewExposure:
