@@ -24,6 +24,7 @@ from ..flame.sequence import (
     read_identity,
     read_motion,
     sequence_mesh,
+    with_identity,
 )
 from . import meshes
 from .distortion import distortion
@@ -415,14 +416,15 @@ def sequence_capture(
 
 def _posed(root: Path, sequence: FlameSequence) -> dict[str, Any]:
     """The fields of a capture that depend on its motion."""
+    person = with_identity(sequence)
 
     def mesh(timestep: int) -> np.ndarray:
-        vertices = sequence_mesh(sequence, timestep)
+        vertices = sequence_mesh(person, timestep)
         return meshes.check_extent(f"{root}: timestep {timestep}", vertices)
 
     return {
         "mesh": meshes.cached_meshes(mesh, len(sequence.model.v_template)),
-        "expression_mesh": partial(expression_mesh, sequence),
+        "expression_mesh": partial(expression_mesh, person),
         "flame": sequence,
     }
 

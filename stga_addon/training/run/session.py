@@ -170,7 +170,7 @@ class _Addition(NamedTuple):
 class _Session:
     """A run that trains.
 
-    strain_range  (F, 2, 3) `Avatar.strain_range`; with refined tracking that of the last evaluation
+    strain_range  (F, 2, 6) `Avatar.strain_range`; with refined tracking that of the meshes of now
     elapsed_s     seconds of training so far, evaluation not counted
     losses        of the last global iterations
     began         the clock at which the run would have begun, had it never been interrupted
@@ -476,10 +476,7 @@ class _Session:
         sets_aside: after the one before was."""
         begin = perf_counter()
         share = min(1.0, self._spent().share)
-        limits = None
-        if self.trainer.tracking is not None:
-            self._measure_refined_strain()
-            limits = self.strain_range
+        limits = self._strain_limits() if self.trainer.tracking is not None else None
         with self.trainer.frames.strain_within(limits):
             render = partial(self.trainer.render, progress=share)
             quality, is_kept = self.evaluator.evaluate(render, perceptual)
@@ -555,15 +552,15 @@ class _Session:
         return self.report(Progress(share, stage, evaluator.forecast_text, known, preview))
 
     def _avatar(self) -> Avatar:
-        if self.strain_range is None:
-            self._measure_refined_strain()
-        return self.trainer.avatar(self.run.principal_point, self.strain_range)
+        return self.trainer.avatar(self.run.principal_point, self._strain_limits())
 
-    def _measure_refined_strain(self) -> None:
-        """Of the training timesteps, whose meshes refined tracking has moved."""
-        if self.run.settings.follows_strain:
+    def _strain_limits(self) -> np.ndarray | None:
+        """`strain_range`, measured anew where refined tracking has moved the training timesteps'
+        meshes."""
+        if self.strain_range is None and self.run.settings.follows_strain:
             mesh = self.trainer.frames.mesh
             self.strain_range = checkpoints.trained_strain_range(self.capture, mesh, None)
+        return self.strain_range
 
     def _require_folder(self) -> None:
         """Raise StgaError where the folder was moved: writing would make it anew."""
