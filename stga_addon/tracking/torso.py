@@ -106,7 +106,7 @@ def follow_torso(
     seen = torso_take.seen_points(take, middle)
     if sum(map(len, seen.rows.values())) < MIN_POINTS:
         return FollowedTorso(fit, unchanged)
-    walk = torso_take.BothWays(crew, Stage.TORSO, len(some) + 2 * len(unchanged))
+    walk = torso_take.BothWays(crew, Stage.TORSO, 3 * len(some) + len(unchanged))
     motions = _motions(take, seen, some, walk)
     deep = torso_take.at_depth(take, seen, motions)
     found = torso_take.compared(take, deep, motions, some)
@@ -119,12 +119,13 @@ def follow_torso(
     if motion == "head":
         return FollowedTorso(fit, unchanged, motion=decided)
     name = own if motion == "own" else motion
+    posed = _everywhere(take, name, deep[name], walk)
     points = TorsoPoints(middle, deep[name].at)
     bending = None
     if bends and name == "shifted":
         walk = torso_take.BothWays(crew, Stage.CLOTH, len(unchanged))
-        bending = found_bending(take, motions[name], points, some, walk)
-    return replace(_followed(fit, take, motions[name], bending, decided), points=points)
+        bending = found_bending(take, posed, points, some, walk)
+    return replace(_followed(fit, take, posed, bending, decided), points=points)
 
 
 def _followed(
@@ -156,19 +157,32 @@ def _followed(
 def _motions(
     take: TorsoTake, seen: torso_take.SeenPoints, some: Sequence[int], walk: torso_take.BothWays
 ) -> dict[str, Motion]:
-    """The motions that a torso may have; some: first followed to find the points' depth."""
+    """The motions that a torso may have, at some timesteps and that of the points; followed first
+    to find the points' depth."""
     seen = torso_take.at_depth(take, seen, {})["stereo"]
     (rough,) = _poses(walk, [_Follower(take, seen, False)], some)
     seen = torso_take.at_depth(take, seen, {"own": take.motion(rough, rigid=False)})["own"]
     both = [_Follower(take, seen, shifts) for shifts in (False, True)]
-    turned, shifted = _poses(walk, both, take.parameters)
-    still = dict.fromkeys(take.parameters, turned[seen.timestep])
+    turned, shifted = _poses(walk, both, some)
+    still = dict.fromkeys(turned, take.straight(seen.timestep))
     return {
-        "head": {t: PosedTorso(values) for t, values in take.parameters.items()},
+        "head": {t: PosedTorso(take.parameters[t]) for t in turned},
         "still": take.motion(still, rigid=False),
         "turned": take.motion(turned, rigid=False),
         "shifted": take.motion(shifted, rigid=True),
     }
+
+
+def _everywhere(
+    take: TorsoTake, name: str, seen: torso_take.SeenPoints, walk: torso_take.BothWays
+) -> Motion:
+    """The motion that was chosen, at all timesteps."""
+    if name == "still":
+        still = dict.fromkeys(take.parameters, take.straight(seen.timestep))
+        return take.motion(still, rigid=False)
+    shifts = name == "shifted"
+    (poses,) = _poses(walk, [_Follower(take, seen, shifts)], take.parameters)
+    return take.motion(poses, rigid=shifts)
 
 
 def _poses(
@@ -187,7 +201,7 @@ class _Follower:
         self._take = take
         self.seen = seen
         self._shifts = shifts
-        self._first = TorsoPose(head_turn(take.parameters[seen.timestep]), np.zeros(3))
+        self._first = take.straight(seen.timestep)
         first = take.with_torso(seen.timestep, self._first, shifts)
         self._carrier = torso_take.Carrier(take, first, seen.at)
 

@@ -39,7 +39,10 @@ CHANGE_OUTLIER_LEVELS = 5 * NOISE_LEVELS
 FLOW_MARGIN_PX = 32  # Around the sheet in the images of optical flow
 PIXEL_STEP = 6  # One of so many pixels is fitted
 MIN_GAIN = 0.05  # Share by which the misfit has to fall for the torso to bend
-STEPS = 4  # Gauss–Newton steps for each timestep
+MAX_STEPS = 4
+CONVERGED_STEP_M = 0.0004
+"""Gauss–Newton steps for each timestep; root mean square of a step after which there is none: such
+ones follow the noise of optical flow."""
 HELD = 1e10  # Precision that holds a vertex
 DEPTH_SIGMA_M = 0.02
 MIN_WEIGHT = 0.5
@@ -256,8 +259,11 @@ class _Cloth:
         """Offsets at the timesteps of a way, which begins with the first one, where they are 0."""
 
         def bent(_: TorsoShot, now: TorsoShot, bend: np.ndarray) -> np.ndarray:
-            for _step in range(STEPS):
-                bend = self._moved(now, bend)
+            for _step in range(MAX_STEPS):
+                last = bend
+                bend = self._moved(now, last)
+                if ((bend - last) ** 2).sum(1).mean() < CONVERGED_STEP_M**2:
+                    break
             return bend
 
         first = np.zeros_like(self._drape)

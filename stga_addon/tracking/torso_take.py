@@ -120,6 +120,10 @@ class TorsoTake:
         turned = with_root(parameters, pose.turn, neck - root)
         return PosedTorso(turned, pose.shift if rigid else None)
 
+    def straight(self, timestep: int) -> TorsoPose:
+        """The torso turned as the head is."""
+        return TorsoPose(head_turn(self.parameters[timestep]), np.zeros(3))
+
     def motion(self, poses: Mapping[int, TorsoPose], rigid: bool) -> Motion:
         """The torso posed at each timestep."""
         return {t: self.with_torso(t, pose, rigid) for t, pose in poses.items()}
