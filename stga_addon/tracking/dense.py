@@ -65,6 +65,10 @@ USUAL_QUANTILE = 0.2
 USUAL_FACTOR = 1.5
 """Other starts are tried where the first leaves a region of the face worse explained, by this
 factor, than it is at this share of the texture's timesteps."""
+CARRIED_STEPS = ((1, 3), (0, 1))
+CARRIED_FACTOR = 1.25
+"""A timestep between two is not solved where it is moved as they are, and no region is explained
+worse than theirs by this factor."""
 DAMPING = 1e-3
 CONVERGED_STEP_M = 1e-4  # Root mean square motion of points in a step, after which a level is done
 MAX_TURN = 0.3  # Of a joint in one step, in radians
@@ -194,16 +198,29 @@ def _started_part(fit: HeadFit, take: RecordedTake, texture: Texture, step: Step
 def _solved_part(
     fit: HeadFit, take: RecordedTake, texture: Texture, usual: np.ndarray, settled: bool, step: Step
 ) -> dict[str, np.ndarray]:
-    """The timesteps of a part, solved one from the other; by name, T of what `_Solved` has of
-    each."""
+    """The timesteps of a part, solved one from the other, every second one first; by name, T of
+    what `_Solved` has of each."""
     solver = _Solver(fit, take, texture, SETTLED_GAIN if settled else 0.0)
-    before: tuple[_Shot, _Solved] | None = None
-    solved: list[_Solved] = []
-    for timestep in sorted(take.landmarks, reverse=settled):
+    timesteps = sorted(take.landmarks, reverse=settled)
+
+    def solve(
+        timestep: int, before: tuple[_Shot, _Solved] | None, after: tuple[_Shot, _Solved] | None
+    ) -> tuple[_Shot, _Solved]:
         shot = solver.shot(timestep)
-        solved.append(solver.solve(shot, before, usual))
-        before = shot, solved[-1]
+        found = solver.carried(shot, before, after) if before and after else None
+        found = found or solver.solve(shot, before, usual)
         step()
+        return shot, found
+
+    before = solve(timesteps[0], None, None)
+    solved = [before[1]]
+    for first in range(1, len(timesteps), 2):
+        (timestep, *later) = timesteps[first : first + 2]
+        after = solve(later[0], before, None) if later else None
+        solved.append(solve(timestep, before, after)[1])
+        if after is not None:
+            solved.append(after[1])
+            before = after
     names = ("values", "matrix", "right", "misfit", "missed", "better")
     order = -1 if settled else 1
     return {name: np.stack([getattr(own, name) for own in solved[::order]]) for name in names}
@@ -270,6 +287,23 @@ class _Solver:
         missed = self._missed(shot.landmarks, best)
         misfit = self._evidence(shot, best, visible)
         return _Solved(best, visible, matrix, right, misfit.regions, missed, better)
+
+    def carried(
+        self, shot: _Shot, before: tuple[_Shot, _Solved], after: tuple[_Shot, _Solved]
+    ) -> _Solved | None:
+        """The start, moved as far as timesteps before and after it were moved; None where that
+        explains some region worse than they are explained, or no better than the start."""
+        moves = [own.values - near.start for near, own in (before, after)]
+        values = shot.start + np.mean(moves, axis=0)
+        visible = self.head.visibility(values, shot.views)
+        values = self._descended(shot, values, visible, CARRIED_STEPS)
+        misfit, old = (self._evidence(shot, own, visible) for own in (values, shot.start))
+        usual = np.maximum(before[1].misfit, after[1].misfit)
+        if not misfit.all < old.all or (misfit.regions > CARRIED_FACTOR * usual).any():
+            return None
+        matrix, right, _ = self._terms(shot, values, visible, 0)
+        missed = self._missed(shot.landmarks, values)
+        return _Solved(values, visible, matrix, right, misfit.regions, missed, True)
 
     def _evidence(self, shot: _Shot, values: np.ndarray, visible: np.ndarray) -> Misfit:
         """How badly the points that are not fitted are explained."""

@@ -14,7 +14,15 @@ from ..flame.quaternions import unit
 from ..worker.helpers import Step
 from .head_model import HeadModel
 from .posed_points import PosedPoints, SurfacePoints, head_rotation, split
-from .solve import Observation, in_order, person, solve_identity, solve_take
+from .solve import (
+    ROUGH_TAKE_ITERATIONS,
+    TAKE_ITERATIONS,
+    Observation,
+    in_order,
+    person,
+    solve_identity,
+    solve_take,
+)
 
 Pictures = Sequence[tuple[Camera, np.ndarray]]
 """Cameras and their images (H, W, 3) or masks (H, W), uint8."""
@@ -238,6 +246,7 @@ def fit_head(head: HeadModel, recorded: RecordedTake, step: Step = lambda: None)
     ordered = True
     parameters: dict[int, np.ndarray] = {}
     for number in range(ROUNDS):
+        iterations = ROUGH_TAKE_ITERATIONS if number < ROUNDS - 1 else TAKE_ITERATIONS
         at = places.on(subject.model.v_template, subject.model.faces)
         found = {t: triangulated(seen[t], reliable, at, world.scale) for t in timesteps}
         observed = [observed_landmarks(found[t], world, reliable) for t in spread]
@@ -252,9 +261,9 @@ def fit_head(head: HeadModel, recorded: RecordedTake, step: Step = lambda: None)
         take_observed = [observed_landmarks(found[t], world, reliable) for t in timesteps]
         if not number:
             solved[:, -RIGID_SIZE:] = [rigid_start(at, own) for own in take_observed]
-            alone = solve_take(subject, places, take_observed, solved, ordered=False)
+            alone = solve_take(subject, places, take_observed, solved, False, iterations)
             ordered = in_order(subject, places, take_observed, alone)
-        solved = solve_take(subject, places, take_observed, solved, ordered)
+        solved = solve_take(subject, places, take_observed, solved, ordered, iterations)
         visibility = LandmarkVisibility(subject, places)
         parameters = dict(zip(timesteps, solved, strict=True))
         seen = {t: visibility.weighted(take[t], own, world) for t, own in parameters.items()}

@@ -41,6 +41,8 @@ MAX_ORDERED_CHANGE = 0.7
 between any two, up to which timesteps follow each other in time."""
 IDENTITY_ITERATIONS = 12
 TAKE_ITERATIONS = 8
+ROUGH_TAKE_ITERATIONS = 2
+"""Of a take whose identity is not yet known; it is solved again, from where that led."""
 CONVERGED_STEP = 1e-3
 """Largest change of a parameter (standard deviations, radians, meters) after which iterations
 stop."""
@@ -129,9 +131,10 @@ def solve_take(
     observations: Sequence[Observation],
     start: np.ndarray,
     ordered: bool,
+    iterations: int = TAKE_ITERATIONS,
 ) -> np.ndarray:
     """Expression and pose (T, E + 18) of consecutive timesteps of a person whose identity is in the
-    template.
+    template, after so many Gauss–Newton iterations at most.
 
     start (T, E + 18). ordered: second differences over time are penalized, but for jumps, such as
     cuts; else every timestep is solved for itself. Memory does not grow with the take beyond its
@@ -143,7 +146,7 @@ def solve_take(
         return normal_equations(points, values, observations[row])
 
     stiffness = acceleration_precision(head.model) if ordered else None
-    return _solve_windows(head, terms, unwound(start) if ordered else start, stiffness)
+    return _solve_windows(head, terms, unwound(start) if ordered else start, stiffness, iterations)
 
 
 def in_order(
@@ -237,7 +240,11 @@ def normal_equations(
 
 
 def _solve_windows(
-    head: HeadModel | None, terms: Terms, start: np.ndarray, stiffness: np.ndarray | None
+    head: HeadModel | None,
+    terms: Terms,
+    start: np.ndarray,
+    stiffness: np.ndarray | None,
+    iterations: int = TAKE_ITERATIONS,
 ) -> np.ndarray:
     """Parameters (T, P). head: whose prior they have; stiffness (P,): of second differences."""
     solved = start.copy()
@@ -247,7 +254,7 @@ def _solve_windows(
         state = solved[first:last].copy()
         blocks = np.zeros((len(state), size, size))
         right = np.zeros_like(state)
-        for _ in range(TAKE_ITERATIONS):
+        for _ in range(iterations):
             for number, values in enumerate(state):
                 blocks[number], right[number] = terms(first + number, values)
             if head is not None:

@@ -205,6 +205,35 @@ def test_a_jaw_that_landmarks_leave_too_little_open_is_opened():
 
 
 @pytest.mark.slow
+def test_a_timestep_is_moved_as_those_beside_it_unless_it_looks_otherwise(monkeypatch):
+    """Catches every timestep solved in full, where neighbors tell half of them; and a mouth that
+    stays closed because it is closed before and after."""
+    solve = dense._Solver.solve
+    solved = []
+
+    def counted(*arguments):
+        solved.append(arguments)
+        return solve(*arguments)
+
+    monkeypatch.setattr(dense._Solver, "solve", counted)
+    eyes = np.radians([-50, 0, 50])
+    errors = []
+    for openings in (np.linspace(0, 0.3, 7), [0, 0.4, 0, 0.4, 0, 0.4, 0]):
+        take = scene(eyes, openings, size=(150, 195))
+        first = fit_head(take.head, take.take)
+        solved.clear()
+        found = fit_dense(first, take.take, Crew(Helpers(1)))
+        errors.append((len(solved), jaw_errors(take, first), jaw_errors(take, found.fit)))
+    (count, before, after), (every, shut, opened) = errors
+    assert count == 4
+    assert before.max() > 6
+    assert after.max() < 2
+    assert every == 7
+    assert shut[1::2].min() > 8
+    assert opened.max() < 2
+
+
+@pytest.mark.slow
 def test_result_depends_on_neither_processes_nor_interruptions(tmp_path, monkeypatch):
     """Catches parts in another order, what one leaves behind, and a take that begins anew."""
     monkeypatch.setattr(dense, "PART_TIMESTEPS", 3)
