@@ -698,7 +698,7 @@ def _session(
     report: Report,
 ) -> _Session:
     settings = run.settings
-    if settings.follows_strain:
+    if settings.follows_strain and not settings.tracking:
         report(Progress(stage="Measuring strain"))
     strain_range = checkpoints.strain_range_of(folder, capture, run)
     trainer = Trainer(capture, settings, selection, Start(state, strain_range), run.device)
