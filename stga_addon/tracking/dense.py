@@ -67,8 +67,8 @@ USUAL_FACTOR = 1.5
 factor, than it is at this share of the texture's timesteps."""
 CARRIED_STEPS = ((1, 3), (0, 1))
 CARRIED_FACTOR = 1.25
-"""A timestep between two is not solved where it is moved as they are, and no region is explained
-worse than theirs by this factor."""
+"""The same for a timestep that is moved as those beside it; which is enough where it leaves no
+region worse explained than theirs, by this factor."""
 DAMPING = 1e-3
 CONVERGED_STEP_M = 1e-4  # Root mean square motion of points in a step, after which a level is done
 MAX_TURN = 0.3  # Of a joint in one step, in radians
@@ -291,8 +291,9 @@ class _Solver:
     def carried(
         self, shot: _Shot, before: tuple[_Shot, _Solved], after: tuple[_Shot, _Solved]
     ) -> _Solved | None:
-        """The start, moved as far as timesteps before and after it were moved; None where that
-        explains some region worse than they are explained, or no better than the start."""
+        """The start, moved as timesteps before and after it were moved from theirs, and a few steps
+        on; None where that explains some region worse than they are explained, or all no better
+        than the start."""
         moves = [own.values - near.start for near, own in (before, after)]
         values = shot.start + np.mean(moves, axis=0)
         visible = self.head.visibility(values, shot.views)
