@@ -60,15 +60,15 @@ LAST_STEPS = ((1, 12), (0, 4))
 LAST_ROUNDS = 2
 """The same for its result where other points are visible than at the start, as in a mouth that
 opens."""
+CARRIED_STEPS = ((1, 3), (0, 1))
+CARRIED_FACTOR = 1.25
+"""The same for a timestep that is moved as those beside it; which is enough where it leaves no
+region worse explained than theirs, by this factor."""
 OPENINGS_M = 0.008, 0.016  # By which the chin is moved for further starts
 USUAL_QUANTILE = 0.2
 USUAL_FACTOR = 1.5
 """Other starts are tried where the first leaves a region of the face worse explained, by this
 factor, than it is at this share of the texture's timesteps."""
-CARRIED_STEPS = ((1, 3), (0, 1))
-CARRIED_FACTOR = 1.25
-"""The same for a timestep that is moved as those beside it; which is enough where it leaves no
-region worse explained than theirs, by this factor."""
 DAMPING = 1e-3
 CONVERGED_STEP_M = 1e-4  # Root mean square motion of points in a step, after which a level is done
 MAX_TURN = 0.3  # Of a joint in one step, in radians
