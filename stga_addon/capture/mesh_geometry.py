@@ -1,6 +1,6 @@
 """Triangle meshes: normals, parts, rigid alignment, and which triangle a camera's pixels show."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
