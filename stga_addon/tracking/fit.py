@@ -261,7 +261,9 @@ def fit_head(head: HeadModel, recorded: RecordedTake, step: Step = lambda: None)
         take_observed = [observed_landmarks(found[t], world, reliable) for t in timesteps]
         if not number:
             solved[:, -RIGID_SIZE:] = [rigid_start(at, own) for own in take_observed]
-            alone = solve_take(subject, places, take_observed, solved, False, iterations)
+            alone = solve_take(
+                subject, places, take_observed, solved, ordered=False, iterations=iterations
+            )
             ordered = in_order(subject, places, take_observed, alone)
         solved = solve_take(subject, places, take_observed, solved, ordered, iterations)
         visibility = LandmarkVisibility(subject, places)

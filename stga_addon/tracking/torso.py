@@ -157,8 +157,8 @@ def _followed(
 def _motions(
     take: TorsoTake, seen: torso_take.SeenPoints, some: Sequence[int], walk: torso_take.BothWays
 ) -> dict[str, Motion]:
-    """The motions that a torso may have, at some timesteps and that of the points; followed first
-    to find the points' depth."""
+    """The motions that a torso may have, at some timesteps and at that of the points, whose depth
+    one of them tells first."""
     seen = torso_take.at_depth(take, seen, {})["stereo"]
     (rough,) = _poses(walk, [_Follower(take, seen, False)], some)
     seen = torso_take.at_depth(take, seen, {"own": take.motion(rough, rigid=False)})["own"]

@@ -234,6 +234,22 @@ def test_a_timestep_is_moved_as_those_beside_it_unless_it_looks_otherwise(monkey
 
 
 @pytest.mark.slow
+def test_a_settled_timestep_is_moved_as_little_with_its_neighbors_as_alone(monkeypatch):
+    """Catches a surface that several cameras see given up where images hardly say more."""
+    kept = []
+
+    def noted(*arguments):
+        kept.append(carried(*arguments) is None)
+
+    carried = dense._Solver.carried
+    monkeypatch.setattr(dense._Solver, "carried", noted)
+    monkeypatch.setattr(dense, "SETTLED_GAIN", 1.0)
+    take = scene(np.radians([-50, 0, 50]), np.linspace(0, 0.3, 7), size=(115, 150))
+    fit_dense(fit_head(take.head, take.take), take.take, Crew(Helpers(1)), settled=True)
+    assert kept == [True] * 3
+
+
+@pytest.mark.slow
 def test_result_depends_on_neither_processes_nor_interruptions(tmp_path, monkeypatch):
     """Catches parts in another order, what one leaves behind, and a take that begins anew."""
     monkeypatch.setattr(dense, "PART_TIMESTEPS", 3)
