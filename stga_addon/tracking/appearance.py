@@ -46,6 +46,10 @@ FLOW_SHARE = 0.3
 FLOW_SCALE_PX = 2.0
 """Weight of a point's flow of 1 pixel, and the distance in pixels beyond which it is an outlier."""
 MIN_FLOW_SIDE_PX = 32  # Smaller images are too small for the patches of DIS
+FAR_WEIGHT = 1e-3
+MIN_NEIGHBORHOOD_PX = 2.0
+"""Weight of the wider neighborhood in a mean over two; standard deviation of the smaller one, in
+pixels of the image of the means."""
 MIN_OBSERVATIONS = 1.0  # Sum of its views' weights, below which a point's texture is not known
 
 
@@ -151,6 +155,45 @@ def box_of(where: np.ndarray, margin: int) -> tuple[slice, slice]:
         first = max(0, used[0] - margin) if len(used) else 0
         sides.append(slice(first, used[-1] + 1 + margin if len(used) else 0))
     return sides[0], sides[1]
+
+
+def mean_around(
+    image: np.ndarray, known: np.ndarray, deviations: Sequence[float], places: np.ndarray
+) -> np.ndarray:
+    """(N, 3) float32 mean of pixels that are known, (H, W) 0 or 1, around places (N, 2), rows and
+    columns; those far away where none is near.
+
+    deviations: standard deviations, in pixels, of the near and the far neighborhood.
+    """
+    import cv2
+
+    # wide neighborhoods need few pixels
+    scale = min(1.0, MIN_NEIGHBORHOOD_PX / deviations[0])
+    small = tuple(max(1, round(scale * side)) for side in image.shape[1::-1])
+    both = cv2.bitwise_and(image, image, mask=known), 255 * known
+    weighted, weight = (reduced(own, small) for own in both)
+    weighted = weighted.astype(np.float32)
+    weight = weight.astype(np.float32) / 255
+    total = np.zeros_like(weighted)
+    norm = np.full_like(weight, 1e-9)
+    for deviation, importance in zip(deviations, (1.0, FAR_WEIGHT), strict=True):
+        sigma = max(0.7, scale * deviation)
+        total += importance * cv2.GaussianBlur(weighted, (0, 0), sigma)
+        norm += importance * cv2.GaussianBlur(weight, (0, 0), sigma)
+    at = (places[:, ::-1] + 0.5) * (np.array(small) / image.shape[1::-1])
+    return sampled([total / norm[..., None]], at)[0]
+
+
+def reduced(image: np.ndarray, size: tuple[int, ...]) -> np.ndarray:
+    """The image's means over the areas of a smaller one's pixels; by halves, which is fast."""
+    import cv2
+
+    while not any(
+        side % 2 or side < 2 * s for side, s in zip(image.shape[1::-1], size, strict=True)
+    ):
+        half = image.shape[1] // 2, image.shape[0] // 2
+        image = cv2.resize(image, half, interpolation=cv2.INTER_AREA)
+    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA))
 
 
 def inside(camera: Camera, pixels: np.ndarray, depth: np.ndarray) -> np.ndarray:

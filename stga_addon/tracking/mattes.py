@@ -19,7 +19,7 @@ from scipy.ndimage import binary_fill_holes
 from ..capture.model import parts_of
 from ..files import read_json, write_json
 from ..worker.helpers import Step
-from .appearance import box_of, sampled
+from .appearance import box_of, mean_around, reduced
 from .face_networks import PersonNetwork
 from .folder import MATTES_FILE, mask_name
 from .footage.model import Footage, FootageCamera, write_png
@@ -34,7 +34,7 @@ SURE = 0.9
 UNLIKELY = 0.1
 MAX_CUT_SIDE_PX = 400
 """Of the images that GrabCut works on, whose time grows with the pixels; the band's is full."""
-CUT_ITERATIONS = 2
+CUT_ITERATIONS = 1
 CUT_MARGIN_SHARE = 0.04
 """Error of the network's outline, as a share of the head's size (root of its area in the image)."""
 HEAD_MARGIN_SHARE = 0.06
@@ -42,9 +42,6 @@ HEAD_MARGIN_SHARE = 0.06
 BAND_SHARE = 0.018  # Half of the soft band's width, as a share of the head's size
 NEIGHBORHOOD_SHARES = (0.03, 0.12)
 """Standard deviations of the neighborhoods that colors are means of, of the head's size."""
-FAR_WEIGHT = 0.02
-MIN_NEIGHBORHOOD_PX = 2.0
-"""Standard deviation of the smaller neighborhood, in pixels of the image of the means."""
 REACH_SHARE = 1.0  # From the head, of its size, that hair reaches; clothes reach farther, below
 SIMILAR_COLORS_LEVELS = 30.0
 """Difference of both sides' colors at which half of the coverage is a smooth edge's."""
@@ -131,7 +128,7 @@ def find_matte(image: np.ndarray, probability: np.ndarray, head: np.ndarray) -> 
     small = tuple(max(1, round(scale * side)) for side in whole)
     pixels = cv2.resize(image, small, interpolation=cv2.INTER_AREA)
     seeds = probability, head.astype(np.float32)
-    likely, heads = (_reduced(cv2, own, small) for own in seeds)
+    likely, heads = (reduced(own, small) for own in seeds)
     cut = _cut(cv2, pixels, likely, heads > 0.5, scale * size).astype(np.float32)
     person = cv2.resize(cut, whole, interpolation=cv2.INTER_LINEAR) > 0.5
     # coverage in a band along the person's outline, and what is near it
@@ -145,10 +142,11 @@ def find_matte(image: np.ndarray, probability: np.ndarray, head: np.ndarray) -> 
         return matte
     places = np.stack([own + side.start for own, side in zip(unknown, near, strict=True)], axis=1)
     means = []
+    deviations = [share * size for share in NEIGHBORHOOD_SHARES]
     for known, beyond in ((outside, 1), (inside, 0)):
         everywhere = np.full(person.shape, beyond, np.uint8)
         everywhere[near] = known
-        means.append(_mean_around(cv2, image, everywhere, size, places))
+        means.append(mean_around(image, everywhere, deviations, places))
     (backdrop, color) = means
     towards = color - backdrop
     contrast = (towards**2).sum(axis=1)
@@ -203,38 +201,6 @@ def _cut(
     filled = statistics[:, cv2.CC_STAT_AREA] <= MAX_HOLE_SHARE * head.sum()
     filled[0] = False
     return kept | filled[label]
-
-
-def _mean_around(
-    cv2: Any, image: np.ndarray, known: np.ndarray, size: float, places: np.ndarray
-) -> np.ndarray:
-    """(N, 3) float32 mean of pixels that are known, (H, W) 0 or 1, around places (N, 2), rows and
-    columns; those far away where none is near."""
-    # wide neighborhoods need few pixels
-    scale = min(1.0, MIN_NEIGHBORHOOD_PX / (NEIGHBORHOOD_SHARES[0] * size))
-    small = tuple(max(1, round(scale * side)) for side in image.shape[1::-1])
-    both = cv2.bitwise_and(image, image, mask=known), 255 * known
-    weighted, weight = (_reduced(cv2, own, small) for own in both)
-    weighted = weighted.astype(np.float32)
-    weight = weight.astype(np.float32) / 255
-    total = np.zeros_like(weighted)
-    norm = np.full_like(weight, 1e-9)
-    for share, importance in zip(NEIGHBORHOOD_SHARES, (1.0, FAR_WEIGHT), strict=True):
-        sigma = max(0.7, scale * share * size)
-        total += importance * cv2.GaussianBlur(weighted, (0, 0), sigma)
-        norm += importance * cv2.GaussianBlur(weight, (0, 0), sigma)
-    at = (places[:, ::-1] + 0.5) * (np.array(small) / image.shape[1::-1])
-    return sampled([total / norm[..., None]], at)[0]
-
-
-def _reduced(cv2: Any, image: np.ndarray, size: tuple[int, ...]) -> np.ndarray:
-    """The image's means over the areas of a smaller one's pixels; by halves, which is fast."""
-    while not any(
-        side % 2 or side < 2 * s for side, s in zip(image.shape[1::-1], size, strict=True)
-    ):
-        half = image.shape[1] // 2, image.shape[0] // 2
-        image = cv2.resize(image, half, interpolation=cv2.INTER_AREA)
-    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA))
 
 
 def _shrunk(cv2: Any, where: np.ndarray, pixels: float) -> np.ndarray:

@@ -1,6 +1,7 @@
 """Samples of a capture: colors, sizes and coverage of triangles in a few training views."""
 
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,6 +19,7 @@ MAX_VIEWS = 48
 MAX_TIMESTEPS = 12
 MAX_FACES = 3000
 """More of each would change no decision, and take long; of more cameras, each gives one view."""
+IMAGES_AT_A_TIME = 2  # Which may be large
 SAMPLED_HEIGHT_PIXELS = 400
 """Images half as high again are shrunk to this: triangles are then two or three pixels wide."""
 MIN_FACING_COSINE = 0.35
@@ -88,7 +90,7 @@ def sample_views(views: Sequence[View], seed: int = 0) -> list[View]:
 
 
 def take_samples(capture: Capture, seed: int = 0) -> Samples:
-    """Of a few training views, one image at a time. Raises StgaError where one cannot be read."""
+    """Of a few training views, two images at a time. Raises StgaError where one cannot be read."""
     views = sample_views(capture.views["train"], seed)
     rng = np.random.default_rng(seed)
     count = len(capture.faces)
@@ -104,7 +106,8 @@ def take_samples(capture: Capture, seed: int = 0) -> Samples:
         name: {timestep: signal(basis, frames)[faces] for timestep, frames in posed.items()}
         for name, signal in SIGNALS.items()
     }
-    rows = [_sample_view(capture, view, faces) for view in views]
+    with ThreadPoolExecutor(IMAGES_AT_A_TIME) as pool:
+        rows = list(pool.map(lambda view: _sample_view(capture, view, faces), views))
     return Samples(
         faces,
         np.array([view.camera_index for view in views]),

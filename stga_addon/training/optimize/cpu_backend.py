@@ -2,6 +2,7 @@
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
+from functools import cached_property
 
 import numpy as np
 
@@ -30,11 +31,15 @@ class CpuBackend:
         self.state = state
         self._settings = settings
         self._frames = frames
-        self._scale_limits = frames.scale_limits(settings)
         self._buffers = rasterize.BufferPool()
 
     def __len__(self) -> int:
         return len(self.state)
+
+    @cached_property
+    def _scale_limits(self) -> np.ndarray:
+        # for a step alone: what only renders need not look through the take for them
+        return self._frames.scale_limits(self._settings)
 
     def step(self, batch: Batch) -> float | None:
         state = self.state

@@ -9,7 +9,7 @@ import numpy as np
 from ...capture.loader import Preparation
 from ...capture.mesh_geometry import silhouette
 from ...capture.model import Capture, View, ViewExposure
-from ...tracking.appearance import box_of
+from ...tracking.appearance import mean_around
 from ..settings import TrainingSettings
 
 Correction = Callable[[View, np.ndarray, np.ndarray | None], np.ndarray]
@@ -17,7 +17,6 @@ Correction = Callable[[View, np.ndarray, np.ndarray | None], np.ndarray]
 BLUR_SHARES = (0.01, 0.05)
 """Standard deviations of the neighborhoods that a pixel's backdrop is the mean of, as shares of the
 image's height: the larger one counts where the smaller one holds no backdrop."""
-FAR_WEIGHT = 1e-3
 NO_CORRECTION = np.array([[1.0, 1.0, 1.0], [0.0, 0.0, 0.0]])
 """Gain and offset by channel."""
 MAX_GAIN = 4.0
@@ -74,31 +73,28 @@ def over_color(image: np.ndarray, mask: np.ndarray, color: Sequence[float]) -> n
     mean of those pixels around it that show nothing else; only this second term is exchanged. A
     mask's soft edge thus keeps no rim of the backdrop's color.
     """
-    cover = mask[..., None].astype(np.float32) / 255
-    rest = (1 - cover) * 255 * np.asarray(color, np.float32)
-    found = cover * image
-    edge = (mask > 0) & (mask < 255)
-    if edge.any() and not mask.all():
-        import cv2
+    import cv2
 
-        margin = round(3 * BLUR_SHARES[1] * len(image))
-        box = box_of(edge, margin)
-        part = image[box].astype(np.float32)
-        share = cover[box]
-        clear = mask[box] == 0
-        total = np.zeros_like(part)
-        weight = np.full_like(share, 1e-12)
-        shown = np.where(clear[..., None], part, 0)
-        for blur, importance in zip(BLUR_SHARES, (1.0, FAR_WEIGHT), strict=True):
-            sigma = max(1.0, blur * len(image))
-            side = 2 * round(3 * sigma) + 1
-            options = (side, side), sigma, None, sigma, cv2.BORDER_REFLECT
-            total += importance * cv2.GaussianBlur(shown, *options)
-            near = cv2.GaussianBlur(clear.astype(np.float32), *options)
-            weight += importance * near[..., None]
-        foreground = np.clip(part - (1 - share) * (total / weight), 0, 255 * share)
-        found[box][edge[box]] = foreground[edge[box]]
-    return np.asarray(np.clip(found + rest, 0, 255) + 0.5).astype(np.uint8)
+    beside = _levels(255 * np.asarray(color, np.float32))
+    over = cv2.merge([np.full_like(mask, level) for level in beside])
+    cv2.copyTo(image, mask, over)
+    places = np.nonzero((mask > 0) & (mask < 255))
+    if len(places[0]):
+        cover = mask[places][:, None].astype(np.float32) / 255
+        shown = cover * image[places]
+        if not mask.all():
+            deviations = [max(1.0, share * len(image)) for share in BLUR_SHARES]
+            clear = (mask == 0).astype(np.uint8)
+            behind = mean_around(image, clear, deviations, np.stack(places, axis=1))
+            shown = np.clip(image[places] - (1 - cover) * behind, 0, 255 * cover)
+        rest = (1 - cover) * 255 * np.asarray(color, np.float32)
+        over[places] = _levels(shown + rest)
+    return np.asarray(over)
+
+
+def _levels(values: np.ndarray) -> np.ndarray:
+    """Rounded, uint8."""
+    return np.asarray(np.clip(values, 0, 255) + 0.5).astype(np.uint8)
 
 
 def fit_exposure(
@@ -172,10 +168,22 @@ def exposure_correction(settings: TrainingSettings) -> Correction | None:
         known = exposure(view)
         if known is None:
             return image
+        import cv2
+
         gain, offset = known.astype(np.float32)
-        cover = np.float32(1) if mask is None else mask[..., None].astype(np.float32) / 255
-        background_part = (1 - cover) * background
-        corrected = (image - background_part - cover * offset) / gain + background_part
-        return np.asarray(np.clip(corrected, 0, 255) + 0.5).astype(np.uint8)
+
+        def inverted(pixels: np.ndarray, cover: np.ndarray) -> np.ndarray:
+            rest = (1 - cover) * background
+            return _levels((pixels - rest - cover * offset) / gain + rest)
+
+        every = np.arange(256, dtype=np.float32)[:, None, None]  # levels
+        corrected = cv2.LUT(image, inverted(every, np.ones(1, np.float32)))
+        if mask is None:
+            return np.asarray(corrected)
+        outside = cv2.LUT(image, inverted(every, np.zeros(1, np.float32)))
+        cv2.copyTo(outside, (mask == 0).astype(np.uint8), corrected)
+        edge = (mask > 0) & (mask < 255)
+        corrected[edge] = inverted(image[edge], mask[edge][:, None].astype(np.float32) / 255)
+        return np.asarray(corrected)
 
     return correct
