@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from capture import factory
+from numpy.linalg import norm
 from numpy.testing import assert_allclose, assert_array_equal
 from PIL import Image
 from scipy.ndimage import binary_dilation, binary_erosion
@@ -22,6 +23,7 @@ from stga_addon.render.render import render, render_avatar
 from stga_addon.tracking.torso_cloth import draped, torso_sheet
 from stga_addon.training.optimize.change import Turn
 from stga_addon.training.optimize.frames import FrameStore
+from stga_addon.training.optimize.initial_splats import flat_points
 from stga_addon.training.optimize.state import state_of_avatar
 from stga_addon.training.optimize.surface import Surface
 from stga_addon.training.optimize.surface_prior import (
@@ -409,6 +411,38 @@ def test_nobody_looks_through_a_side(bundled, tmp_path):
         own = binary_erosion((triangle >= 0) & part[triangle], iterations=7)
         assert own.sum() > 100
         assert alpha_of(layer, camera, frames)[own].min() > 0.9
+
+
+def test_nobody_looks_into_the_mouth_past_a_cheek(bundled, tmp_path):
+    """Catches cheeks of a head that never turned, whose splats lie along the views, without a layer
+    behind them."""
+    capture = filmed(bundled, painted(bundled), (0,), 0.0, tmp_path)
+    layer, frames = behind(capture)
+    camera = look_at([0.7, 0, 0.7], [0, -0.02, 0], 160, 200, 480)
+    triangle, _ = rasterize(capture.neutral, capture.faces, camera)
+    centers, level = middles(capture)
+    cheek = (abs(level + 0.7) < 0.2) & (abs(centers[:, 0] - 0.055) < 0.005) & (centers[:, 2] > 0)
+    share = alpha_of(layer, camera, frames)[cheek[triangle] & (triangle >= 0)]
+    assert len(share) > 20
+    assert share.min() > 0.7
+
+
+def test_what_is_beside_the_jaw_lies_behind_the_face(bundled, tmp_path):
+    """Catches a collar, or hair on shoulders, that stands before a cheek, as deep as the jaw that
+    it is seen beside."""
+    capture = filmed(bundled, painted(bundled), (0,), 0.0, tmp_path)
+    (view,) = capture.views["train"]
+    jaw = np.array([0.066, -0.03, 0.045])
+    assert norm(middles(capture)[0] - jaw, axis=1).min() < 0.005
+    (pixel,), _ = view.camera.project(jaw[None])
+    mask = np.asarray(Image.open(view.mask)).copy()
+    row = int(pixel[1])
+    mask[row - 5 : row + 5, 30:130] = 255
+    Image.fromarray(mask).save(view.mask)
+    splats = flat_points(capture, view, "stga", 0)
+    points = points_to_world(splats.xyz, FrameStore(capture, "stga").of(0), splats.face)
+    assert len(points) > 20
+    assert points[:, 2].max() < jaw[2] - 0.005
 
 
 def with_torso(capture, width=0.2, height=0.4):

@@ -25,6 +25,10 @@ GRAZED_COSINE = 0.7
 FACE_ANGLE_DEG = 45.0
 """Of the angle between a triangle and the camera that it faces most, below which it has a layer
 behind it; from straight ahead, beyond which there is no face, seen from the middle of the head."""
+ONE_DIRECTION_COSINE = 0.8
+ONE_DIRECTION_FACE_ANGLE_DEG = 20.0
+"""The same of a head that was filmed from one direction, along which its splats lie: from aside,
+the mouth's inside shows between them."""
 CELL_VOXELS = 2
 """Behind how large a part of the head one splat is enough."""
 DEPTH_VOXELS = 0.5
@@ -93,7 +97,12 @@ def _behind_sides(
     faces = surface.capture.faces
     neutral = np.asarray(surface.capture.neutral, np.float64)
     voxel = voxel_size(neutral)
-    rows = np.flatnonzero(allowed & _beside_face(surface, at) & (surface.facing < GRAZED_COSINE))
+    limit = GRAZED_COSINE
+    angle = FACE_ANGLE_DEG
+    if surface.filmed_along is not None:
+        limit = ONE_DIRECTION_COSINE
+        angle = ONE_DIRECTION_FACE_ANGLE_DEG
+    rows = np.flatnonzero(allowed & _beside_face(surface, at, angle) & (surface.facing < limit))
     depths = voxel * DEPTH_VOXELS * np.arange(1, MAX_DEPTHS + 1)
     offsets = np.zeros((len(rows), len(depths), 3))
     offsets[:, :, NORMAL_AXIS["stga"]] = -depths
@@ -108,10 +117,11 @@ def _behind_sides(
     return grazed, neutral - deepest[:, None] * vertex_normals(neutral, faces)
 
 
-def _beside_face(surface: Surface, at: HeadCoordinates) -> np.ndarray:
-    """(F,) bool: the outside of head and neck, but for the face and ears."""
+def _beside_face(surface: Surface, at: HeadCoordinates, angle_deg: float) -> np.ndarray:
+    """(F,) bool: the outside of head and neck, but for ears and the face, up to so far from
+    straight ahead."""
     kinds = surface.kinds
-    beside = np.degrees(np.abs(at.azimuth)) > FACE_ANGLE_DEG
+    beside = np.degrees(np.abs(at.azimuth)) > angle_deg
     beside |= kinds["scalp"] | kinds["body"]
     beside &= surface.outside & skin_of(surface.capture) & (at.level > CHIN_LEVEL)
     return np.asarray(beside & ~ears_of(at))

@@ -27,6 +27,7 @@ from ...flame.parts import PARTS
 from ...flame.sequence import below_neck
 from ...tracking.folder import read_torso_points
 from ..settings import TrainingSettings
+from .likeness import face_of, head_coordinates
 
 SAMPLED_HEIGHT_PIXELS = 400
 """Images higher than this are shrunk to it: triangles are then two or three pixels wide."""
@@ -230,8 +231,9 @@ def flat_points(
     mesh's outline.
 
     A single camera does not show how far away hair or shoulders are. Each splat lies on the ray of
-    its pixel, as deep as the part of the mesh that is nearest in the image, follows the same
-    triangle as a hull point there, and has its size and distance. torso: what the image cuts off
+    its pixel, as deep as the part of the mesh that is nearest in the image, but for the face,
+    beside which hair and collars are seen behind it, follows the same triangle as a hull point
+    there, and has its size and distance. torso: what the image cuts off
     below the neck is continued beyond it, as its border looks, for other timesteps that show more;
     where none does, it stays so.
     """
@@ -256,7 +258,11 @@ def flat_points(
     centers = np.stack([columns[beside], rows[beside]], axis=1)
     if not len(centers):
         return _new_splats(np.zeros((0, 3)), voxel, sh_degree)
-    points = camera.unproject(centers, depth[cKDTree(pixels).query(centers)[1]])
+    at = head_coordinates(capture)
+    behind = np.ones(len(capture.faces), bool) if at is None else ~face_of(at)
+    behind = np.repeat(behind, len(samples) // len(behind))
+    nearest = cKDTree(pixels[behind]).query(centers)[1]
+    points = camera.unproject(centers, depth[behind][nearest])
     _, face = _followed(capture, view.timestep, points, torso)
     frames = face_frames(mesh, capture.faces, capture.neutral, convention)
     splats = _new_splats(points, voxel, sh_degree)

@@ -119,6 +119,12 @@ def ears_of(at: HeadCoordinates) -> np.ndarray:
     return np.asarray(ear & (abs(at.level - EAR_LEVEL) < EAR_HEIGHT))
 
 
+def face_of(at: HeadCoordinates) -> np.ndarray:
+    """(F,) bool: triangles between brows and neck, ahead of the ears."""
+    ahead = np.degrees(np.abs(at.azimuth)) < NECK_ANGLE_DEG
+    return np.asarray(ahead & (at.level < BROWS_LEVEL) & (at.level > CHIN_LEVEL))
+
+
 def kinds_of(
     at: HeadCoordinates, is_outside: np.ndarray, has_long_hair: bool = False
 ) -> dict[str, np.ndarray]:
