@@ -26,7 +26,7 @@ FACE_ANGLE_DEG = 45.0
 """Of the angle between a triangle and the camera that it faces most, below which it has a layer
 behind it; from straight ahead, beyond which there is no face, seen from the middle of the head."""
 ONE_DIRECTION_COSINE = 0.8
-ONE_DIRECTION_FACE_ANGLE_DEG = 20.0
+ONE_DIRECTION_FACE_ANGLE_DEG = 30.0
 """The same of a head that was filmed from one direction, along which its splats lie: from aside,
 the mouth's inside shows between them."""
 CELL_VOXELS = 2
