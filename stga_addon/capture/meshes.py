@@ -21,7 +21,7 @@ MESH_SUFFIXES = (".obj", ".ply", ".glb", ".stl")
 PRIMITIVE_NUMBERS = (
     1000  # That each primitive counts for: trimesh takes time even where it is small
 )
-CACHE_BYTES = 96 << 20
+CACHE_BYTES = 96 << 20  # Of a take of ten seconds, each is posed once
 MAX_MESH_BYTES = 512 << 20
 MIN_EXTENT_M = 1e-9
 """A smaller mesh is a point: no shape to train on, and no scale to compare motion with."""

@@ -24,6 +24,7 @@ from stga_addon.tracking.torso_cloth import draped, torso_sheet
 from stga_addon.training.optimize.change import Turn
 from stga_addon.training.optimize.frames import FrameStore
 from stga_addon.training.optimize.initial_splats import flat_points
+from stga_addon.training.optimize.likeness import face_of, head_coordinates
 from stga_addon.training.optimize.state import state_of_avatar
 from stga_addon.training.optimize.surface import Surface
 from stga_addon.training.optimize.surface_prior import (
@@ -440,6 +441,18 @@ def test_what_is_beside_the_jaw_lies_behind_the_face(bundled, tmp_path):
     points = points_to_world(splats.xyz, FrameStore(capture, "stga").of(0), splats.face)
     assert len(points) > 20
     assert points[:, 2].max() < jaw[2] - 0.005
+
+
+def test_a_mesh_of_a_face_alone_has_a_layer_beside_it(bundled, tmp_path):
+    """Catches an error where no part of a mesh is behind the face."""
+    face = face_of(head_coordinates(bundled))
+    regions = {name: own[face] for name, own in bundled.regions.items()}
+    alone = replace(bundled, faces=bundled.faces[face], regions=regions, flame=None)
+    capture = filmed(alone, painted(bundled)[face], (0,), 0.0, tmp_path)
+    (view,) = capture.views["train"]
+    mask = np.asarray(Image.open(view.mask)) > 0
+    Image.fromarray(np.uint8(255 * binary_dilation(mask, iterations=8))).save(view.mask)
+    assert len(flat_points(capture, view, "stga", 0)) > 20
 
 
 def with_torso(capture, width=0.2, height=0.4):

@@ -38,7 +38,7 @@ class CpuBackend:
 
     @cached_property
     def _scale_limits(self) -> np.ndarray:
-        # for a step alone: what only renders need not look through the take for them
+        # found when a step asks: what only renders does not look through the take for them
         return self._frames.scale_limits(self._settings)
 
     def step(self, batch: Batch) -> float | None:

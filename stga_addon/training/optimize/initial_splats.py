@@ -231,11 +231,11 @@ def flat_points(
     mesh's outline.
 
     A single camera does not show how far away hair or shoulders are. Each splat lies on the ray of
-    its pixel, as deep as the part of the mesh that is nearest in the image, but for the face,
-    beside which hair and collars are seen behind it, follows the same triangle as a hull point
-    there, and has its size and distance. torso: what the image cuts off
-    below the neck is continued beyond it, as its border looks, for other timesteps that show more;
-    where none does, it stays so.
+    its pixel, as deep as the part of the mesh that is nearest in the image, but for the face: hair
+    and collars are behind the jaw that they are seen beside. It follows the same triangle as a hull
+    point there, and has its size and distance. torso: what the image cuts off below the neck is
+    continued beyond it, as its border looks, for other timesteps that show more; where none does,
+    it stays so.
     """
     mesh = capture.mesh(view.timestep)
     camera = view.camera
@@ -258,11 +258,9 @@ def flat_points(
     centers = np.stack([columns[beside], rows[beside]], axis=1)
     if not len(centers):
         return _new_splats(np.zeros((0, 3)), voxel, sh_degree)
-    at = head_coordinates(capture)
-    behind = np.ones(len(capture.faces), bool) if at is None else ~face_of(at)
-    behind = np.repeat(behind, len(samples) // len(behind))
-    nearest = cKDTree(pixels[behind]).query(centers)[1]
-    points = camera.unproject(centers, depth[behind][nearest])
+    usable = np.repeat(_without_face(capture), len(samples) // len(capture.faces))
+    nearest = cKDTree(pixels[usable]).query(centers)[1]
+    points = camera.unproject(centers, depth[usable][nearest])
     _, face = _followed(capture, view.timestep, points, torso)
     frames = face_frames(mesh, capture.faces, capture.neutral, convention)
     splats = _new_splats(points, voxel, sh_degree)
@@ -274,6 +272,14 @@ def flat_points(
     splats.opacity[cut] = CONTINUED_OPACITY
     below = below_neck(neck, view.timestep, points)
     return to_local(splats, frames, face).rows(~cut | below)
+
+
+def _without_face(capture: Capture) -> np.ndarray:
+    """(F,) bool: triangles that are not the face's; all of a mesh that has no others, or of which
+    that is not known."""
+    at = head_coordinates(capture)
+    others = np.ones(len(capture.faces), bool) if at is None else ~face_of(at)
+    return others if others.any() else ~others
 
 
 def voxel_size(mesh: np.ndarray) -> float:
