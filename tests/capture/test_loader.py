@@ -11,7 +11,7 @@ from refusal import refusal
 
 from stga_addon.capture import loader as module
 from stga_addon.capture.images import read_view
-from stga_addon.capture.loader import LoaderMemory, ViewLoader
+from stga_addon.capture.loader import LoaderLimits, ViewLoader
 from stga_addon.capture.open import open_capture
 
 from . import factory
@@ -39,7 +39,7 @@ def decoded(monkeypatch):
 
 
 def loader_threads():
-    return sum(thread.name == "view loader" for thread in threading.enumerate())
+    return sum(thread.name.startswith("view ") for thread in threading.enumerate())
 
 
 def wait_until(condition):
@@ -48,12 +48,13 @@ def wait_until(condition):
         time.sleep(0.005)
 
 
-def test_order_and_content(views):
+@pytest.mark.parametrize("readers", [1, 4])
+def test_order_and_content(views, readers):
     """Catches views out of order, doubled, lost at the end, or paired with another's image, a
     deadlock where a single view exceeds the queue, and a consumer that changes the cached image
     under the next visit's feet."""
     order = [views[i] for i in (3, 1, 1, 8, 0)]
-    with ViewLoader(order, memory=LoaderMemory(queue_bytes=1)) as loader:
+    with ViewLoader(order, limits=LoaderLimits(queue_bytes=1, readers=readers)) as loader:
         loaded = list(loader)
     assert [item.view for item in loaded] == order
     for view, image, mask, _ in loaded:
@@ -68,7 +69,7 @@ def test_order_and_content(views):
 def test_cache_is_bounded(views, decoded):
     """Catches a cache that outgrows its limit, or throws out what the next epoch asks for."""
     sequence = [views[i] for i in (0, 1, 0, 2, 2, 1)]
-    with ViewLoader(sequence, memory=LoaderMemory(cache_bytes=2 * VIEW_BYTES)) as loader:
+    with ViewLoader(sequence, limits=LoaderLimits(cache_bytes=2 * VIEW_BYTES)) as loader:
         list(loader)
     # There is room for 0 and 1; 2 is decoded whenever it comes, and drives nothing out.
     assert decoded == [views[i].name for i in (0, 1, 2, 2)]
@@ -79,7 +80,7 @@ def test_scales_by_position(views, decoded):
     match it, and a coarse-to-fine run whose small images fill the cache for good."""
     sizes = [0.5, 0.5, 1.0, 1.0, 0.25]
     with ViewLoader(
-        [views[0]] * 5, scale=sizes.__getitem__, memory=LoaderMemory(cache_bytes=VIEW_BYTES)
+        [views[0]] * 5, scale=sizes.__getitem__, limits=LoaderLimits(cache_bytes=VIEW_BYTES)
     ) as loader:
         loaded = list(loader)
     shapes = [image.shape[:2] for _, image, *_ in loaded]
@@ -88,11 +89,12 @@ def test_scales_by_position(views, decoded):
     assert len(decoded) == 3
 
 
-def test_errors_come_where_their_view_would(views):
+@pytest.mark.parametrize("readers", [1, 4])
+def test_errors_come_where_their_view_would(views, readers):
     """Catches an error lost in the thread, or raised before the good views ahead of it; a hang
     afterwards; and an exception of the given iterator taken for its end."""
     views[2].image.write_bytes(b"broken")
-    with ViewLoader(views) as loader:
+    with ViewLoader(views, limits=LoaderLimits(readers=readers)) as loader:
         assert next(loader)[0] is views[0]
         assert next(loader)[0] is views[1]
         for _ in range(2):
@@ -104,15 +106,29 @@ def test_errors_come_where_their_view_would(views):
         yield views[0]
         raise ValueError("bad schedule")
 
-    with ViewLoader(order()) as loader:
+    with ViewLoader(order(), limits=LoaderLimits(readers=readers)) as loader:
         next(loader)
         with pytest.raises(ValueError, match="bad schedule"):
             next(loader)
 
 
-def test_closes_from_any_state(views):
+def test_readers_work_at_a_time(views):
+    """Catches images that are decoded one after the other, for which many cores and GPUs wait."""
+    together = threading.Barrier(3)
+
+    def prepare(view, image, mask):
+        together.wait(timeout=10)
+        return image, mask
+
+    with ViewLoader(views[:6], prepare=prepare, limits=LoaderLimits(readers=3)) as loader:
+        assert [loaded.view for loaded in loader] == views[:6]
+
+
+@pytest.mark.parametrize("readers", [1, 4])
+def test_closes_from_any_state(views, readers):
     """Catches a thread left behind: full queue, finished, unused, or closed twice."""
-    loader = ViewLoader(itertools.cycle(views), memory=LoaderMemory(queue_bytes=VIEW_BYTES))
+    limits = LoaderLimits(queue_bytes=VIEW_BYTES, readers=readers)
+    loader = ViewLoader(itertools.cycle(views), limits=limits)
     next(loader)
     loader.__exit__(RuntimeError, RuntimeError("stop"), None)
     loader.close()
@@ -134,8 +150,8 @@ def test_meshes_are_read_in_the_thread_and_bounded(views):
         return np.full((1000, 3), float(timestep))
 
     item_bytes = VIEW_BYTES + 24_000
-    memory = LoaderMemory(queue_bytes=2 * item_bytes, cache_bytes=0)
-    with ViewLoader(itertools.cycle(views), memory=memory, mesh=mesh) as loader:
+    limits = LoaderLimits(queue_bytes=2 * item_bytes, cache_bytes=0)
+    with ViewLoader(itertools.cycle(views), limits=limits, mesh=mesh) as loader:
         first = next(loader)
         wait_until(lambda: len(read) == 4)
         time.sleep(0.1)

@@ -78,8 +78,10 @@ def over_color(image: np.ndarray, mask: np.ndarray, color: Sequence[float]) -> n
     beside = _levels(255 * np.asarray(color, np.float32))
     over = cv2.merge([np.full_like(mask, level) for level in beside])
     cv2.copyTo(image, mask, over)
-    places = np.nonzero((mask > 0) & (mask < 255))
-    if len(places[0]):
+    edge = cv2.findNonZero(cv2.inRange(mask, 1, 254))
+    if edge is not None:
+        columns, rows = edge.reshape(-1, 2).T
+        places = rows, columns
         cover = mask[places][:, None].astype(np.float32) / 255
         shown = cover * image[places]
         if not mask.all():

@@ -18,11 +18,12 @@ from typing import NamedTuple
 import numpy as np
 
 from ...avatar.file import Avatar, read_avatar, write_avatar
-from ...capture.loader import ViewLoader
+from ...capture.loader import DEFAULT_LIMITS, ViewLoader
 from ...capture.model import Capture, View, evenly_spread, views_by_timestep
 from ...errors import DeviceError, StgaError, shorten
 from ...files import replacing
 from ...progress import Cancelled, Progress, Report, ignore
+from ...raster.cpu.threads import threads
 from ...render.render import render_avatar
 from ...selection import select_capture
 from ...tracking.folder import is_in_order
@@ -80,6 +81,15 @@ RECENT_LOSSES = 100
 """Global iterations that the loss in messages and metrics is the mean of."""
 RESIDUAL_VIEWS = 24
 """Views in which the residuals of a finished run are measured."""
+READERS_BESIDE_CPU = 0.2
+READERS_BESIDE_GPU = 0.5
+"""Threads that decode images, as a share of those that kernels run on, or would."""
+
+
+def image_readers(device: str) -> int:
+    """How many images are decoded at a time beside a training on a device."""
+    share = READERS_BESIDE_CPU if device == "cpu" else READERS_BESIDE_GPU
+    return max(1, round(share * threads()))
 
 
 def train_run_or_fall_back(
@@ -359,7 +369,8 @@ class _Session:
         mesh = self.trainer.frames.mesh_unless_kept if tracking is None else None
         shown = capture if tracking is None else tracking.refined(capture)
         prepare = image_preparation(shown, settings)
-        return ViewLoader(order, scale, settings.background_levels, prepare=prepare, mesh=mesh)
+        limits = DEFAULT_LIMITS._replace(readers=image_readers(self.run.device))
+        return ViewLoader(order, scale, settings.background_levels, limits, prepare, mesh=mesh)
 
     def _refine(self, tracking: RefinedTracking) -> None:
         """Let the avatar track the training timesteps; undone where views that are left out of it
