@@ -301,6 +301,32 @@ def test_what_sticks_out_of_masks_is_not_closed(bundled, tmp_path):
     ).all()
 
 
+def test_a_chest_below_the_images_is_opaque(bundled, tmp_path):
+    """Catches a chest that the background shines through where images end above it, though it
+    faces the camera; and one that is opaque before images were asked."""
+    capture = filmed(bundled, painted(bundled), (0,), 0.0, tmp_path)
+    (view,) = capture.views["train"]
+    end = 120
+    for path in (view.image, view.mask):
+        Image.fromarray(np.asarray(Image.open(path))[:end]).save(path)
+    view = replace(view, camera=replace(view.camera, height=end))
+    capture = replace(capture, views={"train": (view,)})
+    surface = Surface(capture)
+    row = view.camera.project(middles(capture)[0])[0][:, 1]
+    seen, cosine = surface.seen_from(np.array([0.0, 0.0, 1.0]))
+    faces_camera = seen & (cosine > 0.5)
+    below = faces_camera & (row > end + 5)
+    assert below.sum() > 100
+    state = Trainer(capture, quick_settings(iterations=1), {}).state
+    state.second.opacity[(row < end)[state.face]] = 1e-3
+    before = state.parameters.opacity.copy()
+    SurfacePrior(FrameStore(capture, "stga", False)).apply(Rows(state), Turn(20, 0.5, len(state)))
+    assert state.parameters.opacity[below[state.face]].min() > 2
+    shown = (faces_camera & (row < end - 5))[state.face] & ~state.unbound
+    changed = state.parameters.opacity[shown] != before[shown]
+    assert changed.mean() < 0.1
+
+
 def test_hair_from_aside(bundled, tmp_path):
     """Catches an avatar of one camera that does not look from there as it was trained, streaks of
     hair that run around the head as they shine in front, a face that is smoothed with them, hair

@@ -136,8 +136,12 @@ class SurfacePrior:
     ) -> None:
         face = columns["face"]
         share = doubt(columns["second/opacity"][:, None], usual[:, None])
-        turned_away = np.where(self._surface.sticks_out, 0, self._surface.turned_away)
+        surface = self._surface
+        turned_away = np.where(surface.sticks_out, 0, surface.turned_away)
         share = (share * turned_away[face]) ** 2  # little of what outlines show
+        # beyond the edges of images may also lie what faces cameras
+        beyond = surface.outside & ~surface.sticks_out & ~self._frames.sides.shown
+        share[beyond[face] & ~columns["second/opacity"].astype(bool)] = 1
         rows = np.flatnonzero(share > MIN_PULL)
         share = share[rows]
         opacity = columns["parameters/opacity"][rows]
