@@ -26,7 +26,7 @@ from stga_addon.training.optimize.frames import FrameStore
 from stga_addon.training.optimize.initial_splats import flat_points
 from stga_addon.training.optimize.likeness import face_of, head_coordinates
 from stga_addon.training.optimize.state import state_of_avatar
-from stga_addon.training.optimize.surface import Surface
+from stga_addon.training.optimize.surface import GRAZING_COSINE, Surface
 from stga_addon.training.optimize.surface_prior import (
     BACKING_OPACITY,
     SurfacePrior,
@@ -325,6 +325,21 @@ def test_a_chest_below_the_images_is_opaque(bundled, tmp_path):
     shown = (faces_camera & (row < end - 5))[state.face] & ~state.unbound
     changed = state.parameters.opacity[shown] != before[shown]
     assert changed.mean() < 0.1
+
+
+def test_a_mirrored_cheek_is_in_the_light_of_its_side(bundled, tmp_path):
+    """Catches a cheek that is as dark as the other one, which was filmed in the shade, beside the
+    bright half of a face."""
+    color = painted(bundled)
+    centers, level = middles(bundled)
+    color[centers[:, 0] > 0] *= 0.6
+    capture = filmed(bundled, color, (0, 30, 60), 0.0, tmp_path)
+    surface = Surface(capture)
+    cheek = surface.outside & (surface.facing < GRAZING_COSINE) & (centers[:, 0] < 0)
+    cheek &= (centers[:, 2] > 0.03) & (abs(level + 0.4) < 0.4)
+    assert cheek.sum() > 20
+    away = abs(255 * unseen_sides(surface).color[cheek] - color[cheek])
+    assert (away < 0.1 * color[cheek]).mean() > 0.95
 
 
 def test_hair_from_aside(bundled, tmp_path):

@@ -41,6 +41,8 @@ MIN_SHOWN_SHARE = 0.1
 """Of the pixels that usually show as much of the surface: a folded eyelid has less."""
 SOURCE_TRIANGLES = 100
 """Of whose colors a hidden triangle has the median."""
+MAX_LIGHT_RATIO = 2.0
+"""Of the light on one side of a face to that on the other."""
 SHOWN_COSINE = 0.5
 ASIDE_SHARE = 0.75
 """Of the angle between a triangle and the camera that it faces most, above which its color depends
@@ -118,8 +120,8 @@ def unseen_sides(surface: Surface) -> UnseenSides:
                 copied = color[sources_around_head(at, own, rows)]
                 around = nearest_rows(centers[rows], centers[rows], SMOOTHED)
                 found[rows] = np.median(copied[around], axis=1)
-    hidden, partner = mirror_images(capture, unseen, is_source)
-    found[hidden] = color[partner]
+    hidden, mirrored = _mirror_images_colors(surface, color, unseen, is_source)
+    found[hidden] = mirrored
     inside = _unseen_inside(capture, pixels > 0, is_outside)
     inside |= _unseen_teeth(capture, pixels, shown)
     within = inside | (~is_outside & ~shown)
@@ -136,6 +138,28 @@ def plausible_aside(splats: Splats, along: np.ndarray, sides: UnseenSides) -> Sp
     share = ASIDE_SHARE * sides.view_dependence[face]
     share[splats.unbound & ~sides.is_hair[face]] = 0
     return colored_aside(splats, along[face], share, sides.aside[face])
+
+
+def _mirror_images_colors(
+    surface: Surface, color: np.ndarray, unseen: np.ndarray, is_source: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Unseen triangles whose mirror images are sources, and what they look like (N, 3): those of
+    the face in the light of their own side, as the nearest that are shown on both sides tell it."""
+    capture = surface.capture
+    hidden, partner = mirror_images(capture, unseen, is_source)
+    found = color[partner]
+    if surface.at is None:
+        return hidden, found
+    is_face = ~surface.kinds["scalp"] & ~surface.kinds["body"]
+    both, opposite = mirror_images(capture, is_source & is_face, is_source & is_face)
+    rows = np.flatnonzero(is_face[hidden])
+    if len(both) and len(rows):
+        centers = np.asarray(capture.neutral)[capture.faces].mean(1)
+        near = nearest_rows(centers[both], centers[hidden[rows]], SOURCE_TRIANGLES)
+        here, there = (np.median(color[own[near]], axis=1) for own in (both, opposite))
+        gain = here / np.maximum(there, MIN_DIVISOR)
+        found[rows] *= np.clip(gain, 1 / MAX_LIGHT_RATIO, MAX_LIGHT_RATIO)
+    return hidden, np.clip(found, 0, 1)
 
 
 def _fringe(at: HeadCoordinates, shown: np.ndarray) -> np.ndarray:
