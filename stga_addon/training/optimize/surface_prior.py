@@ -139,7 +139,7 @@ class SurfacePrior:
         surface = self._surface
         turned_away = np.where(surface.sticks_out, 0, surface.turned_away)
         share = (share * turned_away[face]) ** 2  # little of what outlines show
-        # beyond the edges of images may also lie what faces cameras
+        # no view has stepped these: beyond images' edges also lies what faces cameras
         beyond = surface.outside & ~surface.sticks_out & ~self._frames.sides.shown
         share[beyond[face] & ~columns["second/opacity"].astype(bool)] = 1
         rows = np.flatnonzero(share > MIN_PULL)
