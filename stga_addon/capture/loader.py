@@ -156,20 +156,20 @@ class ViewLoader:
         """Each view in its order, as many being decoded ahead as there are readers; an error of
         `views` comes after those before it."""
         reading = deque[tuple[_Key, Future[LoadedView]]]()
-        failed: BaseException | None = None
+        stopped: BaseException | None = None
         position = 0
-        while reading or failed is None:
-            if failed is None and len(reading) < self._readers:
+        while reading or stopped is None:
+            if stopped is None and len(reading) < self._readers:
                 try:
                     reading.append(self._begin(next(views), self._scale(position), pool))
-                except BaseException as error:  # the end, too
-                    failed = error
+                except BaseException as error:  # or the end: after what is being decoded
+                    stopped = error
                 position += 1
             else:
                 key, future = reading.popleft()
                 yield self._kept(key, future.result())
-        if not isinstance(failed, StopIteration):
-            raise failed
+        if not isinstance(stopped, StopIteration):
+            raise stopped
 
     def _has_room(self, size: int) -> bool:
         within = self._ready_bytes + size <= self._queue_bytes

@@ -303,7 +303,7 @@ def test_what_sticks_out_of_masks_is_not_closed(bundled, tmp_path):
 
 def test_a_chest_below_the_images_is_opaque(bundled, tmp_path):
     """Catches a chest that the background shines through where images end above it, though it
-    faces the camera; and one that is opaque before images were asked."""
+    faces the camera; and splats that images show, made opaque as well."""
     capture = filmed(bundled, painted(bundled), (0,), 0.0, tmp_path)
     (view,) = capture.views["train"]
     end = 120

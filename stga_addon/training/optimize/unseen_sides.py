@@ -120,7 +120,7 @@ def unseen_sides(surface: Surface) -> UnseenSides:
                 copied = color[sources_around_head(at, own, rows)]
                 around = nearest_rows(centers[rows], centers[rows], SMOOTHED)
                 found[rows] = np.median(copied[around], axis=1)
-    hidden, mirrored = _mirror_images_colors(surface, color, unseen, is_source)
+    hidden, mirrored = _mirrored_colors(surface, color, unseen, is_source)
     found[hidden] = mirrored
     inside = _unseen_inside(capture, pixels > 0, is_outside)
     inside |= _unseen_teeth(capture, pixels, shown)
@@ -140,7 +140,7 @@ def plausible_aside(splats: Splats, along: np.ndarray, sides: UnseenSides) -> Sp
     return colored_aside(splats, along[face], share, sides.aside[face])
 
 
-def _mirror_images_colors(
+def _mirrored_colors(
     surface: Surface, color: np.ndarray, unseen: np.ndarray, is_source: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Unseen triangles whose mirror images are sources, and what they look like (N, 3): those of
