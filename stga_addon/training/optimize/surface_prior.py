@@ -114,7 +114,9 @@ class SurfacePrior:
         sides = self._frames.sides
         face = columns["face"]
         share = doubt(columns["second/color"], usual) * ~sides.shown[face]
-        is_pinned = sides.triangles[face] | is_inner
+        # an average moves by steps only, so that it is assigned where there was none
+        is_untouched = ~sides.shown[face] & ~columns["second/color"].any(1)
+        is_pinned = sides.triangles[face] | is_inner | is_untouched
         rows = np.flatnonzero((share > MIN_PULL) & ~is_pinned)
         plausible = ((sides.color[face] - 0.5) / SH_C0).astype(np.float32)
         inner = np.searchsorted(self._inner.face, face[is_inner])

@@ -127,7 +127,7 @@ def unseen_sides(surface: Surface) -> UnseenSides:
     within = inside | (~is_outside & ~shown)
     found[within] = inside_colors(capture, color, shown, within)
     triangles = (is_outside & (cosine < UNSEEN_COSINE)) | inside
-    aside = np.where(unseen[:, None], found, aside)
+    aside = np.where((unseen | ~(shown | is_hair))[:, None], found, aside)
     return UnseenSides(triangles, shown, found, is_hair, np.where(is_hair, 1.0, turned), aside)
 
 
