@@ -34,7 +34,11 @@ from stga_addon.training.optimize.surface_prior import (
     splats_behind,
 )
 from stga_addon.training.optimize.trainer import Trainer
-from stga_addon.training.optimize.unseen_sides import plausible_aside, unseen_sides
+from stga_addon.training.optimize.unseen_sides import (
+    SOURCE_COSINE,
+    plausible_aside,
+    unseen_sides,
+)
 
 from .heads import PLACES, write_head
 from .toys import Rows, alpha_of, quick_settings
@@ -335,17 +339,27 @@ def test_a_chest_below_the_images(bundled, tmp_path):
 
 def test_a_mirrored_cheek_is_in_the_light_of_its_side(bundled, tmp_path):
     """Catches a cheek that is as dark as the other one, which was filmed in the shade, beside the
-    bright half of a face."""
+    bright half of a face; one that is as gray as the wall that its outline is blurred with; and
+    hair at the temple made brighter than the rest."""
     color = painted(bundled)
     centers, level = middles(bundled)
     color[centers[:, 0] > 0] *= 0.6
-    capture = filmed(bundled, color, (0, 30, 60), 0.0, tmp_path)
-    surface = Surface(capture)
-    cheek = surface.outside & (surface.facing < GRAZING_COSINE) & (centers[:, 0] < 0)
-    cheek &= (centers[:, 2] > 0.03) & (abs(level + 0.4) < 0.4)
-    assert cheek.sum() > 20
-    away = abs(255 * unseen_sides(surface).color[cheek] - color[cheek])
-    assert (away < 0.1 * color[cheek]).mean() > 0.95
+    temple = (level > 0.3) & (centers[:, 2] < 0.055)
+    color[temple] = HAIR
+    angles = (0, 30, 60)
+    facing = Surface(filmed(bundled, color, angles, 0.0, tmp_path)).facing
+    is_right = centers[:, 0] < 0
+    blurred = np.where((is_right & (facing < SOURCE_COSINE))[:, None], GRAY, color)
+    surface = Surface(filmed(bundled, blurred, angles, 0.0, tmp_path))
+    sides = unseen_sides(surface)
+    turned = surface.outside & is_right & (facing < SOURCE_COSINE - 0.02)
+    cheek = turned & (centers[:, 2] > 0.03) & (abs(level + 0.4) < 0.4)
+    hair = turned & temple & (centers[:, 2] > 0.03) & (level < 0.9)
+    for rows in (cheek & (facing < GRAZING_COSINE), cheek, hair):
+        assert rows.sum() > 20
+        assert sides.shown[rows].mean() < 0.1
+        away = abs(255 * sides.color[rows] - color[rows])
+        assert (away < 0.1 * color[rows] + 4).mean() > 0.9
 
 
 def test_hair_from_aside(bundled, tmp_path):

@@ -54,7 +54,8 @@ class UnseenSides:
     """What is plausible where views tell little of a head.
 
     triangles   (F,) bool: no view shows them
-    shown       (F,) bool: the views whose colors were looked at show them well
+    shown       (F,) bool: the views whose colors were looked at show them well, and better than
+                what they are taken to look like
     color       (F, 3) in 0…1 that a triangle plausibly has
     is_hair     (F,) bool: hair's triangles, where any is shown
     view_dependence  (F,) 0…1 of the color that views show: 1 in hair, for its sheen and strands,
@@ -71,9 +72,10 @@ class UnseenSides:
 
 
 def unseen_sides(surface: Surface) -> UnseenSides:
-    """Triangles that no camera looks at look as their mirror images that are shown; those of scalp,
-    neck and shoulders else as shown ones of their height, back and forth around the head, smoothed
-    over those around; any other as the nearest connected ones. What views show looks as there."""
+    """Triangles that no camera looks at, and of few cameras those of the face that turn away, look
+    as their mirror images that are shown well; of scalp, neck and shoulders else as shown ones of
+    their height, back and forth around the head, smoothed over those around; any other as the
+    nearest connected ones. What views show looks as there."""
     capture = surface.capture
     cosine = surface.facing
     views = _color_views(capture)
@@ -89,39 +91,38 @@ def unseen_sides(surface: Surface) -> UnseenSides:
         none = np.zeros_like(shown)
         return UnseenSides(none, shown, color, none, none.astype(float), color)
     unseen = is_outside & (cosine < GRAZING_COSINE)
-    found = color.copy()
     centers = np.asarray(capture.neutral)[capture.faces].mean(1)
-    part = connected_parts(len(capture.neutral), capture.faces)[capture.faces[:, 0]]
-    hidden = unseen | ~shown | surface.lids
-    for number in np.unique(part[hidden]):
-        rows = np.flatnonzero(hidden & (part == number))
-        own = sources[part[sources] == number] if (part[sources] == number).any() else sources
-        near = nearest_rows(centers[own], centers[rows], SOURCE_TRIANGLES)
-        found[rows] = np.median(color[own[near]], axis=1)
+    found = _as_nearest(capture, color, sources, unseen | ~shown | surface.lids)
     turned = np.where(is_outside, surface.turned_from(SHOWN_COSINE), 0.0)
     aside = color.copy()
+    turns_away = np.zeros_like(shown)
+    hair = np.full(3, np.inf)
     is_hair = np.zeros_like(shown)
     at = surface.at
     if at is not None:
         kinds = surface.kinds
-        is_face = is_source & ~kinds["scalp"] & ~kinds["body"] & (at.level < BROWS_LEVEL)
+        of_face = is_outside & ~kinds["scalp"] & ~kinds["body"]
+        turns_away = of_face & (cosine < SOURCE_COSINE) & surface.has_few_cameras
+        is_skin = of_face & is_source & (at.level < BROWS_LEVEL)
         for kind, members in kinds.items():
             own = np.flatnonzero(members & is_source)
             if kind == "scalp":
                 if not len(own):
                     own = _fringe(at, is_outside & (pixels > 0) & (cosine > FRINGE_COSINE))
-                own = hairy_triangles(own, centers, color, color[is_face])
+                own = hairy_triangles(own, centers, color, color[is_skin])
             if kind == "scalp" and len(own):
                 near = nearest_rows(centers[own], centers[members], SOURCE_TRIANGLES)
                 aside[members] = np.median(color[own[near]], axis=1)
                 is_hair |= members
+                hair = np.median(color[own], axis=0)
             rows = np.flatnonzero(members & unseen)
             if len(own) and len(rows):
                 copied = color[sources_around_head(at, own, rows)]
                 around = nearest_rows(centers[rows], centers[rows], SMOOTHED)
                 found[rows] = np.median(copied[around], axis=1)
-    hidden, mirrored = _mirrored_colors(surface, color, unseen, is_source)
+    hidden, mirrored = _mirrored_colors(surface, color, unseen | turns_away, is_source, hair)
     found[hidden] = mirrored
+    shown[hidden] = False
     inside = _unseen_inside(capture, pixels > 0, is_outside)
     inside |= _unseen_teeth(capture, pixels, shown)
     within = inside | (~is_outside & ~shown)
@@ -140,11 +141,32 @@ def plausible_aside(splats: Splats, along: np.ndarray, sides: UnseenSides) -> Sp
     return colored_aside(splats, along[face], share, sides.aside[face])
 
 
+def _as_nearest(
+    capture: Capture, color: np.ndarray, sources: np.ndarray, hidden: np.ndarray
+) -> np.ndarray:
+    """Colors (F, 3), those of `hidden` triangles (F,) bool as of the nearest sources (M,), of the
+    same connected part where it has any."""
+    found = color.copy()
+    centers = np.asarray(capture.neutral)[capture.faces].mean(1)
+    part = connected_parts(len(capture.neutral), capture.faces)[capture.faces[:, 0]]
+    for number in np.unique(part[hidden]):
+        rows = np.flatnonzero(hidden & (part == number))
+        own = sources[part[sources] == number] if (part[sources] == number).any() else sources
+        near = nearest_rows(centers[own], centers[rows], SOURCE_TRIANGLES)
+        found[rows] = np.median(color[own[near]], axis=1)
+    return found
+
+
 def _mirrored_colors(
-    surface: Surface, color: np.ndarray, unseen: np.ndarray, is_source: np.ndarray
+    surface: Surface,
+    color: np.ndarray,
+    unseen: np.ndarray,
+    is_source: np.ndarray,
+    hair: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Unseen triangles whose mirror images are sources, and what they look like (N, 3): those of
-    the face in the light of their own side, as the nearest that are shown on both sides tell it."""
+    the face in the light of their own side, as the nearest that are shown on both sides tell it,
+    but for what looks rather like hair (3,), whose rest is as it is shown."""
     capture = surface.capture
     hidden, partner = mirror_images(capture, unseen, is_source)
     found = color[partner]
@@ -152,8 +174,12 @@ def _mirrored_colors(
         return hidden, found
     is_face = ~surface.kinds["scalp"] & ~surface.kinds["body"]
     both, opposite = mirror_images(capture, is_source & is_face, is_source & is_face)
-    rows = np.flatnonzero(is_face[hidden])
-    if len(both) and len(rows):
+    if not len(both):
+        return hidden, found
+    away_from_hair = np.linalg.norm(found - hair, axis=1)
+    is_skin = np.linalg.norm(found - np.median(color[both], axis=0), axis=1) < away_from_hair
+    rows = np.flatnonzero(is_face[hidden] & is_skin)
+    if len(rows):
         centers = np.asarray(capture.neutral)[capture.faces].mean(1)
         near = nearest_rows(centers[both], centers[hidden[rows]], SOURCE_TRIANGLES)
         here, there = (np.median(color[own[near]], axis=1) for own in (both, opposite))
