@@ -10,7 +10,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from PIL import Image
 from scipy.ndimage import binary_dilation, binary_erosion
 
-from stga_addon.avatar.embedding import points_to_world
+from stga_addon.avatar.embedding import face_areas, points_to_world
 from stga_addon.avatar.lattice import lattice_splats
 from stga_addon.avatar.splats import SH_C0, colored_aside, sh_color
 from stga_addon.capture.camera import look_at
@@ -245,32 +245,56 @@ def test_hair_goes_round_the_head(angles, height, fringe, hair, bundled, tmp_pat
 
 
 def test_what_lips_and_lids_hide(bundled, tmp_path):
-    """Catches a closed mouth that is skin inside, teeth that are too white, lips with a dark rim,
-    an eye that is skin where it looks aside, and folds of ears that count as the mouth's inside."""
+    """Catches a closed mouth that is skin inside, down to the throat's end, teeth that are too white
+    or train with a slit between lips, lips with a dark rim, an eye that is skin where it looks
+    aside, and folds of ears that count as the mouth's inside."""
     sides = sides_of(filmed(bundled, painted(bundled), TURNS_DEG, 0.0, tmp_path))
     hidden = sides.triangles & ~Surface(bundled).outside
     behind_lids = eyeballs_of(bundled) & hidden
     assert behind_lids.sum() > 20
     off = np.abs(255 * sides.color[behind_lids] - EYES)
     assert off.max() < 3
-    centers, _ = middles(bundled)
+    centers, level = middles(bundled)
     model = bundled.flame.model
     teeth = faces_within(bundled.faces, model.masks["teeth"])
     folds = ~Surface(bundled).outside & (np.abs(centers[:, 0]) > 0.06)
     assert folds.sum() > 20
     assert not sides.triangles[folds].any()
     assert sides.triangles[teeth].all()
+    assert hidden[teeth].all()
     part = connected_parts(len(bundled.neutral), bundled.faces)[bundled.faces[:, 0]]
     away = np.linalg.norm(centers - centers[bundled.regions["mouth"]].mean(0), axis=1)
     front = teeth & (away < 0.02) & (centers[:, 2] > np.quantile(centers[teeth, 2], 0.8))
     assert_allclose(np.median(sides.color[front], 0), 0.85 * EYES / 255, rtol=0.1)
     inside = hidden & ~teeth & (away < 0.06)
     throat = inside & (away > 0.04)
-    for rows in (throat & (part == part[0]), throat & (part != part[0])):
+    end = (part == part[0]) & hidden & (level < -0.5) & (away > 0.075)
+    for rows in (throat & (part == part[0]), throat & (part != part[0]), end):
         assert rows.sum() > 20
         assert sides.color[rows].max(1).mean() < 0.3
     lips = np.argsort(np.where(inside & (part == part[0]), away, np.inf))[:10]
     assert (np.median(sides.color[lips], 0) > 0.4 * SKIN / 255).all()
+
+
+def test_splats_behind_closed_lips_stay_small(bundled, tmp_path):
+    """Catches splats of the lips' inner side that hang before teeth and tongue once they part."""
+    capture = filmed(bundled, painted(bundled), (0,), 0.0, tmp_path)
+    frames = FrameStore(capture, "stga", False)
+    state = Trainer(capture, quick_settings(iterations=1), {}).state
+    state.parameters.log_scale[:] += 1
+    before = state.parameters.log_scale.copy()
+    SurfacePrior(frames).apply(Rows(state), Turn(20, 0.5, len(state)))
+    sides = frames.sides
+    outside = frames.surface.outside
+    lips = capture.regions["mouth"] & (outside | ~sides.triangles)
+    inner = lips & ~outside & ~sides.shown
+    of_inner = inner[state.face] & ~state.unbound
+    assert of_inner.sum() > 20
+    side = np.sqrt(2 * face_areas(capture.neutral, capture.faces)) / frames.unit_lengths
+    width = np.exp(state.parameters.log_scale).max(1)
+    assert (width[of_inner] < 0.4 * side[state.face[of_inner]]).all()
+    of_outer = (lips & outside & sides.shown)[state.face] & ~state.unbound
+    assert (state.parameters.log_scale[of_outer] == before[of_outer]).any(1).mean() > 0.9
 
 
 def test_what_sticks_out_of_masks_is_not_closed(bundled, tmp_path):

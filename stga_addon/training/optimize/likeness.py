@@ -53,10 +53,12 @@ in colors of 0…1; triangles around one over which what is found is smoothed.""
 
 EYEBALLS = ("left_eyeball", "right_eyeball")
 TEETH = ("teeth",)
-LINING_REACH = 1.1
+LINING_REACH = 1.3
+LINING_LEVEL = -0.4
 TONGUE_REACH = 0.5
-"""How far a mouth's lining is from its middle, in that unit; what else reaches so near to it is
-teeth, gums and tongue."""
+"""How far a mouth's lining, with the throat, is from its middle, in that unit, and its height over
+the eyes, whose sockets are as near; what else reaches so near to the mouth is teeth, gums and
+tongue."""
 DEPTHS = (0.0, 0.25, 0.45, 0.75)
 LIP_SHARE = 0.75
 GUM_SHARES = np.array([[0.43, 0.24, 0.22], [0.22, 0.1, 0.09], [0.12, 0.04, 0.03]])
@@ -260,7 +262,8 @@ def lining_of(capture: Capture) -> np.ndarray:
         return np.zeros(len(capture.faces), bool)
     centers = np.asarray(capture.neutral)[capture.faces].mean(1)
     away = np.linalg.norm(centers - centers[capture.regions["mouth"]].mean(0), axis=1)
-    return np.asarray(skin_of(capture) & (away < LINING_REACH * at.unit))
+    near = (away < LINING_REACH * at.unit) & (at.level < LINING_LEVEL)
+    return np.asarray(skin_of(capture) & near)
 
 
 def teeth_of(capture: Capture) -> np.ndarray:

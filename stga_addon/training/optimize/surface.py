@@ -31,6 +31,7 @@ from .likeness import (
     head_coordinates,
     kinds_of,
     nearest_rows,
+    teeth_of,
 )
 from .outlines import TOLERANCE_SHARE, clear_of
 
@@ -114,13 +115,14 @@ class Surface:
 
     @cached_property
     def outside(self) -> np.ndarray:
-        """(F,) bool: triangles of the neutral mesh that some camera around it sees."""
+        """(F,) bool: triangles of the neutral mesh that some camera around it sees; no teeth, which
+        a slit between lips may show."""
         seen = np.zeros(len(self.capture.faces), bool)
         for number in range(OUTSIDE_CAMERAS):
             angle = 2 * np.pi * number / OUTSIDE_CAMERAS
             height = (-0.5, 0.2, 0.9)[number % 3]
             seen |= self.seen_from(np.array([np.sin(angle), height, np.cos(angle)]))[0]
-        return seen
+        return seen & ~teeth_of(self.capture)
 
     def seen_from(self, direction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """(F,) bool: triangles of the neutral mesh that a camera in this direction (3,) from its

@@ -16,6 +16,7 @@ from .backend import Backend
 from .backing import CELL_VOXELS
 from .change import Turn
 from .frames import FrameStore
+from .likeness import lining_of
 from .state import parameters_and_average
 
 WELL_SEEN_COSINE = 0.8
@@ -37,6 +38,8 @@ behind what views graze."""
 BESIDE_LID_SHARE = 0.6
 """Of the scale of the layer under lids, at their edges and in the mouth, where it would stand out
 beside the eye and the lips."""
+LINING_SHARE = 0.5
+"""Of the scale of a triangle's only splat, that those have at most beside closed lips."""
 BORDER_INSET = 0.6
 """Of the distance from the middle of a triangle, and of the scale, at the mesh's edge."""
 FLAT_VOXELS = 0.25
@@ -102,6 +105,7 @@ class SurfacePrior:
         self._pull_shapes(backend, bound, columns, moments["second/opacity"])
         self._flatten(backend, bound, columns)
         self._keep_layer(backend, bound, columns, is_inner)
+        self._shrink_lining(backend, bound, columns)
 
     def _pull_colors(
         self,
@@ -191,6 +195,29 @@ class SurfacePrior:
         inner = self._inner.rows(np.searchsorted(self._inner.face, face[rows]))
         kept = {name: getattr(inner, name) for name in INNER_PARAMETERS}
         backend.assign(bound[rows], parameters_and_average(kept))
+
+    def _shrink_lining(
+        self, backend: Backend, bound: np.ndarray, columns: Mapping[str, np.ndarray]
+    ) -> None:
+        """Splats behind closed lips stay small: they would hang before teeth when these open."""
+        limits = self._lining_limits[columns["face"], None]
+        rows = np.flatnonzero((columns["parameters/log_scale"] > limits).any(1))
+        log_scale = np.minimum(columns["parameters/log_scale"][rows], limits[rows])
+        values = parameters_and_average({"log_scale": log_scale})
+        backend.assign(bound[rows], {**values, "first/log_scale": 0.0})
+
+    @cached_property
+    def _lining_limits(self) -> np.ndarray:
+        """(F,) largest log scale, in local units."""
+        capture = self._frames.capture
+        sides = self._frames.sides
+        limits = np.full(len(capture.faces), np.inf, np.float32)
+        lining = lining_of(capture) & ~self._surface.outside & ~sides.shown & ~sides.triangles
+        single = lattice_splats(
+            capture.neutral, capture.faces, 0, 0, convention=self._frames.convention
+        )
+        limits[lining] = single.log_scale.max(1)[lining] + np.log(LINING_SHARE)
+        return limits
 
     @cached_property
     def _inner(self) -> Splats:
