@@ -245,7 +245,7 @@ def test_hair_goes_round_the_head(angles, height, fringe, hair, bundled, tmp_pat
 
 
 def test_what_lips_and_lids_hide(bundled, tmp_path):
-    """Catches a closed mouth that is skin inside, down to the throat's end, teeth that are too white
+    """Catches a closed mouth that is skin inside, or at the throat's end, teeth that are too white
     or train with a slit between lips, lips with a dark rim, an eye that is skin where it looks
     aside, and folds of ears that count as the mouth's inside."""
     sides = sides_of(filmed(bundled, painted(bundled), TURNS_DEG, 0.0, tmp_path))
