@@ -56,9 +56,8 @@ TEETH = ("teeth",)
 LINING_REACH = 1.3
 LINING_LEVEL = -0.4
 TONGUE_REACH = 0.5
-"""How far a mouth's lining, with the throat, is from its middle, in that unit, and its height over
-the eyes, whose sockets are as near; what else reaches so near to the mouth is teeth, gums and
-tongue."""
+"""How far from a mouth's middle, in that unit, its lining and throat reach, and how high over the
+eyes, whose sockets are as near; what else comes so near to the mouth is teeth, gums and tongue."""
 DEPTHS = (0.0, 0.25, 0.45, 0.75)
 LIP_SHARE = 0.75
 GUM_SHARES = np.array([[0.43, 0.24, 0.22], [0.22, 0.1, 0.09], [0.12, 0.04, 0.03]])

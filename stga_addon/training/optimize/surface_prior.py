@@ -39,7 +39,7 @@ BESIDE_LID_SHARE = 0.6
 """Of the scale of the layer under lids, at their edges and in the mouth, where it would stand out
 beside the eye and the lips."""
 LINING_SHARE = 0.5
-"""Of the scale of a triangle's only splat, that those have at most beside closed lips."""
+"""Of the scale of a triangle's only splat: the largest behind closed lips."""
 BORDER_INSET = 0.6
 """Of the distance from the middle of a triangle, and of the scale, at the mesh's edge."""
 FLAT_VOXELS = 0.25
@@ -118,7 +118,7 @@ class SurfacePrior:
         sides = self._frames.sides
         face = columns["face"]
         share = doubt(columns["second/color"], usual) * ~sides.shown[face]
-        # an average moves by steps only, so that it is assigned where there was none
+        # the avatar is made of averages, which only steps move
         is_untouched = ~sides.shown[face] & ~columns["second/color"].any(1)
         is_pinned = sides.triangles[face] | is_inner | is_untouched
         rows = np.flatnonzero((share > MIN_PULL) & ~is_pinned)
@@ -199,7 +199,8 @@ class SurfacePrior:
     def _shrink_lining(
         self, backend: Backend, bound: np.ndarray, columns: Mapping[str, np.ndarray]
     ) -> None:
-        """Splats behind closed lips stay small: they would hang before teeth when these open."""
+        """Splats on the lips' inner side, which no view shows well, stay small: they would hang
+        before the teeth when the lips part."""
         limits = self._lining_limits[columns["face"], None]
         rows = np.flatnonzero((columns["parameters/log_scale"] > limits).any(1))
         log_scale = np.minimum(columns["parameters/log_scale"][rows], limits[rows])
@@ -208,7 +209,7 @@ class SurfacePrior:
 
     @cached_property
     def _lining_limits(self) -> np.ndarray:
-        """(F,) largest log scale, in local units."""
+        """(F,) largest log scale, in local units; infinite elsewhere."""
         capture = self._frames.capture
         sides = self._frames.sides
         limits = np.full(len(capture.faces), np.inf, np.float32)

@@ -54,8 +54,8 @@ class UnseenSides:
     """What is plausible where views tell little of a head.
 
     triangles   (F,) bool: no view shows them
-    shown       (F,) bool: the views whose colors were looked at show them well, and better than
-                what they are taken to look like
+    shown       (F,) bool: the views whose colors were looked at show them well; none that look as
+                their mirror images
     color       (F, 3) in 0…1 that a triangle plausibly has
     is_hair     (F,) bool: hair's triangles, where any is shown
     view_dependence  (F,) 0…1 of the color that views show: 1 in hair, for its sheen and strands,
@@ -165,8 +165,8 @@ def _mirrored_colors(
     hair: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Unseen triangles whose mirror images are sources, and what they look like (N, 3): those of
-    the face in the light of their own side, as the nearest that are shown on both sides tell it,
-    but for what looks rather like hair (3,), whose rest is as it is shown."""
+    the face in the light of their own side, as the nearest that are shown on both sides tell it;
+    what looks rather like hair (3,) stays as it is, as does the hair around."""
     capture = surface.capture
     hidden, partner = mirror_images(capture, unseen, is_source)
     found = color[partner]
