@@ -199,8 +199,8 @@ class SurfacePrior:
     def _shrink_lining(
         self, backend: Backend, bound: np.ndarray, columns: Mapping[str, np.ndarray]
     ) -> None:
-        """Splats on the lips' inner side, which no view shows well, stay small: they would hang
-        before the teeth when the lips part."""
+        """Splats on the lips' inner side, which few cameras do not show well, stay small: they
+        would hang before the teeth when the lips part."""
         limits = self._lining_limits[columns["face"], None]
         rows = np.flatnonzero((columns["parameters/log_scale"] > limits).any(1))
         log_scale = np.minimum(columns["parameters/log_scale"][rows], limits[rows])
@@ -217,6 +217,7 @@ class SurfacePrior:
         single = lattice_splats(
             capture.neutral, capture.faces, 0, 0, convention=self._frames.convention
         )
+        lining &= self._surface.has_few_cameras
         limits[lining] = single.log_scale.max(1)[lining] + np.log(LINING_SHARE)
         return limits
 
