@@ -247,7 +247,7 @@ def test_hair_goes_round_the_head(angles, height, fringe, hair, bundled, tmp_pat
 def test_what_lips_and_lids_hide(bundled, tmp_path):
     """Catches a closed mouth that is skin inside, or at the throat's end, teeth that are too white
     or train with a slit between lips, lips with a dark rim, an eye that is skin where it looks
-    aside, and folds of ears that count as the mouth's inside."""
+    aside, and folds of ears, or eyes' sockets, that count as the mouth's inside."""
     sides = sides_of(filmed(bundled, painted(bundled), TURNS_DEG, 0.0, tmp_path))
     hidden = sides.triangles & ~Surface(bundled).outside
     behind_lids = eyeballs_of(bundled) & hidden
@@ -272,6 +272,10 @@ def test_what_lips_and_lids_hide(bundled, tmp_path):
     for rows in (throat & (part == part[0]), throat & (part != part[0]), end):
         assert rows.sum() > 20
         assert sides.color[rows].max(1).mean() < 0.3
+    sockets = (part == part[0]) & ~Surface(bundled).outside & (away < 0.09) & (level > -0.3)
+    sockets &= ~sides.shown & (np.abs(centers[:, 0]) < 0.06)
+    assert sockets.sum() > 20
+    assert (sides.color[sockets].max(1) > 0.3).mean() > 0.95
     lips = np.argsort(np.where(inside & (part == part[0]), away, np.inf))[:10]
     assert (np.median(sides.color[lips], 0) > 0.4 * SKIN / 255).all()
 

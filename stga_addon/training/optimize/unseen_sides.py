@@ -54,8 +54,8 @@ class UnseenSides:
     """What is plausible where views tell little of a head.
 
     triangles   (F,) bool: no view shows them
-    shown       (F,) bool: the views whose colors were looked at show them well; none that look as
-                their mirror images
+    shown       (F,) bool: the views whose colors were looked at show them well; not those that
+                look as their mirror images
     color       (F, 3) in 0…1 that a triangle plausibly has
     is_hair     (F,) bool: hair's triangles, where any is shown
     view_dependence  (F,) 0…1 of the color that views show: 1 in hair, for its sheen and strands,
@@ -177,8 +177,8 @@ def _mirrored_colors(
     if not len(both):
         return hidden, found
     away_from_hair = np.linalg.norm(found - hair, axis=1)
-    is_skin = np.linalg.norm(found - np.median(color[both], axis=0), axis=1) < away_from_hair
-    rows = np.flatnonzero(is_face[hidden] & is_skin)
+    away_from_skin = np.linalg.norm(found - np.median(color[both], axis=0), axis=1)
+    rows = np.flatnonzero(is_face[hidden] & (away_from_skin < away_from_hair))
     if len(rows):
         centers = np.asarray(capture.neutral)[capture.faces].mean(1)
         near = nearest_rows(centers[both], centers[hidden[rows]], SOURCE_TRIANGLES)
