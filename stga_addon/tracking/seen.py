@@ -16,6 +16,7 @@ from .dense_head import REGIONS
 from .fit import HeadFit, Pictures, RecordedTake, posed_mesh
 from .focal_length import scale_warnings
 from .footage.model import Footage, FootageCamera
+from .gaze import with_gaze
 from .head_model import HeadModel
 from .mattes import with_mattes
 from .opened import file_state
@@ -96,6 +97,7 @@ def fit_skin(fitted: FittedHead, crew: Crew) -> FittedHead:
     fitted = _with_images(fitted)
     recorded = fitted.recorded
     fit, misfits = by_images(recorded.opened.head, fitted.fit, recorded.take, crew)
+    fit = with_gaze(fit, recorded.take, is_stranger=True)
     return _in_world(replace(fitted, fit=fit, misfits=misfits))
 
 
@@ -105,6 +107,7 @@ def fit_expressions(fitted: FittedHead, person: HeadFit, crew: Crew) -> FittedHe
     dense = fit_dense(fitted.fit, fitted.recorded.take, crew)
     fit = fitted.fit if dense is None else dense.fit
     fit = replace(fit, shape=person.shape, static_offset=person.static_offset)
+    fit = with_gaze(fit, fitted.recorded.take, is_stranger=False)
     return _in_world(replace(fitted, fit=fit, misfits=_misfits(dense)))
 
 

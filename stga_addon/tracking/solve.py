@@ -146,7 +146,7 @@ def solve_take(
         return normal_equations(points, values, observations[row])
 
     stiffness = acceleration_precision(head.model) if ordered else None
-    return _solve_windows(head, terms, unwound(start) if ordered else start, stiffness, iterations)
+    return solve_in_time(head, terms, unwound(start) if ordered else start, stiffness, iterations)
 
 
 def in_order(
@@ -212,7 +212,7 @@ def smoothed(
     def linear(row: int, now: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         return information[row], pull[row] - information[row] @ (now - values[row])
 
-    return _solve_windows(head, linear, values, stiffness)
+    return solve_in_time(head, linear, values, stiffness)
 
 
 def person(head: HeadModel, shape: np.ndarray) -> HeadModel:
@@ -239,7 +239,7 @@ def normal_equations(
     return flat.T @ flat, -flat.T @ (np.sqrt(weight)[:, None] * residual).ravel()
 
 
-def _solve_windows(
+def solve_in_time(
     head: HeadModel | None,
     terms: Terms,
     start: np.ndarray,

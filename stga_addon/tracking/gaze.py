@@ -1,0 +1,99 @@
+"""Where a person looks: the eyes' joints, turned so that the irises are where they are seen."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from ..flame.model import EYEBALL_WEIGHT
+from .correspondence import EYE_JOINTS
+from .fit import HeadFit, LandmarkVisibility, RecordedTake, observed_landmarks, triangulate
+from .posed_points import PosedPoints
+from .solve import (
+    LANDMARK_SIGMA_M,
+    Observation,
+    acceleration_precision,
+    normal_equations,
+    parameter_precision,
+    solve_in_time,
+)
+
+ITERATIONS = 4
+IRIS_SIGMA_M = 0.0005
+"""Standard deviation of the middle of an iris, which is seen sharply."""
+MAX_GAZE_RAD = 0.7
+"""Up, down or aside; no eye turns farther."""
+PARALLEL_QUANTILE = 0.8
+"""Of how far a take's left eye looks to the left of the right one: eyes that look in parallel, as
+they converge otherwise, and never look apart."""
+AXES = 2
+"""About which an eye turns: x, by which it looks up and down, and y, aside."""
+
+
+def with_gaze(fit: HeadFit, take: RecordedTake, is_stranger: bool) -> HeadFit:
+    """The fit, its eyes turned so that the foremost points of the eyeballs are where the take's
+    landmarks have the irises; as it is where there are no eyeballs, or no landmarks of irises.
+
+    Beside hundreds of landmarks of skin, two of irises hardly count: eyes would turn by half of
+    what they do. is_stranger: the model's eyeballs may be some millimeters off, which turns both
+    eyes all the time: in the median over the take, they are said to look in parallel, where the fit
+    has them. Of a known person, landmarks are corrected for that (`without_bias`).
+    """
+    model = fit.head.model
+    on_eyeball = (model.weights[model.faces] > EYEBALL_WEIGHT).all(axis=1)[take.places.face]
+    irises = {joint: np.flatnonzero(take.reliable & on_eyeball[:, joint]) for joint in EYE_JOINTS}
+    seen = {joint: rows for joint, rows in irises.items() if len(rows)}
+    if not seen:
+        return fit
+    rows = np.concatenate(list(seen.values()))
+    first = model.n_expression
+    columns = np.concatenate([first + 3 * joint + np.arange(AXES) for joint in seen])
+    timesteps = sorted(fit.parameters)
+    start = np.stack([fit.parameters[timestep] for timestep in timesteps])
+    observed = _observed(fit, take, timesteps, rows)
+    points = PosedPoints(model, take.places[rows])
+    precision = parameter_precision(fit.head)[columns]
+    sharper = (LANDMARK_SIGMA_M / IRIS_SIGMA_M) ** 2
+
+    def terms(row: int, turns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        values = start[row].copy()
+        values[columns] = turns
+        matrix, right = normal_equations(points, values, observed[row])
+        pull = precision * (start[row, columns] - turns)
+        own = sharper * matrix[np.ix_(columns, columns)] + np.diag(precision)
+        return own, sharper * right[columns] + pull
+
+    stiffness = acceleration_precision(model)[columns] if fit.ordered else None
+    turns = solve_in_time(None, terms, start[:, columns], stiffness, ITERATIONS)
+    if is_stranger:
+        usual = np.median(start[:, columns], axis=0).reshape(-1, AXES).mean(axis=0)
+        turns = turns - _rest(turns) + np.tile(usual, len(seen))
+    moved = start.copy()
+    moved[:, columns] = np.clip(turns, -MAX_GAZE_RAD, MAX_GAZE_RAD)
+    return replace(fit, parameters=dict(zip(timesteps, moved, strict=True)))
+
+
+def _rest(turns: np.ndarray) -> np.ndarray:
+    """(2 E,) how one or two eyes stand on their eyeballs while both look in parallel straight
+    ahead, from how they turn in a take (T, 2 E), left one first: half of the time they look higher
+    or more to the left, and most of the time they look at what is near."""
+    rest = np.median(turns, axis=0)
+    if turns.shape[1] > AXES:
+        left, right = (turns - rest)[:, 1::AXES].T
+        rest[1::AXES] += np.quantile(left - right, PARALLEL_QUANTILE) / 2 * np.array([1, -1])
+    return rest
+
+
+def _observed(
+    fit: HeadFit, take: RecordedTake, timesteps: list[int], rows: np.ndarray
+) -> list[Observation]:
+    """Some of the landmarks at each timestep, all of them on the eyeballs."""
+    visibility = LandmarkVisibility(fit.head, take.places[rows])
+    found = []
+    for timestep in timesteps:
+        own = take.landmarks[timestep]
+        own = replace(own, points=own.points[:, rows], confidence=own.confidence[:, rows])
+        seen = visibility.weighted(own, fit.parameters[timestep], fit.to_capture)
+        triangulation = triangulate(seen.cameras, seen.points, seen.confidence)
+        used = np.ones(len(rows), bool)
+        found.append(observed_landmarks(triangulation, fit.to_capture, used))
+    return found
