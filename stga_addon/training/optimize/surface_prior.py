@@ -16,7 +16,7 @@ from .backend import Backend
 from .backing import CELL_VOXELS
 from .change import Turn
 from .frames import FrameStore
-from .likeness import lining_of
+from .likeness import eyeballs_of, lining_of
 from .state import parameters_and_average
 
 WELL_SEEN_COSINE = 0.8
@@ -40,6 +40,8 @@ BESIDE_LID_SHARE = 0.6
 beside the eye and the lips."""
 LINING_SHARE = 0.5
 """Of the scale of a triangle's only splat: the largest behind closed lips."""
+EYE_DEPTH_M = 0.0005
+"""Least depth of splats on eyeballs."""
 BORDER_INSET = 0.6
 """Of the distance from the middle of a triangle, and of the scale, at the mesh's edge."""
 FLAT_VOXELS = 0.25
@@ -84,7 +86,7 @@ class SurfacePrior:
         surface = self._surface
         sides = self._frames.sides
         may_be = sides.triangles | ~sides.shown | surface.lids | surface.is_flat
-        may_be |= self._frames.backing.triangles
+        may_be |= self._frames.backing.triangles | self._eyeballs
         return np.asarray(may_be | (surface.turned_away > 0))
 
     def prepare(self) -> None:
@@ -106,6 +108,7 @@ class SurfacePrior:
         self._flatten(backend, bound, columns)
         self._keep_layer(backend, bound, columns, is_inner)
         self._shrink_lining(backend, bound, columns)
+        self._sink_eyes(backend, bound, columns)
 
     def _pull_colors(
         self,
@@ -220,6 +223,23 @@ class SurfacePrior:
         lining &= self._surface.has_few_cameras
         limits[lining] = single.log_scale.max(1)[lining] + np.log(LINING_SHARE)
         return limits
+
+    def _sink_eyes(
+        self, backend: Backend, bound: np.ndarray, columns: Mapping[str, np.ndarray]
+    ) -> None:
+        """Splats on eyeballs lie below them: lids, whose splats are as deep, close over them."""
+        axis = NORMAL_AXIS[self._frames.convention]
+        face = columns["face"]
+        highest = (-EYE_DEPTH_M / self._frames.unit_lengths)[face]
+        rises = columns["parameters/xyz"][:, axis] > highest
+        rows = np.flatnonzero(rises & self._eyeballs[face])
+        xyz = columns["parameters/xyz"][rows]
+        xyz[:, axis] = highest[rows]
+        backend.assign(bound[rows], parameters_and_average({"xyz": xyz}))
+
+    @cached_property
+    def _eyeballs(self) -> np.ndarray:
+        return eyeballs_of(self._frames.capture)
 
     @cached_property
     def _inner(self) -> Splats:
