@@ -111,6 +111,15 @@ def test_hair_is_as_high_as_its_outline(filmed):
     assert not surface.is_flat[shoulder & ~surface.hidden].any()
 
 
+def in_motion(capture, model, closed=(0.0, 0.0)):
+    """The capture with the head's motion, whose left and right eye are so far closed at some
+    timestep."""
+    weights = dict(zip(("eyeBlinkLeft", "eyeBlinkRight"), closed, strict=True))
+    blink = np.array([weights.get(name, 0.0) for name in model.expression_names])
+    frames = [SimpleNamespace(expr=blink * (timestep == 4)) for timestep in capture.timesteps]
+    return replace(capture, flame=SimpleNamespace(model=model, frame=frames.__getitem__))
+
+
 def from_the_front(capture, folder, change):
     """Its middle views, with masks that `change(view, mask)` has changed."""
     views = []
@@ -319,7 +328,7 @@ def test_what_views_tell_is_kept(filmed):
 def test_lids_close(filmed):
     """Catches lids that were trained on open eyes and, closed, are shreds with the eye behind."""
     model = flame_model(None)
-    capture = replace(filmed, flame=SimpleNamespace(model=model))
+    capture = in_motion(filmed, model)
     names = [model.expression_names.index(f"eyeBlink{side}") for side in ("Left", "Right")]
     blink = capture.neutral + model.shapedirs[:, :, model.n_identity :][:, :, names].sum(2)
     frames = FrameStore(capture, "stga", moved_mesh=lambda timestep: (None, blink)[timestep])
@@ -342,7 +351,7 @@ def test_lids_close(filmed):
 def test_lids_that_views_show_stay(filmed):
     """Catches lids' own splats that join the layer under them, color and all, as training moves
     them a little below the surface."""
-    capture = replace(filmed, flame=SimpleNamespace(model=flame_model(None)))
+    capture = in_motion(filmed, flame_model(None), closed=(1.0, 1.0))
     frames = FrameStore(capture, "stga")
     prior = SurfacePrior(frames)
     state = Trainer(capture, quick_settings(sh_degree=0, sh_steps=(), lattice=1), {}).state
@@ -361,6 +370,67 @@ def test_lids_that_views_show_stay(filmed):
     assert is_layer.mean() < 0.4
 
 
+def test_lids_that_stay_folded_are_skin(filmed, tmp_path):
+    """Catches a lid in the shade of its fold, where no view shows the eye closed, light from the
+    other side on it, and what views show of a closed lid painted over."""
+    model = flame_model(None)
+    center = filmed.neutral[filmed.faces].mean(1)
+    is_left = center[:, 0] > 0
+    capture = in_motion(filmed, model, closed=(1.0, 0.0))
+    lids = Surface(capture).lids
+    colors = np.where(is_left[:, None], [200, 150, 130], [150, 100, 80])
+    colors[lids] = [70, 40, 30]
+    views = []
+    for view in filmed.views["train"]:
+        triangle, _ = rasterize(filmed.neutral, filmed.faces, view.camera)
+        path = tmp_path / f"{view.timestep}.png"
+        image = np.where(triangle[..., None] >= 0, colors[triangle], 255)
+        Image.fromarray(np.uint8(image)).save(path)
+        views.append(replace(view, image=path))
+    frames = FrameStore(replace(capture, views={"train": tuple(views)}), "stga")
+    sides = frames.sides
+    folded = lids & ~is_left
+    assert_array_equal(frames.surface.folded_lids, folded)
+    assert not sides.shown[folded].any()
+    assert_allclose(sides.color[folded] * 255, np.tile([150, 100, 80], (folded.sum(), 1)), atol=4)
+    state = Trainer(capture, quick_settings(sh_degree=0, sh_steps=(), lattice=1), {}).state
+    state.parameters.sh[:] = -1
+    for part in (state.second.sh, state.second.opacity):
+        part[:] = 1
+    SurfacePrior(frames).apply(Rows(state), Turn(20, 0.5, len(state)))
+    bound = ~state.unbound
+    at = bound & folded[state.face]
+    plausible = (sides.color[state.face[at]] - 0.5) / SH_C0
+    assert_allclose(state.parameters.sh[at, 0], plausible, atol=1e-4)
+    shown = bound & (lids & is_left & sides.shown & ~frames.surface.hidden)[state.face]
+    assert (state.parameters.sh[shown, 0] == -1).all(1).mean() > 0.6
+
+
+def test_lids_close_over_eyes(filmed):
+    """Catches splats of an iris that stand out so far that they show on closed lids."""
+    model = flame_model(None)
+    capture = in_motion(filmed, model)
+    eyeballs = np.zeros(len(capture.faces), bool)
+    for side in ("left", "right"):
+        eyeballs |= faces_within(model.faces, model.masks[f"{side}_eyeball"])
+    for convention in ("stga", "gaussian_avatars"):
+        frames = FrameStore(capture, convention)
+        state = Trainer(capture, quick_settings(convention=convention), {}).state
+        axis = NORMAL_AXIS[convention]
+        bound = np.flatnonzero(~state.unbound)
+        rng = np.random.default_rng(0)
+        meters = frames.unit_lengths[state.face[bound]]
+        before = rng.normal(0, 1e-3, len(bound)) / meters
+        state.parameters.xyz[bound, axis] = before
+        SurfacePrior(frames).apply(Rows(state), Turn(20, 0.5, len(state)))
+        height = state.parameters.xyz[bound, axis] * meters
+        of_eyes = eyeballs[state.face[bound]]
+        facing = (frames.surface.facing > 0.9)[state.face[bound]]
+        expected = np.minimum(before * meters, -5e-4)
+        assert_allclose(height[of_eyes & facing], expected[of_eyes & facing], atol=1e-6)
+        assert (height[facing & ~of_eyes] > 0).mean() > 0.3
+
+
 def test_teeth_that_views_show_are_theirs(filmed):
     """Catches teeth that are painted over as not shown, where lips leave a few of them free."""
     model = flame_model(None)
@@ -371,8 +441,8 @@ def test_teeth_that_views_show_are_theirs(filmed):
         filmed,
         views={"train": filmed.views["train"][4:5]},
         mesh=lambda _: smile,
-        flame=SimpleNamespace(model=model),
     )
+    capture = in_motion(capture, model)
     teeth = faces_within(model.faces, model.masks["teeth"])
     triangle, _ = rasterize(smile, model.faces, capture.views["train"][0].camera)
     pixels = np.bincount(triangle[triangle >= 0], minlength=len(teeth))

@@ -22,6 +22,7 @@ from ...capture.mesh_geometry import (
 from ...capture.model import Capture, View, evenly_spread, views_by_timestep
 from ...flame.model import torso_faces
 from ...flame.quaternions import unit
+from ...tracking.solve import LID_SHAPES
 from .initial_splats import FEW_CAMERAS, SAMPLED_HEIGHT_PIXELS, mirrored, voxel_size
 from .likeness import (
     JAW_LEVEL,
@@ -67,9 +68,10 @@ AROUND = 30
 """Measured triangles of whose heights one that is in no outline has the median."""
 BLINKS = ("eyeBlinkLeft", "eyeBlinkRight")
 LID_STRETCH = 1.8
+CLOSED_SHARE = 0.6
 MIN_SQUARED_AREA = 1e-28
-"""Expressions that pull lids out of their folds, and how much longer they make them; squared
-meters, of triangles without area."""
+"""Expressions that pull lids out of their folds, how much longer they make them, and how far eyes
+are tracked that are closed (`LID_SHAPES`); squared meters, of triangles without area."""
 NECK_LEVEL = -1.1
 NECK_HALF_HEIGHT = 0.4
 NECK_SIDE_DEG = 95.0
@@ -236,20 +238,46 @@ class Surface:
     def lids(self) -> np.ndarray:
         """(F,) bool: triangles that a blink pulls out of a fold, in heads whose expressions have
         ARKit's names."""
-        lids = np.zeros(len(self.capture.faces), bool)
+        return np.any([np.zeros(len(self.capture.faces), bool), *self._lids.values()], axis=0)
+
+    @cached_property
+    def folded_lids(self) -> np.ndarray:
+        """(F,) bool: those of eyes that no training view shows closed."""
+        found = np.zeros(len(self.capture.faces), bool)
+        flame = self.capture.flame
+        if flame is None or not self._lids:
+            return found
+        timesteps = views_by_timestep(self.capture.views["train"])
+        weights = np.array([flame.frame(timestep).expr for timestep in timesteps])
+        names = flame.model.expression_names
+        for blink, own in self._lids.items():
+            side = blink.removeprefix("eyeBlink")
+            shapes = {name + side: share for name, share in LID_SHAPES.items()}
+            known = {names.index(name): shapes[name] for name in set(shapes) & set(names)}
+            if (weights[:, list(known)] @ list(known.values())).max() < CLOSED_SHARE:
+                found |= own
+        return found
+
+    @cached_property
+    def _lids(self) -> dict[str, np.ndarray]:
+        """The lids (F,) bool that each of BLINKS closes."""
+        found = dict[str, np.ndarray]()
         if self.capture.flame is None:
-            return lids
+            return found
         model = self.capture.flame.model
         neutral = np.asarray(self.capture.neutral, np.float64)
-        for name in set(BLINKS) & set(model.expression_names):
+        for name in BLINKS:
+            if name not in model.expression_names:
+                continue
             number = model.n_identity + model.expression_names.index(name)
             moved = np.asarray(model.shapedirs)[:, :, number]
             rows = np.flatnonzero(moved.any(1)[self.capture.faces].any(1))
             corners = self.capture.faces[rows]
-            lids[rows] |= (
+            found[name] = np.zeros(len(self.capture.faces), bool)
+            found[name][rows] = (
                 _largest_stretch(neutral[corners], (neutral + moved)[corners]) > LID_STRETCH
             )
-        return lids
+        return found
 
     @cached_property
     def border(self) -> np.ndarray:

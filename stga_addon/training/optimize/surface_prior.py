@@ -123,7 +123,9 @@ class SurfacePrior:
         share = doubt(columns["second/color"], usual) * ~sides.shown[face]
         # the avatar is made of averages, which only steps move
         is_untouched = ~sides.shown[face] & ~columns["second/color"].any(1)
-        is_pinned = sides.triangles[face] | is_inner | is_untouched
+        # of a lid, the edge of a fold is seen, in the fold's shade
+        is_folded = self._surface.folded_lids[face]
+        is_pinned = sides.triangles[face] | is_inner | is_untouched | is_folded
         rows = np.flatnonzero((share > MIN_PULL) & ~is_pinned)
         plausible = ((sides.color[face] - 0.5) / SH_C0).astype(np.float32)
         inner = np.searchsorted(self._inner.face, face[is_inner])

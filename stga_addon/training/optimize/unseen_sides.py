@@ -13,6 +13,7 @@ from .likeness import (
     BROWS_LEVEL,
     SMOOTHED,
     HeadCoordinates,
+    face_of,
     hairy_triangles,
     inside_colors,
     lining_of,
@@ -127,6 +128,7 @@ def unseen_sides(surface: Surface) -> UnseenSides:
     inside |= _unseen_teeth(capture, pixels, shown)
     within = inside | (~is_outside & ~shown)
     found[within] = inside_colors(capture, color, shown, within)
+    shown[_color_lids(surface, is_source, color, found)] = False
     triangles = (is_outside & (cosine < UNSEEN_COSINE)) | inside
     aside = np.where((unseen | ~(shown | is_hair))[:, None], found, aside)
     return UnseenSides(triangles, shown, found, is_hair, np.where(is_hair, 1.0, turned), aside)
@@ -186,6 +188,24 @@ def _mirrored_colors(
         gain = here / np.maximum(there, MIN_DIVISOR)
         found[rows] *= np.clip(gain, 1 / MAX_LIGHT_RATIO, MAX_LIGHT_RATIO)
     return hidden, np.clip(found, 0, 1)
+
+
+def _color_lids(
+    surface: Surface, is_source: np.ndarray, color: np.ndarray, found: np.ndarray
+) -> np.ndarray:
+    """Give lids that stay in their folds, which are in the shade, the usual color (F, 3) of their
+    half of the face in `found` (F, 3); returns which (F,) bool."""
+    colored = np.zeros_like(is_source)
+    at = surface.at
+    if at is None:
+        return colored
+    skin = face_of(at) & is_source
+    for half in (at.azimuth > 0, at.azimuth <= 0):
+        own = surface.folded_lids & half
+        if own.any() and (skin & half).any():
+            found[own] = np.median(color[skin & half], axis=0)
+            colored |= own
+    return colored
 
 
 def _fringe(at: HeadCoordinates, shown: np.ndarray) -> np.ndarray:
