@@ -422,6 +422,7 @@ def test_lids_close_over_eyes(filmed):
         meters = frames.unit_lengths[state.face[bound]]
         before = rng.normal(0, 1e-3, len(bound)) / meters
         state.parameters.xyz[bound, axis] = before
+        state.second.opacity[:] = 1  # as views show them
         SurfacePrior(frames).apply(Rows(state), Turn(20, 0.5, len(state)))
         height = state.parameters.xyz[bound, axis] * meters
         of_eyes = eyeballs[state.face[bound]]
