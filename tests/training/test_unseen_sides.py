@@ -17,6 +17,7 @@ from stga_addon.capture.camera import look_at
 from stga_addon.capture.images import read_image
 from stga_addon.capture.mesh_geometry import connected_parts, rasterize, silhouette
 from stga_addon.capture.model import View
+from stga_addon.flame.forward import neutral_frame
 from stga_addon.flame.model import faces_within, torso_faces
 from stga_addon.flame.parts import flame_model, key_regions
 from stga_addon.render.render import render, render_avatar
@@ -175,7 +176,7 @@ def bundled(from_one_side):
         faces=model.faces,
         neutral=model.v_template,
         mesh=lambda _: model.v_template,
-        flame=replace(from_one_side.flame, model=model),
+        flame=replace(from_one_side.flame, model=model, frame=lambda _: neutral_frame(model)),
         regions=key_regions(model),
     )
 
