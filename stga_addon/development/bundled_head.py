@@ -1,4 +1,5 @@
-"""Makes `flame/head.npz`, the head model that comes with this package, from ICT-FaceKit.
+"""Makes `flame/head.npz`, the head model that comes with this package, from ICT-FaceKit, and
+`tracking/networks/bundled_head_places.npz`, where landmarks lie on it.
 
 python -m stga_addon.development.bundled_head ict_facekit.npz. The input holds the model's neutral
 (V, 3) in centimeters, y up, looking along +z, tris (F, 3), identity (100, V, 3) in standard
@@ -16,6 +17,11 @@ import numpy as np
 from ..driving.performance import ARKIT_SHAPES, OPTIONAL
 from ..files import read_npz, write_npz
 from ..flame.model import BUNDLED_HEAD, JOINTS, SHAPE_STEP_M
+from ..flame.parts import flame_model
+from ..tracking.correspondence import calibrate
+from ..tracking.face_networks import FaceNetworks
+from ..tracking.landmarks import write_places
+from ..tracking.recorded import BUNDLED_PLACES
 from .arkit_shapes import METERS_PER_UNIT, ict_names
 
 # First and last vertex of the model's parts, and how many triangles of each are kept. Its second
@@ -96,6 +102,7 @@ def main(source: Path) -> None:
         },
         compressed=True,
     )
+    write_places(BUNDLED_PLACES, *calibrate(flame_model(None), FaceNetworks(), str(BUNDLED_HEAD)))
 
 
 def neutral_head(arrays: Mapping[str, np.ndarray]) -> np.ndarray:

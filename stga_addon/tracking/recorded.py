@@ -29,6 +29,8 @@ from .opened import OpenedFootage, begin_landmarks
 from .pictures import picture_of_first_frame
 from .stages import Crew, Stage
 
+BUNDLED_PLACES = Path(__file__).parent / "networks/bundled_head_places.npz"
+"""Of the bundled head, as `calibrate` finds them; made by `development/bundled_head.py`."""
 MIN_FACE_SHARE = 1 / 3  # Of the timesteps, at which a face has to be detected
 FACE_REMEDY = "where the face is too small in the frame, crop the video to head and shoulders"
 MIN_FACE_PIXELS = 1.0  # Extent of the landmarks in an image, below which they are but a point
@@ -113,8 +115,11 @@ def _detected(opened: OpenedFootage, crew: Crew) -> tuple[dict[str, CameraLandma
     is_begun = folder.is_begun(out)
     detector = FaceNetworks()
     crew.report(Stage.HEAD_MODEL, 0, 1)
-    head_file = opened.head_file or BUNDLED_HEAD
-    places, reliable = calibrate(opened.head.model, detector, str(head_file))
+    model = opened.head.model
+    if opened.head_file is None and opened.options.person is None:
+        places, reliable = read_places(BUNDLED_PLACES, len(model.faces))
+    else:
+        places, reliable = calibrate(model, detector, str(opened.head_file or BUNDLED_HEAD))
     begin_landmarks(opened)
     kept = out / folder.LANDMARKS_FOLDER
     write_places(kept / folder.PLACES_FILE, places, reliable)

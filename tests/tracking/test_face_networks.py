@@ -20,7 +20,9 @@ from stga_addon.tracking.fit import HeadFit
 from stga_addon.tracking.footage.open import open_footage
 from stga_addon.tracking.head_model import read_head_model
 from stga_addon.tracking.known_person import KnownPerson
+from stga_addon.tracking.landmarks import read_places
 from stga_addon.tracking.opened import TrackingOptions
+from stga_addon.tracking.recorded import BUNDLED_PLACES
 from stga_addon.tracking.solve import person
 from stga_addon.tracking.track import track
 
@@ -121,9 +123,15 @@ def test_a_face_is_looked_for_in_parts_only_where_the_frame_shows_none(pictures,
 def test_landmarks_of_lips_and_lids_lie_on_what_moves_them():
     """Catches the lower lip's landmarks on the upper lip, which they touch while the mouth is
     closed, and those of lids on the eyeballs: an open mouth would be tracked as closed, and a blink
-    as half of one."""
+    as half of one. And places that are kept of another head or other networks."""
     model = flame_model(None)
-    places, _ = calibrate(model, FaceNetworks(), "head")
+    places, used = calibrate(model, FaceNetworks(), "head")
+    kept, kept_used = read_places(BUNDLED_PLACES, len(model.faces))
+    both = used & kept_used
+    assert both.sum() > 0.98 * max(used.sum(), kept_used.sum())
+    at = [own.on(model.v_template, model.faces)[both] for own in (kept, places)]
+    apart = norm(at[0] - at[1], axis=1)
+    assert np.quantile(apart, 0.95) < 2e-4  # as processors round
 
     def moved(name):
         shape = model.shapedirs[:, :, model.n_identity + model.expression_names.index(name)]
