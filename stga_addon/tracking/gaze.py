@@ -23,8 +23,8 @@ IRIS_SIGMA_M = 0.0005
 MAX_GAZE_RAD = 0.7
 """Up, down or aside; no eye turns farther."""
 PARALLEL_QUANTILE = 0.8
-"""Of how far a take's left eye looks to the left of the right one: eyes that look in parallel, as
-they converge otherwise, and never look apart."""
+"""Of how far a take's left eye looks to the left of the right one, at which both look in parallel:
+eyes converge on what is near, and do not look apart."""
 AXES = 2
 """About which an eye turns: x, by which it looks up and down, and y, aside."""
 
@@ -33,10 +33,10 @@ def with_gaze(fit: HeadFit, take: RecordedTake, is_stranger: bool) -> HeadFit:
     """The fit, its eyes turned so that the foremost points of the eyeballs are where the take's
     landmarks have the irises; as it is where there are no eyeballs, or no landmarks of irises.
 
-    Beside hundreds of landmarks of skin, two of irises hardly count: eyes would turn by half of
-    what they do. is_stranger: the model's eyeballs may be some millimeters off, which turns both
-    eyes all the time: in the median over the take, they are said to look in parallel, where the fit
-    has them. Of a known person, landmarks are corrected for that (`without_bias`).
+    Beside hundreds of landmarks of skin, two of irises hardly count: eyes would turn by less than
+    half of what they do. is_stranger: the model's eyeballs may be some millimeters off, which would
+    turn each eye all the time: where they converge least, they are said to look in parallel, and in
+    the median where the fit has them. Of a known person, landmarks are corrected (`without_bias`).
     """
     model = fit.head.model
     on_eyeball = (model.weights[model.faces] > EYEBALL_WEIGHT).all(axis=1)[take.places.face]
@@ -73,9 +73,8 @@ def with_gaze(fit: HeadFit, take: RecordedTake, is_stranger: bool) -> HeadFit:
 
 
 def _rest(turns: np.ndarray) -> np.ndarray:
-    """(2 E,) how one or two eyes stand on their eyeballs while both look in parallel straight
-    ahead, from how they turn in a take (T, 2 E), left one first: half of the time they look higher
-    or more to the left, and most of the time they look at what is near."""
+    """(2 E,) the turns of one or two eyes, the left one first, at which they look straight ahead
+    and in parallel, by all of a take (T, 2 E): their medians, as far apart as they seldom are."""
     rest = np.median(turns, axis=0)
     if turns.shape[1] > AXES:
         left, right = (turns - rest)[:, 1::AXES].T

@@ -242,7 +242,7 @@ class Surface:
 
     @cached_property
     def folded_lids(self) -> np.ndarray:
-        """(F,) bool: those of eyes that no training view shows closed."""
+        """(F,) bool: the lids of eyes that no training view shows closed."""
         found = np.zeros(len(self.capture.faces), bool)
         flame = self.capture.flame
         if flame is None or not self._lids:

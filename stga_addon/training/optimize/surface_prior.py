@@ -124,7 +124,7 @@ class SurfacePrior:
         # the avatar is made of averages, which only steps move
         is_untouched = ~sides.shown[face] & ~columns["second/color"].any(1)
         # of a lid, the edge of a fold is seen, in the fold's shade
-        is_folded = self._surface.folded_lids[face]
+        is_folded = self._surface.folded_lids[face] & ~sides.shown[face]
         is_pinned = sides.triangles[face] | is_inner | is_untouched | is_folded
         rows = np.flatnonzero((share > MIN_PULL) & ~is_pinned)
         plausible = ((sides.color[face] - 0.5) / SH_C0).astype(np.float32)
