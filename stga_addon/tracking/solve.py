@@ -326,17 +326,20 @@ def prior_terms(head: HeadModel, values: np.ndarray) -> tuple[np.ndarray, np.nda
         precision[..., :-RIGID_SIZE] += (excess != 0) / WEIGHT_EXCESS_SIGMA**2
         right[..., :-RIGID_SIZE] -= excess / WEIGHT_EXCESS_SIGMA**2
         for side in ("Left", "Right"):
-            lid = {
-                head.model.expression_names.index(name + side): share
-                for name, share in LID_SHAPES.items()
-                if name + side in head.model.expression_names
-            }
-            columns = list(lid)
-            shares = np.array(list(lid.values()))
+            columns, shares = lid_shares(head.model, side)
             beyond = np.maximum((weights[..., columns] * shares).sum(-1, keepdims=True) - 1, 0)
             precision[..., columns] += (beyond > 0) * shares * shares.sum() / WEIGHT_EXCESS_SIGMA**2
             right[..., columns] -= beyond * shares / WEIGHT_EXCESS_SIGMA**2
     return precision, right
+
+
+def lid_shares(model: FlameModel, side: str) -> tuple[list[int], np.ndarray]:
+    """Columns (N,) of the expressions that close the eye on a side, "Left" or "Right", and their
+    shares (N,)."""
+    names = model.expression_names
+    known = [name for name in LID_SHAPES if name + side in names]
+    columns = [names.index(name + side) for name in known]
+    return columns, np.array([LID_SHAPES[name] for name in known])
 
 
 def acceleration_precision(model: FlameModel) -> np.ndarray:

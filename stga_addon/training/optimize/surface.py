@@ -22,7 +22,7 @@ from ...capture.mesh_geometry import (
 from ...capture.model import Capture, View, evenly_spread, views_by_timestep
 from ...flame.model import torso_faces
 from ...flame.quaternions import unit
-from ...tracking.solve import LID_SHAPES
+from ...tracking.solve import lid_shares
 from .initial_splats import FEW_CAMERAS, SAMPLED_HEIGHT_PIXELS, mirrored, voxel_size
 from .likeness import (
     JAW_LEVEL,
@@ -71,7 +71,7 @@ LID_STRETCH = 1.8
 CLOSED_SHARE = 0.6
 MIN_SQUARED_AREA = 1e-28
 """Expressions that pull lids out of their folds, how much longer they make them, and how far eyes
-are tracked that are closed (`LID_SHAPES`); squared meters, of triangles without area."""
+are tracked that are closed (`lid_shares`); squared meters, of triangles without area."""
 NECK_LEVEL = -1.1
 NECK_HALF_HEIGHT = 0.4
 NECK_SIDE_DEG = 95.0
@@ -249,12 +249,9 @@ class Surface:
             return found
         timesteps = views_by_timestep(self.capture.views["train"])
         weights = np.array([flame.frame(timestep).expr for timestep in timesteps])
-        names = flame.model.expression_names
         for blink, own in self._lids.items():
-            side = blink.removeprefix("eyeBlink")
-            shapes = {name + side: share for name, share in LID_SHAPES.items()}
-            known = {names.index(name): shapes[name] for name in set(shapes) & set(names)}
-            if (weights[:, list(known)] @ list(known.values())).max() < CLOSED_SHARE:
+            columns, shares = lid_shares(flame.model, blink.removeprefix("eyeBlink"))
+            if (weights[:, columns] @ shares).max() < CLOSED_SHARE:
                 found |= own
         return found
 

@@ -41,7 +41,7 @@ beside the eye and the lips."""
 LINING_SHARE = 0.5
 """Of the scale of a triangle's only splat: the largest behind closed lips."""
 EYE_DEPTH_M = 0.0005
-"""Least depth of splats on eyeballs."""
+"""Least depth of splats below the eyeballs that they are on."""
 BORDER_INSET = 0.6
 """Of the distance from the middle of a triangle, and of the scale, at the mesh's edge."""
 FLAT_VOXELS = 0.25

@@ -79,9 +79,8 @@ def unseen_sides(surface: Surface) -> UnseenSides:
     nearest connected ones. What views show looks as there."""
     capture = surface.capture
     cosine = surface.facing
-    views = _color_views(capture)
     is_outside = surface.outside
-    color, pixels = mean_colors(capture, views)
+    color, pixels = mean_colors(capture, _color_views(capture))
     density = pixels / np.maximum(face_areas(capture.neutral, capture.faces), MIN_DIVISOR)
     facing = density[cosine > SOURCE_COSINE]
     usual = np.median(facing[facing > 0]) if facing.any() else 0.0
@@ -124,11 +123,12 @@ def unseen_sides(surface: Surface) -> UnseenSides:
     hidden, mirrored = _mirrored_colors(surface, color, unseen | turns_away, is_source, hair)
     found[hidden] = mirrored
     shown[hidden] = False
-    inside = _unseen_inside(capture, pixels > 0, is_outside)
-    inside |= _unseen_teeth(capture, pixels, shown)
+    inside = _unseen_inside(capture, pixels > 0, is_outside) | _unseen_teeth(capture, pixels, shown)
     within = inside | (~is_outside & ~shown)
     found[within] = inside_colors(capture, color, shown, within)
-    shown[_color_lids(surface, is_source, color, found)] = False
+    lids, of_skin = _lid_colors(surface, is_source, color)
+    found[lids] = of_skin
+    shown[lids] = False
     triangles = (is_outside & (cosine < UNSEEN_COSINE)) | inside
     aside = np.where((unseen | ~(shown | is_hair))[:, None], found, aside)
     return UnseenSides(triangles, shown, found, is_hair, np.where(is_hair, 1.0, turned), aside)
@@ -190,22 +190,20 @@ def _mirrored_colors(
     return hidden, np.clip(found, 0, 1)
 
 
-def _color_lids(
-    surface: Surface, is_source: np.ndarray, color: np.ndarray, found: np.ndarray
-) -> np.ndarray:
-    """Give lids that stay in their folds, which are in the shade, the usual color (F, 3) of their
-    half of the face in `found` (F, 3); returns which (F,) bool."""
-    colored = np.zeros_like(is_source)
+def _lid_colors(
+    surface: Surface, is_source: np.ndarray, color: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Lids (M,) that stay in their folds, which are in the shade, and the usual color (M, 3) of the
+    skin in their half of the face; none where no skin is shown there."""
+    found = np.full(color.shape, np.nan)
     at = surface.at
-    if at is None:
-        return colored
-    skin = face_of(at) & is_source
-    for half in (at.azimuth > 0, at.azimuth <= 0):
-        own = surface.folded_lids & half
-        if own.any() and (skin & half).any():
-            found[own] = np.median(color[skin & half], axis=0)
-            colored |= own
-    return colored
+    if at is not None:
+        skin = face_of(at) & is_source
+        for half in (at.azimuth > 0, at.azimuth <= 0):
+            if (skin & half).any():
+                found[surface.folded_lids & half] = np.median(color[skin & half], axis=0)
+    lids = np.flatnonzero(np.isfinite(found[:, 0]))
+    return lids, found[lids]
 
 
 def _fringe(at: HeadCoordinates, shown: np.ndarray) -> np.ndarray:
