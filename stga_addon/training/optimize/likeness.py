@@ -80,6 +80,7 @@ class HeadCoordinates:
     side       (F,) distance from the middle plane, in the same unit
     unit       meters from the eyes to the mouth
     eyes       (3,) their middle
+    middle     (3,) of the head, at the height of the brows
     axes       (3, 3) unit vectors to the head's left, up and ahead
     """
 
@@ -89,6 +90,7 @@ class HeadCoordinates:
     side: np.ndarray
     unit: float
     eyes: np.ndarray
+    middle: np.ndarray
     axes: np.ndarray
 
 
@@ -109,6 +111,7 @@ def head_coordinates(capture: Capture) -> HeadCoordinates | None:
         side=np.abs(x) / unit,
         unit=unit,
         eyes=eyes,
+        middle=middle,
         axes=axes,
     )
 

@@ -18,6 +18,7 @@ from .change import Turn
 from .frames import FrameStore
 from .likeness import eyeballs_of, lining_of
 from .state import parameters_and_average
+from .unseen_hair import UnseenHair
 
 WELL_SEEN_COSINE = 0.8
 BEHIND_COSINE = -0.5
@@ -127,7 +128,12 @@ class SurfacePrior:
         is_folded = self._surface.folded_lids[face] & ~sides.shown[face]
         is_pinned = sides.triangles[face] | is_inner | is_untouched | is_folded
         rows = np.flatnonzero((share > MIN_PULL) & ~is_pinned)
-        plausible = ((sides.color[face] - 0.5) / SH_C0).astype(np.float32)
+        colors = sides.color[face]
+        hair = np.flatnonzero(sides.is_hair[face])
+        if len(hair):
+            shades = self._hair.shades(face[hair], columns["parameters/xyz"][hair])
+            colors[hair] *= shades[:, None]
+        plausible = ((colors - 0.5) / SH_C0).astype(np.float32)
         inner = np.searchsorted(self._inner.face, face[is_inner])
         plausible[is_inner] = self._inner.sh[inner, 0]
         color = columns["parameters/color"][rows]
@@ -159,7 +165,7 @@ class SurfacePrior:
         opacity += share * (HIDDEN_OPACITY - opacity)
         xyz = columns["parameters/xyz"][rows]
         axis = NORMAL_AXIS[self._frames.convention]
-        height = self._frames.layer_height[face[rows]]
+        height = self._hair.height(face[rows], xyz)
         xyz[:, axis] += share * (height - xyz[:, axis])
         values = {"opacity": opacity, "xyz": xyz}
         backend.assign(bound[rows], parameters_and_average(values))
@@ -176,7 +182,7 @@ class SurfacePrior:
         log_scale = columns["parameters/log_scale"][rows]
         limits = limit / self._frames.unit_lengths[face[rows]]
         is_layer = self._surface.closed & (self._surface.facing < BEHIND_COSINE)
-        least = np.where(is_layer, self._frames.hair_layer_scale, 0.0)[face[rows]]
+        least = np.where(is_layer, self._hair.least_width, 0.0)[face[rows]]
         off = thickness(rotation, log_scale, axis) > FLAT_TOLERANCE * limits
         off |= width(rotation, log_scale, axis) * FLAT_TOLERANCE < least
         off = np.flatnonzero(off)
@@ -242,6 +248,10 @@ class SurfacePrior:
     @cached_property
     def _eyeballs(self) -> np.ndarray:
         return eyeballs_of(self._frames.capture)
+
+    @cached_property
+    def _hair(self) -> UnseenHair:
+        return UnseenHair(self._frames)
 
     @cached_property
     def _inner(self) -> Splats:
@@ -313,7 +323,7 @@ def above_unseen_hair(frames: FrameStore, splats: Splats) -> np.ndarray:
 
 def hidden_splats(frames: FrameStore, settings: TrainingSettings) -> Splats:
     """A dense opaque layer on the `closed` triangles, in which no view splits splats: on skin and
-    clothes, or where the outer layer of hair is."""
+    clothes, or where the outer layer of hair is, of strands where no outline shows it."""
     capture = frames.capture
     surface = frames.surface
     axis = NORMAL_AXIS[frames.convention]
@@ -325,14 +335,17 @@ def hidden_splats(frames: FrameStore, settings: TrainingSettings) -> Splats:
         HIDDEN_OPACITY,
         convention=frames.convention,
     )
-    layer = layer.rows(surface.closed[layer.face])
+    hair = UnseenHair(frames)
+    strands = [hair.strands(layer)] if hair.has_strands.any() else []
+    layer = layer.rows((surface.closed & ~hair.has_strands)[layer.face])
     face = layer.face
     inset = np.where(surface.border, BORDER_INSET, 1.0)[face]
     xyz = layer.xyz * inset[:, None]
     xyz[:, axis] += frames.layer_height[face]
     log_scale = layer.log_scale + np.log(inset * frames.hair_widening[face])[:, None]
     log_scale[:, axis] += np.log(HIDDEN_FLATNESS)
-    return replace(layer, xyz=xyz.astype(np.float32), log_scale=log_scale.astype(np.float32))
+    layer = replace(layer, xyz=xyz.astype(np.float32), log_scale=log_scale.astype(np.float32))
+    return joined([layer, *strands])
 
 
 def splats_behind(frames: FrameStore, sh_degree: int) -> Splats:

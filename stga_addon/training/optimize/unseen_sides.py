@@ -44,6 +44,9 @@ SOURCE_TRIANGLES = 100
 """Of whose colors a hidden triangle has the median."""
 MAX_LIGHT_RATIO = 2.0
 """Of the light on one side of a face to that on the other."""
+SMOOTHING = {"scalp": (SMOOTHED, 1.0), "body": (4 * SMOOTHED, 3.0)}
+"""Triangles over which copied colors are smoothed, and by how much those above and below count as
+farther than those beside: collars are level, and a neck's front has shadows that its back has not."""
 SHOWN_COSINE = 0.5
 ASIDE_SHARE = 0.75
 """Of the angle between a triangle and the camera that it faces most, above which its color depends
@@ -118,8 +121,7 @@ def unseen_sides(surface: Surface) -> UnseenSides:
             rows = np.flatnonzero(members & unseen)
             if len(own) and len(rows):
                 copied = color[sources_around_head(at, own, rows)]
-                around = nearest_rows(centers[rows], centers[rows], SMOOTHED)
-                found[rows] = np.median(copied[around], axis=1)
+                found[rows] = _smoothed(copied, centers[rows] @ at.axes.T, SMOOTHING[kind])
     hidden, mirrored = _mirrored_colors(surface, color, unseen | turns_away, is_source, hair)
     found[hidden] = mirrored
     shown[hidden] = False
@@ -140,7 +142,16 @@ def plausible_aside(splats: Splats, along: np.ndarray, sides: UnseenSides) -> Sp
     face = splats.face
     share = ASIDE_SHARE * sides.view_dependence[face]
     share[splats.unbound & ~sides.is_hair[face]] = 0
+    share[sides.triangles[face]] = 0  # they have one color from everywhere, and hair its locks
     return colored_aside(splats, along[face], share, sides.aside[face])
+
+
+def _smoothed(color: np.ndarray, places: np.ndarray, smoothing: tuple[int, float]) -> np.ndarray:
+    """Colors (N, 3), of each the median of those around it, as SMOOTHING has it; places (N, 3) to
+    the head's left, up and ahead."""
+    count, level_weight = smoothing
+    places = places * [1, level_weight, 1]
+    return np.asarray(np.median(color[nearest_rows(places, places, count)], axis=1))
 
 
 def _as_nearest(

@@ -1,0 +1,156 @@
+"""Strands of hair where no view shows any: in one color and without them, it looks like a helmet."""
+
+from dataclasses import replace
+from functools import cached_property
+
+import numpy as np
+
+from ...avatar.embedding import face_areas, points_to_world, to_local
+from ...avatar.lattice import NORMAL_AXIS
+from ...avatar.splats import Splats
+from ...capture.mesh_geometry import vertex_normals
+from ...flame.quaternions import from_matrices, unit
+from .frames import FrameStore
+from .likeness import HeadCoordinates
+
+STRAND_COSINE = -0.3
+"""Of the angle between a triangle and the camera that it faces most, below which strands grow:
+longer than the layer's splats, they would stand in outlines."""
+STRAND_SIZE = (0.075, 0.011, 0.004)
+STRANDS_PER_AREA = 1600.0
+STRAND_OPACITY = 3.0
+"""Standard deviations of a strand along and across its growth and along the normal, in distances of
+the eyes from the mouth; strands in that distance's square, which hide what is below; logit."""
+SMOOTHING_STEPS = 10
+"""Means over neighbors of the height of hair, which changes from one triangle to the next."""
+CROWN_ELEVATION_DEG = 55.0
+"""Of the place from which hair grows in all directions, behind the middle of the head."""
+SHADE = 0.15
+LOCKS = 400
+LOCK_LENGTH = 0.7
+"""Standard deviation of the brightness of locks, as a share of it; how many lie around the head,
+and how far one keeps its brightness, in distances of the eyes from the mouth."""
+
+
+class UnseenHair:
+    """Hair's outer layer where it faces away from all cameras: the same in every run."""
+
+    def __init__(self, frames: FrameStore) -> None:
+        self._frames = frames
+
+    @cached_property
+    def has_strands(self) -> np.ndarray:
+        """(F,) bool: triangles whose layer of hair consists of strands."""
+        surface = self._frames.surface
+        is_hair = self._frames.sides.is_hair
+        return np.asarray(surface.closed & is_hair & (surface.facing < STRAND_COSINE))
+
+    def strands(self, like: Splats) -> Splats:
+        """Opaque splats that lie on the hair's surface in the direction of growth, without color;
+        with as many harmonics as `like`, of which there is one at least."""
+        at = self._at
+        faces = self._frames.capture.faces
+        surface = self._surface
+        rows = np.flatnonzero(self.has_strands)
+        wanted = STRANDS_PER_AREA * face_areas(surface, faces[rows]) / at.unit**2
+        rng = np.random.default_rng(0)
+        face = np.repeat(rows, rng.poisson(wanted))
+        weights = rng.dirichlet(np.ones(3), len(face))[:, :, None]
+        place = (surface[faces[face]] * weights).sum(1)
+        normal = unit((vertex_normals(surface, faces)[faces[face]] * weights).sum(1), 1e-20)
+        along = growth(at, place, normal)
+        axes = np.stack([along, np.cross(normal, along), normal], axis=2)
+        world = replace(
+            like.rows(np.zeros(len(face), int)),
+            xyz=place.astype(np.float32),
+            rotation=from_matrices(axes).astype(np.float32),
+            log_scale=np.tile(np.log(np.array(STRAND_SIZE) * at.unit), (len(face), 1)),
+            opacity=np.full(len(face), STRAND_OPACITY, np.float32),
+        )
+        return to_local(world, self._frames.neutral, face)
+
+    @cached_property
+    def least_width(self) -> np.ndarray:
+        """(F,) standard deviation of splats of the layer, geometric mean of both directions in it,
+        in local units."""
+        frames = self._frames
+        if not self.has_strands.any():
+            return frames.hair_layer_scale
+        strand = self._at.unit * np.sqrt(STRAND_SIZE[0] * STRAND_SIZE[1]) / frames.unit_lengths
+        return np.where(self.has_strands, strand, frames.hair_layer_scale)
+
+    def height(self, face: np.ndarray, xyz: np.ndarray) -> np.ndarray:
+        """(N,) of the layer at places (N, 3) on triangles, in local units; it is smooth where
+        strands grow."""
+        frames = self._frames
+        height = frames.layer_height[face]
+        rows = np.flatnonzero(self.has_strands[face])
+        if len(rows):
+            own = face[rows]
+            corners = self._surface[frames.capture.faces[own]] - frames.neutral.origin[own][:, None]
+            local = np.einsum("nji,ncj->nci", frames.neutral.rotation[own], corners)
+            local /= frames.unit_lengths[own, None, None]
+            normal = np.cross(local[:, 1] - local[:, 0], local[:, 2] - local[:, 0])
+            axis = NORMAL_AXIS[frames.convention]
+            below = ((xyz[rows] - local[:, 0]) * normal).sum(1) / normal[:, axis]
+            height[rows] = xyz[rows, axis] - below
+        return height
+
+    def shades(self, face: np.ndarray, xyz: np.ndarray) -> np.ndarray:
+        """(N,) by how much hair at places (N, 3) on triangles is brighter than usual."""
+        return lock_shades(self._at, points_to_world(xyz, self._frames.neutral, face))
+
+    @property
+    def _at(self) -> HeadCoordinates:
+        at = self._frames.surface.at
+        assert at is not None  # hair is known only where a head's parts are
+        return at
+
+    @cached_property
+    def _surface(self) -> np.ndarray:
+        """(V, 3) the neutral mesh, where strands grow moved to the middle of the layer."""
+        frames = self._frames
+        neutral = np.asarray(frames.capture.neutral, np.float64)
+        own = frames.capture.faces[self.has_strands]
+        uses = np.maximum(np.bincount(own.ravel(), minlength=len(neutral)), 1)
+        of_triangles = (frames.layer_height * frames.unit_lengths)[self.has_strands]
+        for _ in range(SMOOTHING_STEPS):
+            height = np.bincount(own.ravel(), np.repeat(of_triangles, 3), len(neutral)) / uses
+            of_triangles = height[own].mean(1)
+        return neutral + height[:, None] * vertex_normals(neutral, frames.capture.faces)
+
+
+def growth(at: HeadCoordinates, places: np.ndarray, normals: np.ndarray) -> np.ndarray:
+    """Unit vectors (N, 3) in which hair grows at places (N, 3) of a surface with these normals
+    (N, 3): away from the crown, which is down at the sides and behind."""
+    outward = unit(places - at.middle, 1e-20)
+    crown = _crown(at)
+    away = (outward @ crown)[:, None] * outward - crown
+    away -= (away * normals).sum(1, keepdims=True) * normals
+    return unit(away, 1e-20)
+
+
+def lock_shades(at: HeadCoordinates, places: np.ndarray) -> np.ndarray:
+    """(N,) by how much hair at places (N, 3) is brighter than usual: locks, which reach from the
+    crown down, have a brightness of their own, that changes slowly along them."""
+    crown = _crown(at)
+    across = at.axes[0]
+    away = places - at.middle
+    turn = np.arctan2(away @ np.cross(crown, across), away @ across) / (2 * np.pi)
+    distance = np.linalg.norm(away, axis=1)
+    angle = np.arccos(np.clip(away @ crown / np.maximum(distance, 1e-20), -1, 1))
+    place = np.stack([LOCKS * turn, distance * angle / (LOCK_LENGTH * at.unit)])
+    cell = np.floor(place).astype(int)
+    column, row = place - cell
+    brightness = np.random.default_rng(0).standard_normal((LOCKS, LOCKS))
+    total = np.zeros(len(places))
+    for right, lower in ((0, 0), (0, 1), (1, 0), (1, 1)):
+        weight = abs(1 - right - column) * abs(1 - lower - row)
+        total += weight * brightness[(cell[0] + right) % LOCKS, (cell[1] + lower) % LOCKS]
+    return np.asarray(1 + SHADE * total)
+
+
+def _crown(at: HeadCoordinates) -> np.ndarray:
+    """Unit vector (3,) from the middle of the head."""
+    elevation = np.radians(CROWN_ELEVATION_DEG)
+    return np.asarray(np.sin(elevation) * at.axes[1] - np.cos(elevation) * at.axes[2])
