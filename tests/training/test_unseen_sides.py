@@ -9,10 +9,11 @@ from numpy.linalg import norm
 from numpy.testing import assert_allclose, assert_array_equal
 from PIL import Image
 from scipy.ndimage import binary_dilation, binary_erosion
+from scipy.spatial import cKDTree
 
-from stga_addon.avatar.embedding import face_areas, points_to_world
+from stga_addon.avatar.embedding import face_areas, points_to_world, to_world
 from stga_addon.avatar.lattice import lattice_splats
-from stga_addon.avatar.splats import SH_C0, colored_aside, sh_color
+from stga_addon.avatar.splats import SH_C0, colored_aside, joined, sh_color
 from stga_addon.capture.camera import look_at
 from stga_addon.capture.images import read_image
 from stga_addon.capture.mesh_geometry import connected_parts, rasterize, silhouette
@@ -20,13 +21,14 @@ from stga_addon.capture.model import View
 from stga_addon.flame.forward import neutral_frame
 from stga_addon.flame.model import faces_within, torso_faces
 from stga_addon.flame.parts import flame_model, key_regions
+from stga_addon.flame.quaternions import to_matrices
 from stga_addon.render.render import render, render_avatar
 from stga_addon.tracking.torso_cloth import draped, torso_sheet
 from stga_addon.training.optimize.change import Turn
 from stga_addon.training.optimize.frames import FrameStore
 from stga_addon.training.optimize.initial_splats import flat_points
 from stga_addon.training.optimize.likeness import face_of, head_coordinates
-from stga_addon.training.optimize.state import state_of_avatar
+from stga_addon.training.optimize.state import new_state, state_of_avatar
 from stga_addon.training.optimize.surface import GRAZING_COSINE, Surface
 from stga_addon.training.optimize.surface_prior import (
     BACKING_OPACITY,
@@ -243,6 +245,94 @@ def test_hair_goes_round_the_head(angles, height, fringe, hair, bundled, tmp_pat
         assert rows.sum() > 8, part
         off = np.abs(255 * sides.color[rows] - own).max(1)
         assert (off < 25).mean() > 0.9, part
+
+
+@pytest.mark.parametrize("convention", ["stga", "gaussian_avatars"])
+def test_unseen_hair_grows_in_locks(convention, bundled, tmp_path):
+    """Catches a helmet of one color, strands across the direction of growth or with gaps, locks
+    that fade, change from turn to turn or reach skin, and light that takes them away from aside."""
+    capture = filmed(bundled, painted(bundled, GRAY), TURNS_DEG, 0.0, tmp_path)
+    frames = FrameStore(capture, convention)
+    surface = frames.surface
+    surface.hair_height = np.where(surface.kinds["scalp"], 0.02, 0)  # as outlines would tell it
+    layer = hidden_splats(frames, quick_settings(convention=convention, sh_degree=0))
+    longest = np.argsort(layer.log_scale, axis=1)
+    aspect = np.exp(np.diff(np.sort(layer.log_scale, axis=1), axis=1)[:, 1])
+    strands = aspect > 3
+    centers, level = middles(bundled)
+    hair = (level > -0.9) & (centers[:, 2] < -0.08)
+    assert strands[hair[layer.face]].mean() > 0.95
+    assert not strands[(level < -1.5)[layer.face]].any()
+    world = to_world(layer, frames.neutral)
+    axes = to_matrices(world.rotation)
+    along = np.take_along_axis(axes, longest[:, None, 2:], axis=2)[..., 0]
+    behind = strands & (level < 0.2)[layer.face] & (abs(centers[:, 0]) < 0.04)[layer.face]
+    assert np.median(abs(along[behind, 1])) > 0.85  # down, along the nape
+    on_top = strands & (level > 1.2)[layer.face]
+    from_above = np.array([0, -0.15, -1])  # to the crown, which lies behind the top
+    assert np.median(abs(along[on_top] @ from_above)) > 0.8
+    camera = look_at([0, 0.05, -1], [0, 0.05, 0], 320, 400, 960)
+    triangle, _ = rasterize(bundled.neutral, bundled.faces, camera)
+    shown = binary_erosion((triangle >= 0) & hair[triangle], iterations=6)
+    assert shown.sum() > 2000
+    assert alpha_of(layer, camera, frames.neutral)[shown].min() > 0.98
+    state = new_state(joined([layer, splats_behind(frames, 0)]))
+    prior = SurfacePrior(frames)
+    prior.apply(Rows(state), Turn(20, 0.5, len(state)))
+    once = state.average.sh.copy()
+    prior.apply(Rows(state), Turn(40, 0.5, len(state)))
+    assert_allclose(state.average.sh, once, atol=1e-3)
+    for name in ("xyz", "log_scale"):
+        kept = getattr(state.average, name)[: len(layer)][strands]
+        assert_allclose(kept, getattr(layer, name)[strands], atol=1e-3)
+    colors = sh_color(state.average.sh, np.array([0.0, 0, 1]))[: len(layer)]
+    shade = colors / frames.sides.color[layer.face]
+    pinned = frames.sides.triangles[layer.face]
+    assert np.ptp(shade[pinned & strands], axis=1).max() < 1e-3  # of one hue
+    assert 0.08 < shade[pinned & strands].std() < 0.2
+    assert abs(shade[pinned & strands].mean() - 1) < 0.02
+    assert_allclose(shade[pinned & (level < -1.5)[layer.face]], 1, atol=1e-3)
+    place = world.xyz[behind]
+    near, apart = (
+        np.corrcoef(shade[behind, 0], shade[behind, 0][nearest(place * weights)])[0, 1]
+        for weights in ([50, 1, 50], [1, 50, 1])  # in the same lock, and at the same height
+    )
+    assert near > apart + 0.2
+    splats = replace(layer, sh=once[: len(layer)])
+    aside = plausible_aside(splats, np.tile(np.float32([0, 0, 1]), (len(hair), 1)), frames.sides)
+    assert_array_equal(aside.sh[strands, 0], splats.sh[strands, 0])
+
+
+def nearest(places):
+    """(N,) row of the place nearest to each of these (N, 3) but itself."""
+    return cKDTree(places).query(places, 2)[1][:, 1]
+
+
+def test_hair_ends_at_the_ears(bundled, tmp_path):
+    """Catches skin around ears where hair is, and hair on them: their shells stand out."""
+    sides = sides_of(filmed(bundled, painted(bundled), (0,), 0.0, tmp_path))
+    centers, level = middles(bundled)
+    outside = Surface(bundled).outside
+    beside = outside & (abs(centers[:, 0]) > 0.062) & (level > -1)
+    shells = beside & (abs(centers[:, 0]) > 0.08)
+    above = beside & (level > 0.35) & (centers[:, 2] < -0.01)
+    behind = beside & (abs(level) < 0.3) & (centers[:, 2] < -0.03)
+    for rows, color in ((shells, SKIN), (above, HAIR), (behind, HAIR)):
+        rows = rows & sides.triangles
+        assert rows.sum() > 20
+        assert np.mean(np.abs(255 * sides.color[rows] - color).max(1) < 30) > 0.95
+
+
+def test_shadows_on_a_neck_do_not_go_round_it(bundled, tmp_path):
+    """Catches patches behind a neck, copied from its front, where the chin's shadow is."""
+    color = painted(bundled)
+    centers, level = middles(bundled)
+    spots = np.sin(centers[:, 0] * 400) > 0.5
+    color[spots & (level < -1.2) & (level > -2.2)] = 0.6 * SKIN
+    sides = sides_of(filmed(bundled, color, TURNS_DEG, 0.0, tmp_path))
+    back = sides.triangles & (centers[:, 2] < -0.03) & (level > -2.1) & (level < -1.4)
+    assert back.sum() > 20
+    assert np.mean(np.abs(255 * sides.color[back] - SKIN).max(1) < 25) > 0.9
 
 
 def test_what_lips_and_lids_hide(bundled, tmp_path):

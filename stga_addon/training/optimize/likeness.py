@@ -23,17 +23,22 @@ CHIN_LEVEL = -2.0
 TORSO_HEIGHT = 2.0
 """Places on a head, in distances of its eyes from its mouth: how far its middle lies behind the
 eyes and above them; heights over the eyes; of a torso, which a bust's end has not."""
-HAIRLINE_DEG = (90.0, 140.0)
-HAIRLINE = (-0.55, -1.15)
-LONG_HAIRLINE = (-0.55, -2.3)
+JAW_DEG = (76.0, 90.0)
+JAW = (-1.0, JAW_LEVEL)
+"""Angles from straight ahead, and heights over the eyes in that unit, below which the neck begins:
+a jaw reaches lower than what is behind it."""
+HAIRLINE_DEG = (84.0, 112.0, 140.0)
+HAIRLINE = (0.15, -0.55, -1.15)
+LONG_HAIRLINE = (0.15, -1.0, -2.3)
+HANGING_DEG = (90.0, 140.0)
 HANGING_RISE = 0.6
-"""Angles from straight ahead, and heights over the eyes in that unit, below which no hair grows, or
-none hangs; how far below the first it has its full distance from the neck."""
+"""The same below which no hair grows, which begins above the ears, or none hangs; between which
+angles, and how far below the first, it gets its full distance from the neck."""
 EAR_SIDE = 0.93
-EAR_LEVEL = -0.2
-EAR_HEIGHT = 0.75
-EAR_ANGLE_DEG = 82.5
-EAR_WIDTH_DEG = 32.5
+EAR_LEVEL = -0.33
+EAR_HEIGHT = 0.57
+EAR_ANGLE_DEG = 90.0
+EAR_WIDTH_DEG = 14.0
 """How far from the middle plane ears begin, where they are, and half their extent."""
 BAND = 0.3
 MIN_BAND_TRIANGLES = 20
@@ -141,7 +146,8 @@ def kinds_of(
     hairy = (angle > SCALP_ANGLE_DEG) | (elevation > SCALP_ELEVATION_DEG)
     scalp = is_outside & ~ear & hairy & (at.level > hairline)
     beside = (angle > NECK_ANGLE_DEG) | (at.level < CHIN_LEVEL)
-    body = is_outside & ~ear & ~scalp & beside & (at.level < JAW_LEVEL)
+    below_jaw = at.level < np.interp(angle, JAW_DEG, JAW)
+    body = is_outside & ~ear & ~scalp & beside & below_jaw
     return {"scalp": scalp, "body": body}
 
 
@@ -150,7 +156,7 @@ def hanging_share(at: HeadCoordinates) -> np.ndarray:
     beside the neck, 1 behind it and further down."""
     angle = np.degrees(np.abs(at.azimuth))
     below = np.interp(angle, HAIRLINE_DEG, HAIRLINE) - at.level
-    behind = np.interp(angle, HAIRLINE_DEG, (0, 1))
+    behind = np.interp(angle, HANGING_DEG, (0, 1))
     return np.asarray(behind * np.clip(below / HANGING_RISE, 0, 1))
 
 

@@ -1,4 +1,4 @@
-"""Strands of hair where no view shows any: in one color and without them, it looks like a helmet."""
+"""Strands and locks of hair where no view shows any: without them, it looks like a helmet."""
 
 from dataclasses import replace
 from functools import cached_property
@@ -54,7 +54,7 @@ class UnseenHair:
         rows = np.flatnonzero(self.has_strands)
         wanted = STRANDS_PER_AREA * face_areas(surface, faces[rows]) / at.unit**2
         rng = np.random.default_rng(0)
-        face = np.repeat(rows, rng.poisson(wanted))
+        face = np.repeat(rows, np.maximum(rng.poisson(wanted), 1))
         weights = rng.dirichlet(np.ones(3), len(face))[:, :, None]
         place = (surface[faces[face]] * weights).sum(1)
         normal = unit((vertex_normals(surface, faces)[faces[face]] * weights).sum(1), 1e-20)
@@ -68,16 +68,6 @@ class UnseenHair:
             opacity=np.full(len(face), STRAND_OPACITY, np.float32),
         )
         return to_local(world, self._frames.neutral, face)
-
-    @cached_property
-    def least_width(self) -> np.ndarray:
-        """(F,) standard deviation of splats of the layer, geometric mean of both directions in it,
-        in local units."""
-        frames = self._frames
-        if not self.has_strands.any():
-            return frames.hair_layer_scale
-        strand = self._at.unit * np.sqrt(STRAND_SIZE[0] * STRAND_SIZE[1]) / frames.unit_lengths
-        return np.where(self.has_strands, strand, frames.hair_layer_scale)
 
     def height(self, face: np.ndarray, xyz: np.ndarray) -> np.ndarray:
         """(N,) of the layer at places (N, 3) on triangles, in local units; it is smooth where

@@ -44,9 +44,9 @@ SOURCE_TRIANGLES = 100
 """Of whose colors a hidden triangle has the median."""
 MAX_LIGHT_RATIO = 2.0
 """Of the light on one side of a face to that on the other."""
-SMOOTHING = {"scalp": (SMOOTHED, 1.0), "body": (4 * SMOOTHED, 3.0)}
+SMOOTHING = {"scalp": (SMOOTHED, 1.0), "body": (2 * SMOOTHED, 3.0)}
 """Triangles over which copied colors are smoothed, and by how much those above and below count as
-farther than those beside: collars are level, and a neck's front has shadows that its back has not."""
+farther than those beside: collars are level, and shadows of a chin are on the neck's front only."""
 SHOWN_COSINE = 0.5
 ASIDE_SHARE = 0.75
 """Of the angle between a triangle and the camera that it faces most, above which its color depends
