@@ -173,17 +173,16 @@ class SurfacePrior:
     def _flatten(
         self, backend: Backend, bound: np.ndarray, columns: Mapping[str, np.ndarray]
     ) -> None:
-        """Splats on skin and clothes stay thin, those of hair behind as wide as closes it, but for
-        its strands."""
+        """Splats on skin and clothes stay thin, those of hair behind as wide as closes it."""
         face = columns["face"]
         limit = FLAT_VOXELS * self._frames.voxel
         axis = NORMAL_AXIS[self._frames.convention]
-        rows = np.flatnonzero((self._surface.is_flat & ~self._hair.has_strands)[face])
+        rows = np.flatnonzero(self._surface.is_flat[face])
         rotation = columns["parameters/rotation"][rows]
         log_scale = columns["parameters/log_scale"][rows]
         limits = limit / self._frames.unit_lengths[face[rows]]
         is_layer = self._surface.closed & (self._surface.facing < BEHIND_COSINE)
-        least = np.where(is_layer, self._frames.hair_layer_scale, 0.0)[face[rows]]
+        least = np.where(is_layer, self._hair.least_width, 0.0)[face[rows]]
         off = thickness(rotation, log_scale, axis) > FLAT_TOLERANCE * limits
         off |= width(rotation, log_scale, axis) * FLAT_TOLERANCE < least
         off = np.flatnonzero(off)

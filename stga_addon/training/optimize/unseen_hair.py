@@ -69,6 +69,16 @@ class UnseenHair:
         )
         return to_local(world, self._frames.neutral, face)
 
+    @cached_property
+    def least_width(self) -> np.ndarray:
+        """(F,) standard deviation of splats of the layer, geometric mean of both directions in it,
+        in local units."""
+        frames = self._frames
+        if not self.has_strands.any():
+            return frames.hair_layer_scale
+        strand = self._at.unit * np.sqrt(STRAND_SIZE[0] * STRAND_SIZE[1]) / frames.unit_lengths
+        return np.where(self.has_strands, strand, frames.hair_layer_scale)
+
     def height(self, face: np.ndarray, xyz: np.ndarray) -> np.ndarray:
         """(N,) of the layer at places (N, 3) on triangles, in local units; it is smooth where
         strands grow."""
