@@ -16,11 +16,13 @@ from .likeness import HeadCoordinates
 STRAND_COSINE = -0.3
 """Of the angle between a triangle and the camera that it faces most, below which strands grow:
 longer than the layer's splats, they would stand in outlines."""
-STRAND_SIZE = (0.075, 0.011, 0.004)
-STRANDS_PER_AREA = 1600.0
+STRANDS = 6000
+STRAND_SHARE = 1.1
+STRAND_SHAPE = (2.6, 0.38, 0.13)
 STRAND_OPACITY = 3.0
-"""Standard deviations of a strand along and across its growth and along the normal, in distances of
-the eyes from the mouth; strands in that distance's square, which hide what is below; logit."""
+"""How many there are on a head; the product of a strand's standard deviations along and across its
+growth, as a share of a strand's part of the surface, so that they hide what is below; these and the
+one along the normal, as multiples of that product's root; logit."""
 SMOOTHING_STEPS = 10
 """Means over neighbors of the height of hair, which changes from one triangle to the next."""
 CROWN_ELEVATION_DEG = 55.0
@@ -52,10 +54,10 @@ class UnseenHair:
         faces = self._frames.capture.faces
         surface = self._surface
         rows = np.flatnonzero(self.has_strands)
-        wanted = STRANDS_PER_AREA * face_areas(surface, faces[rows]) / at.unit**2
-        rng = np.random.default_rng(0)
-        face = np.repeat(rows, np.maximum(rng.poisson(wanted), 1))
-        weights = rng.dirichlet(np.ones(3), len(face))[:, :, None]
+        area = face_areas(surface, faces[rows])
+        ends = np.round(STRANDS * np.cumsum(area) / area.sum()).astype(int)
+        face = np.repeat(rows, np.maximum(np.diff(ends, prepend=0), 1))
+        weights = np.random.default_rng(0).dirichlet(np.ones(3), len(face))[:, :, None]
         place = (surface[faces[face]] * weights).sum(1)
         normal = unit((vertex_normals(surface, faces)[faces[face]] * weights).sum(1), 1e-20)
         along = growth(at, place, normal)
@@ -64,7 +66,7 @@ class UnseenHair:
             like.rows(np.zeros(len(face), int)),
             xyz=place.astype(np.float32),
             rotation=from_matrices(axes).astype(np.float32),
-            log_scale=np.tile(np.log(np.array(STRAND_SIZE) * at.unit), (len(face), 1)),
+            log_scale=np.tile(np.log(self._strand_width * np.array(STRAND_SHAPE)), (len(face), 1)),
             opacity=np.full(len(face), STRAND_OPACITY, np.float32),
         )
         return to_local(world, self._frames.neutral, face)
@@ -76,8 +78,14 @@ class UnseenHair:
         frames = self._frames
         if not self.has_strands.any():
             return frames.hair_layer_scale
-        strand = self._at.unit * np.sqrt(STRAND_SIZE[0] * STRAND_SIZE[1]) / frames.unit_lengths
+        strand = self._strand_width / frames.unit_lengths
         return np.where(self.has_strands, strand, frames.hair_layer_scale)
+
+    @cached_property
+    def _strand_width(self) -> float:
+        """Standard deviation in meters, geometric mean of along and across the growth."""
+        area = face_areas(self._surface, self._frames.capture.faces[self.has_strands]).sum()
+        return float(np.sqrt(STRAND_SHARE * area / STRANDS))
 
     def height(self, face: np.ndarray, xyz: np.ndarray) -> np.ndarray:
         """(N,) of the layer at places (N, 3) on triangles, in local units; it is smooth where
