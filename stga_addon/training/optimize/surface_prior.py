@@ -336,7 +336,6 @@ def hidden_splats(frames: FrameStore, settings: TrainingSettings) -> Splats:
         convention=frames.convention,
     )
     hair = UnseenHair(frames)
-    strands = [hair.strands(layer)] if hair.has_strands.any() else []
     layer = layer.rows((surface.closed & ~hair.has_strands)[layer.face])
     face = layer.face
     inset = np.where(surface.border, BORDER_INSET, 1.0)[face]
@@ -345,7 +344,7 @@ def hidden_splats(frames: FrameStore, settings: TrainingSettings) -> Splats:
     log_scale = layer.log_scale + np.log(inset * frames.hair_widening[face])[:, None]
     log_scale[:, axis] += np.log(HIDDEN_FLATNESS)
     layer = replace(layer, xyz=xyz.astype(np.float32), log_scale=log_scale.astype(np.float32))
-    return joined([layer, *strands])
+    return joined([layer, hair.splats(settings.sh_degree)])
 
 
 def splats_behind(frames: FrameStore, sh_degree: int) -> Splats:

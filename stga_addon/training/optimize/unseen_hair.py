@@ -6,11 +6,11 @@ from functools import cached_property
 import numpy as np
 
 from ...avatar.embedding import face_areas, points_to_world, to_local
-from ...avatar.lattice import NORMAL_AXIS
-from ...avatar.splats import Splats
+from ...avatar.lattice import NORMAL_AXIS, lattice_splats
+from ...avatar.splats import Splats, joined
 from ...capture.mesh_geometry import vertex_normals
 from ...flame.quaternions import from_matrices, unit
-from .frames import FrameStore
+from .frames import SKIN_DEPTH, FrameStore
 from .likeness import HeadCoordinates
 
 STRAND_COSINE = -0.3
@@ -19,7 +19,7 @@ longer than the layer's splats, they would stand in outlines."""
 STRANDS = 6000
 STRAND_SHARE = 1.1
 STRAND_SHAPE = (2.6, 0.38, 0.13)
-STRAND_OPACITY = 3.0
+OPACITY = 3.0
 """How many there are on a head; the product of a strand's standard deviations along and across its
 growth, as a share of a strand's part of the surface, so that they hide what is below; these and the
 one along the normal, as multiples of that product's root; logit."""
@@ -47,9 +47,20 @@ class UnseenHair:
         is_hair = self._frames.sides.is_hair
         return np.asarray(surface.closed & is_hair & (surface.facing < STRAND_COSINE))
 
-    def strands(self, like: Splats) -> Splats:
-        """Opaque splats that lie on the hair's surface in the direction of growth, without color;
-        with as many harmonics as `like`, of which there is one at least."""
+    def splats(self, sh_degree: int) -> Splats:
+        """Strands, which lie on the hair's surface in the direction of growth, and a splat under
+        them on each triangle; opaque, without color."""
+        frames = self._frames
+        capture = frames.capture
+        scalp = lattice_splats(
+            capture.neutral, capture.faces, 0, sh_degree, OPACITY, frames.convention
+        ).rows(self.has_strands)
+        if not len(scalp):
+            return scalp
+        scalp.xyz[:, NORMAL_AXIS[frames.convention]] = self._scalp_height[scalp.face]
+        return joined([scalp, self._strands(scalp)])
+
+    def _strands(self, like: Splats) -> Splats:
         at = self._at
         faces = self._frames.capture.faces
         surface = self._surface
@@ -67,7 +78,7 @@ class UnseenHair:
             xyz=place.astype(np.float32),
             rotation=from_matrices(axes).astype(np.float32),
             log_scale=np.tile(np.log(self._strand_width * np.array(STRAND_SHAPE)), (len(face), 1)),
-            opacity=np.full(len(face), STRAND_OPACITY, np.float32),
+            opacity=np.full(len(face), OPACITY, np.float32),
         )
         return to_local(world, self._frames.neutral, face)
 
@@ -88,8 +99,8 @@ class UnseenHair:
         return float(np.sqrt(STRAND_SHARE * area / STRANDS))
 
     def height(self, face: np.ndarray, xyz: np.ndarray) -> np.ndarray:
-        """(N,) of the layer at places (N, 3) on triangles, in local units; it is smooth where
-        strands grow."""
+        """(N,) of the layer at places (N, 3) on triangles, in local units; where strands grow it is
+        smooth, or the scalp's, whichever is nearer."""
         frames = self._frames
         height = frames.layer_height[face]
         rows = np.flatnonzero(self.has_strands[face])
@@ -100,9 +111,15 @@ class UnseenHair:
             local /= frames.unit_lengths[own, None, None]
             normal = np.cross(local[:, 1] - local[:, 0], local[:, 2] - local[:, 0])
             axis = NORMAL_AXIS[frames.convention]
+            now = xyz[rows, axis]
             below = ((xyz[rows] - local[:, 0]) * normal).sum(1) / normal[:, axis]
-            height[rows] = xyz[rows, axis] - below
+            scalp = self._scalp_height[own]
+            height[rows] = np.where(abs(now - scalp) < abs(below), scalp, now - below)
         return height
+
+    @property
+    def _scalp_height(self) -> np.ndarray:
+        return -SKIN_DEPTH * self._frames.units
 
     def shades(self, face: np.ndarray, xyz: np.ndarray) -> np.ndarray:
         """(N,) by how much hair at places (N, 3) on triangles is brighter than usual."""
