@@ -260,6 +260,7 @@ def test_unseen_hair_grows_in_locks(convention, bundled, tmp_path):
     longest = np.argsort(layer.log_scale, axis=1)
     aspect = np.exp(np.diff(np.sort(layer.log_scale, axis=1), axis=1)[:, 1])
     strands = aspect > 3
+    assert 5000 < strands.sum() < 8000
     centers, level = middles(bundled)
     hair = (level > -0.9) & (centers[:, 2] < -0.08)
     assert set(layer.face[strands]) >= set(np.flatnonzero(hair & surface.closed))

@@ -1,7 +1,7 @@
 """Strands and locks of hair where no view shows any: without them, it looks like a helmet."""
 
 from dataclasses import replace
-from functools import cached_property
+from functools import cache, cached_property
 
 import numpy as np
 
@@ -24,7 +24,9 @@ OPACITY = 3.0
 growth, as a share of a strand's part of the surface, so that they hide what is below; these and the
 one along the normal, as multiples of that product's root; logit."""
 SMOOTHING_STEPS = 10
-"""Means over neighbors of the height of hair, which changes from one triangle to the next."""
+MIN_RISE = 0.3
+"""Means over neighbors of the height of hair, which changes from one triangle to the next; cosine
+of the angle between hair's surface and a triangle that its height is measured with at least."""
 CROWN_ELEVATION_DEG = 55.0
 """Of the place from which hair grows in all directions, behind the middle of the head."""
 SHADE = 0.15
@@ -101,21 +103,30 @@ class UnseenHair:
     def height(self, face: np.ndarray, xyz: np.ndarray) -> np.ndarray:
         """(N,) of the layer at places (N, 3) on triangles, in local units; where strands grow it is
         smooth, or the scalp's, whichever is nearer."""
+        level, slope = self._planes
+        height = level[face] + (slope[face] * xyz).sum(1)
+        now = xyz[:, NORMAL_AXIS[self._frames.convention]]
+        scalp = self._scalp_height[face]
+        is_scalp = self.has_strands[face] & (abs(now - scalp) < abs(now - height))
+        return np.where(is_scalp, scalp, height)
+
+    @cached_property
+    def _planes(self) -> tuple[np.ndarray, np.ndarray]:
+        """The layer over each triangle, in its frame: height (F,) at the origin and its slope along
+        the axes (F, 3), bounded where the surface is steep."""
         frames = self._frames
-        height = frames.layer_height[face]
-        rows = np.flatnonzero(self.has_strands[face])
-        if len(rows):
-            own = face[rows]
-            corners = self._surface[frames.capture.faces[own]] - frames.neutral.origin[own][:, None]
-            local = np.einsum("nji,ncj->nci", frames.neutral.rotation[own], corners)
-            local /= frames.unit_lengths[own, None, None]
-            normal = np.cross(local[:, 1] - local[:, 0], local[:, 2] - local[:, 0])
-            axis = NORMAL_AXIS[frames.convention]
-            now = xyz[rows, axis]
-            below = ((xyz[rows] - local[:, 0]) * normal).sum(1) / normal[:, axis]
-            scalp = self._scalp_height[own]
-            height[rows] = np.where(abs(now - scalp) < abs(below), scalp, now - below)
-        return height
+        axis = NORMAL_AXIS[frames.convention]
+        rows = np.flatnonzero(self.has_strands)
+        offsets = self._surface[frames.capture.faces[rows]] - frames.neutral.origin[rows][:, None]
+        corners = np.einsum("nji,ncj->nci", frames.neutral.rotation[rows], offsets)
+        corners /= frames.unit_lengths[rows, None, None]
+        normal = unit(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), 1e-20)
+        level = frames.layer_height.copy()
+        slope = np.zeros((len(level), 3), np.float32)
+        slope[rows] = -normal / np.maximum(normal[:, axis], MIN_RISE)[:, None]
+        slope[rows, axis] = 0
+        level[rows] = corners[:, 0, axis] - (slope[rows] * corners[:, 0]).sum(1)
+        return level, slope
 
     @property
     def _scalp_height(self) -> np.ndarray:
@@ -167,12 +178,17 @@ def lock_shades(at: HeadCoordinates, places: np.ndarray) -> np.ndarray:
     place = np.stack([LOCKS * turn, distance * angle / (LOCK_LENGTH * at.unit)])
     cell = np.floor(place).astype(int)
     column, row = place - cell
-    brightness = np.random.default_rng(0).standard_normal((LOCKS, LOCKS))
+    brightness = _brightness_of_locks()
     total = np.zeros(len(places))
     for right, lower in ((0, 0), (0, 1), (1, 0), (1, 1)):
         weight = abs(1 - right - column) * abs(1 - lower - row)
         total += weight * brightness[(cell[0] + right) % LOCKS, (cell[1] + lower) % LOCKS]
     return np.asarray(1 + SHADE * total)
+
+
+@cache
+def _brightness_of_locks() -> np.ndarray:
+    return np.random.default_rng(0).standard_normal((LOCKS, LOCKS))
 
 
 def _crown(at: HeadCoordinates) -> np.ndarray:
