@@ -16,13 +16,13 @@ from .likeness import HeadCoordinates
 STRAND_COSINE = -0.3
 """Of the angle between a triangle and the camera that it faces most, below which strands grow:
 longer than the layer's splats, they would stand in outlines."""
-STRANDS = 6000
+STRANDS = 10000
 STRAND_SHARE = 1.1
 STRAND_SHAPE = (2.6, 0.38, 0.13)
 OPACITY = 3.0
-"""How many there are on a head; the product of a strand's standard deviations along and across its
-growth, as a share of a strand's part of the surface, so that they hide what is below; these and the
-one along the normal, as multiples of that product's root; logit."""
+"""How many a whole scalp would have; the product of a strand's standard deviations along and across
+its growth, as a share of a strand's part of the surface, so that they hide what is below; these and
+the one along the normal, as multiples of that product's root; logit."""
 SMOOTHING_STEPS = 10
 MIN_RISE = 0.3
 """Means over neighbors of the height of hair, which changes from one triangle to the next; cosine
@@ -68,7 +68,7 @@ class UnseenHair:
         surface = self._surface
         rows = np.flatnonzero(self.has_strands)
         area = face_areas(surface, faces[rows])
-        ends = np.round(STRANDS * np.cumsum(area) / area.sum()).astype(int)
+        ends = np.round(self._count * np.cumsum(area) / area.sum()).astype(int)
         face = np.repeat(rows, np.maximum(np.diff(ends, prepend=0), 1))
         weights = np.random.default_rng(0).dirichlet(np.ones(3), len(face))[:, :, None]
         place = (surface[faces[face]] * weights).sum(1)
@@ -98,7 +98,15 @@ class UnseenHair:
     def _strand_width(self) -> float:
         """Standard deviation in meters, geometric mean of along and across the growth."""
         area = face_areas(self._surface, self._frames.capture.faces[self.has_strands]).sum()
-        return float(np.sqrt(STRAND_SHARE * area / STRANDS))
+        return float(np.sqrt(STRAND_SHARE * area / self._count))
+
+    @property
+    def _count(self) -> float:
+        """How many strands there are."""
+        capture = self._frames.capture
+        area = face_areas(capture.neutral, capture.faces)
+        scalp = self._frames.surface.kinds["scalp"]
+        return float(STRANDS * area[self.has_strands].sum() / area[scalp].sum())
 
     def height(self, face: np.ndarray, xyz: np.ndarray) -> np.ndarray:
         """(N,) of the layer at places (N, 3) on triangles, in local units; where strands grow it is
