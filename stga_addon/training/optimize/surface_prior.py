@@ -344,7 +344,7 @@ def hidden_splats(frames: FrameStore, settings: TrainingSettings) -> Splats:
     log_scale = layer.log_scale + np.log(inset * frames.hair_widening[face])[:, None]
     log_scale[:, axis] += np.log(HIDDEN_FLATNESS)
     layer = replace(layer, xyz=xyz.astype(np.float32), log_scale=log_scale.astype(np.float32))
-    return joined([layer, hair.splats(settings.sh_degree)])
+    return joined([layer, hair.splats(settings.sh_degree, HIDDEN_OPACITY)])
 
 
 def splats_behind(frames: FrameStore, sh_degree: int) -> Splats:

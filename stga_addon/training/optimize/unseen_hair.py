@@ -19,17 +19,16 @@ longer than the layer's splats, they would stand in outlines."""
 STRANDS = 10000
 STRAND_SHARE = 1.1
 STRAND_SHAPE = (2.6, 0.38, 0.13)
-OPACITY = 3.0
 """How many a whole scalp would have; the product of a strand's standard deviations along and across
 its growth, as a share of a strand's part of the surface, so that they hide what is below; these and
-the one along the normal, as multiples of that product's root; logit."""
+the one along the normal, as multiples of that product's root."""
 SMOOTHING_STEPS = 10
 MIN_RISE = 0.3
 """Means over neighbors of the height of hair, which changes from one triangle to the next; cosine
 of the angle between hair's surface and a triangle that its height is measured with at least."""
 CROWN_ELEVATION_DEG = 55.0
 """Of the place from which hair grows in all directions, behind the middle of the head."""
-SHADE = 0.15
+LOCK_CONTRAST = 0.15
 LOCKS = 400
 LOCK_LENGTH = 0.7
 """Standard deviation of the brightness of locks, as a share of it; how many lie around the head,
@@ -49,13 +48,13 @@ class UnseenHair:
         is_hair = self._frames.sides.is_hair
         return np.asarray(surface.closed & is_hair & (surface.facing < STRAND_COSINE))
 
-    def splats(self, sh_degree: int) -> Splats:
+    def splats(self, sh_degree: int, opacity_logit: float) -> Splats:
         """Strands, which lie on the hair's surface in the direction of growth, and a splat under
-        them on each triangle; opaque, without color."""
+        them on each triangle; without color."""
         frames = self._frames
         capture = frames.capture
         scalp = lattice_splats(
-            capture.neutral, capture.faces, 0, sh_degree, OPACITY, frames.convention
+            capture.neutral, capture.faces, 0, sh_degree, opacity_logit, frames.convention
         ).rows(self.has_strands)
         if not len(scalp):
             return scalp
@@ -80,7 +79,6 @@ class UnseenHair:
             xyz=place.astype(np.float32),
             rotation=from_matrices(axes).astype(np.float32),
             log_scale=np.tile(np.log(self._strand_width * np.array(STRAND_SHAPE)), (len(face), 1)),
-            opacity=np.full(len(face), OPACITY, np.float32),
         )
         return to_local(world, self._frames.neutral, face)
 
@@ -141,7 +139,7 @@ class UnseenHair:
         return -SKIN_DEPTH * self._frames.units
 
     def shades(self, face: np.ndarray, xyz: np.ndarray) -> np.ndarray:
-        """(N,) by how much hair at places (N, 3) on triangles is brighter than usual."""
+        """(N,) brightness of hair at places (N, 3) on triangles, as a multiple of the usual one."""
         return lock_shades(self._at, points_to_world(xyz, self._frames.neutral, face))
 
     @property
@@ -175,8 +173,8 @@ def growth(at: HeadCoordinates, places: np.ndarray, normals: np.ndarray) -> np.n
 
 
 def lock_shades(at: HeadCoordinates, places: np.ndarray) -> np.ndarray:
-    """(N,) by how much hair at places (N, 3) is brighter than usual: locks, which reach from the
-    crown down, have a brightness of their own, that changes slowly along them."""
+    """(N,) brightness of hair at places (N, 3), as a multiple of the usual one: locks, which reach
+    from the crown down, have their own, that changes slowly along them."""
     crown = _crown(at)
     across = at.axes[0]
     away = places - at.middle
@@ -191,7 +189,7 @@ def lock_shades(at: HeadCoordinates, places: np.ndarray) -> np.ndarray:
     for right, lower in ((0, 0), (0, 1), (1, 0), (1, 1)):
         weight = abs(1 - right - column) * abs(1 - lower - row)
         total += weight * brightness[(cell[0] + right) % LOCKS, (cell[1] + lower) % LOCKS]
-    return np.asarray(1 + SHADE * total)
+    return np.asarray(1 + LOCK_CONTRAST * total)
 
 
 @cache
