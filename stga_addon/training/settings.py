@@ -37,9 +37,9 @@ class Rates:
     scales as logarithms, opacity as logit and, `strain_color`, of colors that follow the pose; each
     decays exponentially to `position_end` or `end` of itself."""
 
-    xyz: float = setting(4e-4, 0, MAX_RATE)
-    rotation: float = setting(1e-2, 0, MAX_RATE)
-    log_scale: float = setting(4e-2, 0, MAX_RATE)
+    xyz: float = setting(6e-4, 0, MAX_RATE)
+    rotation: float = setting(2e-2, 0, MAX_RATE)
+    log_scale: float = setting(13e-2, 0, MAX_RATE)
     opacity: float = setting(1e-1, 0, MAX_RATE)
     sh: float = setting(4e-2, 0, MAX_RATE)
     sh_rest: float = setting(2e-3, 0, MAX_RATE)
