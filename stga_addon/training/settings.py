@@ -44,8 +44,8 @@ class Rates:
     sh: float = setting(4e-2, 0, MAX_RATE)
     sh_rest: float = setting(2e-3, 0, MAX_RATE)
     strain_color: float = setting(1e-2, 0, MAX_RATE)
-    position_end: float = setting(0.025, 0, 1)
-    end: float = setting(0.3, 0, 1)
+    position_end: float = setting(0.017, 0, 1)
+    end: float = setting(0.2, 0, 1)
 
 
 MAX_FINE_TRIANGLES = 16_000
@@ -287,7 +287,7 @@ PAPER_SETTINGS = {
     "views_per_visit": 0,
     "global_interval": 20,
     "warm_up_share": 0.0,
-    "rates": Rates(end=0.1),
+    "rates": Rates(4e-4, 1e-2, 4e-2, position_end=0.025, end=0.1),
     "scale_limit": 1.0,
     "stray_limit": 1.0,
     "stray_reset_share": 0.0,

@@ -552,7 +552,7 @@ def test_commands_use_the_refined_meshes(
     assert stga("eval", own) == 0
     found = re.search(r"PSNR ([\d.]+) dB", capsys.readouterr().out)
     # the avatar that is written lacks offsets that do not show
-    assert float(found[1]) == pytest.approx(best, abs=0.005)
+    assert float(found[1]) == pytest.approx(best, abs=0.01)
     root = read_run(own).capture
     tracked = open_capture(root, root / "model.npz")
     assert stga("eval", own, "--split test") == 0
