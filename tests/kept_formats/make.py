@@ -45,7 +45,7 @@ from stga_addon.training.run.folder import (
 )
 from stga_addon.training.run.identity import RunIdentity
 from stga_addon.training.run.metrics_log import append_metrics
-from stga_addon.training.settings import make_settings
+from stga_addon.training.settings import Rates, make_settings
 
 DATA = Path(__file__).with_name("data")
 SKINNED = "avatar.glb"
@@ -58,6 +58,7 @@ TIMESTEPS = (0, 3)
 IDENTITY = RunIdentity("vhap", "1 cameras, 2 timesteps", *("abcdef"[k] * 64 for k in range(6)))
 METRICS = {"iteration": 10, "seconds": 5.5, "evaluation_s": 0.5, "wall_s": 7.25, "splats": COUNT}
 METRICS |= {"loss": 0.125, "psnr": 30.5, "ssim": 0.875, "peak_memory_mb": 512.0}
+RATES = Rates(4e-4, 1e-2, 4e-2, 1e-1, 4e-2, 2e-3, 1e-2, position_end=0.025, end=0.3)
 
 
 def ramp(*shape, start=0):
@@ -141,7 +142,7 @@ def run():
         Path("/captures/anna"),
         Path("/models/flame.npz"),
         "opencv",
-        make_settings(iterations=9, driven_offsets=("strain_position",), sh_degree=1),
+        make_settings(iterations=9, driven_offsets=("strain_position",), sh_degree=1, rates=RATES),
         (EffectDecision("jaw", "auto", True, "turns by 9°", "none"),),
         "gpu:Name",
         IDENTITY,
@@ -151,7 +152,7 @@ def run():
 
 
 def train():
-    settings = make_settings(iterations=3, preset="draft")
+    settings = make_settings(iterations=3, preset="draft", rates=RATES)
     return Train(Path("/runs/anna"), Path("/captures/anna"), settings, selection=SELECTION)
 
 

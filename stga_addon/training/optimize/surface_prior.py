@@ -60,10 +60,11 @@ PULLED_COLUMNS = (
     "second/color",
     "second/opacity",
 )
+SHAPE_MOMENTS = ("second/xyz", "second/rotation", "second/log_scale")
 PINNED_KINDS = ("parameters", "average", "first", "second")
 INNER_PARAMETERS = ("xyz", "rotation", "log_scale", "opacity")
-"""What is read of the splats that may be pulled; arrays of those whose color is pinned; parameters
-of the inner layer that stay."""
+"""What is read of the splats that may be pulled; mean squares of the gradients of places and
+shapes; arrays of those whose color is pinned; parameters of the inner layer that stay."""
 
 
 class SurfacePrior:
@@ -106,6 +107,7 @@ class SurfacePrior:
         is_inner = self._is_inner(columns)
         self._pull_colors(backend, bound, columns, moments["second/color"], is_inner)
         self._pull_shapes(backend, bound, columns, moments["second/opacity"])
+        self._slow_shapes(backend, bound, usual)
         self._flatten(backend, bound, columns)
         self._keep_layer(backend, bound, columns, is_inner)
         self._shrink_lining(backend, bound, columns)
@@ -169,6 +171,15 @@ class SurfacePrior:
         xyz[:, axis] += share * (height - xyz[:, axis])
         values = {"opacity": opacity, "xyz": xyz}
         backend.assign(bound[rows], parameters_and_average(values))
+
+    def _slow_shapes(self, backend: Backend, bound: np.ndarray, usual: np.ndarray) -> None:
+        """Where gradients are below DOUBT times those of well seen splats, places and shapes take
+        steps that are as much shorter: a layer that hardly shows would get holes."""
+        seen = backend.columns(SHAPE_MOMENTS, usual)
+        least = {name: DOUBT**2 * np.median(column.mean(1)) for name, column in seen.items()}
+        columns = backend.columns(SHAPE_MOMENTS, bound)
+        values = {name: np.maximum(column, least[name]) for name, column in columns.items()}
+        backend.assign(bound, values)
 
     def _flatten(
         self, backend: Backend, bound: np.ndarray, columns: Mapping[str, np.ndarray]

@@ -26,7 +26,7 @@ from ..settings import TrainingSettings
 from .checkpoint import read_checkpoint
 from .folder import AVATAR, CHECKPOINT, Continuation, Run
 
-START_SHARE = 0.5
+START_SHARE = 0.375
 """Share of the run's schedule of learning rates that has passed when its continuation begins."""
 DENSITY_INTERVAL = 40
 DENSITY_SPAN = (0.0, 0.6)
@@ -138,7 +138,8 @@ def continued_settings(
     expressions strain triangles in directions that the old takes never showed.
     """
     first = settings.rates
-    ends = {"position_end": first.position_end**START_SHARE, "end": first.end**START_SHARE}
+    left = 1 - START_SHARE
+    ends = {"position_end": first.position_end**left, "end": first.end**left}
     rates = replace(first, **learning_rates(first, START_SHARE), **ends)  # from there on
     if strategy == "extend":
         rates = replace(rates, strain_color=first.strain_color)
