@@ -26,7 +26,7 @@ from ..settings import TrainingSettings
 from .checkpoint import read_checkpoint
 from .folder import AVATAR, CHECKPOINT, Continuation, Run
 
-START_SHARE = 0.375
+START_SHARE = 0.5
 """Share of the run's schedule of learning rates that has passed when its continuation begins."""
 DENSITY_INTERVAL = 40
 DENSITY_SPAN = (0.0, 0.6)
