@@ -50,6 +50,8 @@ FLAT_TOLERANCE = 1.02
 """Largest standard deviation of splats on skin and clothes along the normal; how much more is worth
 a change. Views of a narrow cone do not tell it."""
 MIN_VARIANCE = 1e-14
+GEOMETRY_MOMENTS = ("second/xyz", "second/rotation", "second/log_scale")
+MOMENTS = ("second/color", "second/opacity", *GEOMETRY_MOMENTS)
 PULLED_COLUMNS = (
     "face",
     "parameters/color",
@@ -57,14 +59,13 @@ PULLED_COLUMNS = (
     "parameters/xyz",
     "parameters/rotation",
     "parameters/log_scale",
-    "second/color",
-    "second/opacity",
+    *MOMENTS,
 )
-SHAPE_MOMENTS = ("second/xyz", "second/rotation", "second/log_scale")
 PINNED_KINDS = ("parameters", "average", "first", "second")
 INNER_PARAMETERS = ("xyz", "rotation", "log_scale", "opacity")
-"""What is read of the splats that may be pulled; mean squares of the gradients of places and
-shapes; arrays of those whose color is pinned; parameters of the inner layer that stay."""
+"""Second moments of positions and shapes; of all that is compared with well seen splats; what is
+read of the splats that may be pulled; arrays of those whose color is pinned; parameters of the
+inner layer that stay."""
 
 
 class SurfacePrior:
@@ -102,12 +103,12 @@ class SurfacePrior:
             return
         well_seen = is_bound & (self._surface.facing > WELL_SEEN_COSINE)[where["face"]]
         usual = np.flatnonzero(well_seen if well_seen.any() else is_bound)
-        moments = backend.columns(("second/color", "second/opacity"), usual)
+        moments = backend.columns(MOMENTS, usual)
         columns = backend.columns(PULLED_COLUMNS, bound)
         is_inner = self._is_inner(columns)
         self._pull_colors(backend, bound, columns, moments["second/color"], is_inner)
         self._pull_shapes(backend, bound, columns, moments["second/opacity"])
-        self._slow_shapes(backend, bound, usual)
+        self._shorten_steps(backend, bound, columns, moments)
         self._flatten(backend, bound, columns)
         self._keep_layer(backend, bound, columns, is_inner)
         self._shrink_lining(backend, bound, columns)
@@ -172,14 +173,18 @@ class SurfacePrior:
         values = {"opacity": opacity, "xyz": xyz}
         backend.assign(bound[rows], parameters_and_average(values))
 
-    def _slow_shapes(self, backend: Backend, bound: np.ndarray, usual: np.ndarray) -> None:
-        """Where gradients are below DOUBT times those of well seen splats, places and shapes take
-        steps that are as much shorter: a layer that hardly shows would get holes."""
-        seen = backend.columns(SHAPE_MOMENTS, usual)
-        least = {name: DOUBT**2 * np.median(column.mean(1)) for name, column in seen.items()}
-        columns = backend.columns(SHAPE_MOMENTS, bound)
-        values = {name: np.maximum(column, least[name]) for name, column in columns.items()}
-        backend.assign(bound, values)
+    def _shorten_steps(
+        self,
+        backend: Backend,
+        bound: np.ndarray,
+        columns: Mapping[str, np.ndarray],
+        usual: Mapping[str, np.ndarray],
+    ) -> None:
+        """Where gradients are below DOUBT times those of well seen splats, Adam moves and shapes
+        splats by steps that are as much shorter: a layer that hardly shows would get holes."""
+        least = {name: DOUBT**2 * np.median(usual[name].mean(1)) for name in GEOMETRY_MOMENTS}
+        moments = {name: np.maximum(columns[name], least[name]) for name in GEOMETRY_MOMENTS}
+        backend.assign(bound, moments)
 
     def _flatten(
         self, backend: Backend, bound: np.ndarray, columns: Mapping[str, np.ndarray]
