@@ -239,8 +239,9 @@ def test_no_tuft_hangs_behind_the_head(filmed):
 
 
 @pytest.mark.parametrize("convention", ["stga", "gaussian_avatars"])
-def test_hair_behind_keeps_its_width(filmed, convention):
-    """Catches a back of the head in whose hair training, which does not see it, makes tears."""
+def test_what_is_behind_keeps_its_width(filmed, convention):
+    """Catches a back of the head in whose hair, neck and hem training, which does not see it, makes
+    tears."""
     frontal = replace(filmed, views={"train": filmed.views["train"][3:6]})
     frames = FrameStore(frontal, convention)
     settings = quick_settings(convention=convention)
@@ -248,11 +249,17 @@ def test_hair_behind_keeps_its_width(filmed, convention):
     state = new_state(joined([layer, splats_behind(frames, settings.sh_degree)]))
     state.parameters.log_scale[: len(layer)] -= 0.7
     SurfacePrior(frames).apply(Rows(state), Turn(20, 0.5, len(state)))
-    hair = (frames.surface.facing < BEHIND_COSINE) & (frames.surface.hair_height > 0)
-    behind = np.flatnonzero(hair[layer.face])
-    assert len(behind) > 100
-    wide = width(state.parameters.rotation, state.parameters.log_scale, NORMAL_AXIS[convention])
-    assert np.all(wide[behind] > 0.97 * frames.hair_layer_scale[state.face[behind]])
+    surface = frames.surface
+    is_behind = (surface.facing < BEHIND_COSINE)[layer.face]
+    hair = is_behind & (surface.hair_height > 0)[layer.face]
+    hem = (surface.closed & surface.border)[layer.face]
+    axis = NORMAL_AXIS[convention]
+    wide = width(state.parameters.rotation, state.parameters.log_scale, axis)[: len(layer)]
+    assert np.all(wide[hair] > 0.97 * frames.hair_layer_scale[layer.face[hair]])
+    before = width(layer.rotation, layer.log_scale, axis)
+    for part in (hair, is_behind & ~hair & ~hem, hem):
+        assert part.sum() > 50
+        assert np.all(wide[part] > 0.7 * before[part])
 
 
 def test_what_hardly_shows_hardly_moves(filmed):

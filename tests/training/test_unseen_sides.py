@@ -24,6 +24,7 @@ from stga_addon.flame.parts import flame_model, key_regions
 from stga_addon.flame.quaternions import to_matrices
 from stga_addon.render.render import render, render_avatar
 from stga_addon.tracking.torso_cloth import draped, torso_sheet
+from stga_addon.training.optimize.backing import GRAZED_COSINE
 from stga_addon.training.optimize.change import Turn
 from stga_addon.training.optimize.frames import FrameStore
 from stga_addon.training.optimize.initial_splats import flat_points
@@ -614,6 +615,23 @@ def test_nobody_looks_through_a_side(bundled, tmp_path):
         assert alpha_of(layer, camera, frames)[own].min() > 0.9
 
 
+def test_nobody_looks_through_what_a_collar_hides(bundled, tmp_path):
+    """Catches a neck and clothes that are opaque for the cameras only, which see a collar before
+    them, so that from aside the background shows through; and a layer that reaches beyond the end
+    of the mesh."""
+    capture = filmed(bundled, painted(bundled), TURNS_DEG, 0.0, tmp_path)
+    layer, frames = behind(capture)
+    _, level = middles(capture)
+    camera = look_at([0.85, -0.08, 0.5], [0, -0.08, 0], 160, 200, 480)
+    triangle, _ = rasterize(capture.neutral, capture.faces, camera)
+    dressed = (level < -1.6) & (level > -2.5) & (Surface(capture).facing > GRAZED_COSINE)
+    own = binary_erosion((triangle >= 0) & dressed[triangle], iterations=5)
+    alpha = alpha_of(layer, camera, frames)
+    assert own.sum() > 100
+    assert np.mean(alpha[own] > 0.8) > 0.9
+    assert alpha[~binary_dilation(triangle >= 0, iterations=2)].max() < 0.25
+
+
 @pytest.mark.parametrize(("angles", "has_layer"), [((0,), True), (TURNS_DEG, False)])
 def test_nobody_looks_into_the_mouth_past_a_cheek(angles, has_layer, bundled, tmp_path):
     """Catches cheeks of a head that never turned, whose splats lie along the views, without a layer
@@ -690,9 +708,11 @@ def test_a_torso_has_a_back(bundled, tmp_path):
     avatar = Trainer(capture, quick_settings(iterations=1), {}).avatar("center", None)
     shown = render_avatar(avatar, capture.neutral, camera, (1, 1, 1))[:, own]
     assert_allclose(255 * shown, CLOTH[:, None].repeat(own.sum(), 1), atol=40)
-    bust = FrameStore(filmed(bundled, painted(bundled), (-20, 0, 20), 0.0, tmp_path), "stga")
-    assert bust.surface.border.any()
-    assert not bust.backing.triangles[middles(bundled)[1] < -2.5].any()
+    bust = filmed(bundled, painted(bundled), (-20, 0, 20), 0.0, tmp_path)
+    assert Surface(bust).border.any()
+    layer, frames = behind(bust)
+    away = middles(bust)[0][layer.face] - points_to_world(layer.xyz, frames, layer.face)
+    assert norm(away, axis=1).max() < 0.025
 
 
 def test_a_head_is_outside_with_any_torso(bundled):

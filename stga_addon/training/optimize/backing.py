@@ -4,6 +4,7 @@ its sides transparent where it is tracked too wide, and a torso may have a front
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from ...avatar.embedding import face_areas, face_frames
 from ...avatar.lattice import NORMAL_AXIS
@@ -30,15 +31,18 @@ ONE_DIRECTION_FACE_ANGLE_DEG = 30.0
 """The same of a head that was filmed from one direction, along which its splats lie: from aside,
 the mouth's inside shows between them."""
 CELL_VOXELS = 2
-"""Behind how large a part of the head one splat is enough."""
+BORDER_CELLS = 2.0
+"""Behind how large a part of the head one splat is enough; how far from the mesh's edge, in these
+cells, clothes have a layer behind them, as it would stand out there."""
 DEPTH_VOXELS = 0.5
 MAX_DEPTHS = 10
 MARGIN_SHARE = 0.015
 BACK_MARGIN_SHARE = 0.03
 SPLAT_REACH = 1.8
 """Step of the depths at which the layer may lie, and how many are tried: the first that is within
-the masks, with a margin as a share of their height; of a back, whose triangles are large; how far
-the splats of these reach, three standard deviations, in the side of a square of two triangles."""
+the masks, with a margin as a share of their height; of a torso, whose triangles are large; how far
+the splats of these reach, three standard deviations, in the side of a square of two triangles, or
+in cells where these are larger."""
 BEHIND_DEG = (-30.0, 0.0, 30.0)
 """Directions from behind from which the inner side of a torso's front may show."""
 BACK_SHARE = 0.5
@@ -65,9 +69,10 @@ class Backing:
 
 
 def backing_of(surface: Surface, sides: UnseenSides) -> Backing:
-    """Behind the outside of a head that few cameras see at a grazing angle or not at all, but for
-    ears and the parts of the face: at the least depth that masks allow, in the color from aside.
-    Behind the front of a torso that has no back: a round one in the usual color of its height."""
+    """Behind neck and clothes, and the outside of a head that few cameras see at a grazing angle or
+    not at all, but for ears and the parts of the face: at the least depth that masks allow, in the
+    color from aside. Behind the front of a torso that has no back: a round one in the usual color
+    of its height."""
     capture = surface.capture
     faces = capture.faces
     neutral = np.asarray(capture.neutral, np.float64)
@@ -92,39 +97,66 @@ def backing_of(surface: Surface, sides: UnseenSides) -> Backing:
 def _behind_sides(
     surface: Surface, at: HeadCoordinates, allowed: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """One triangle in each cell, of those `allowed` (F,) bool that no camera sees well, as (F,)
-    bool; the neutral vertices (V, 3), moved inside the head until masks cover them."""
+    """One triangle in each cell, of those `allowed` (F,) bool that somebody may look through from
+    aside, as (F,) bool: what is `_grazed`; neck and clothes, as what a collar or a fold hides from
+    the cameras need not be opaque for them. The neutral vertices (V, 3), moved inside the head
+    until masks cover them."""
     faces = surface.capture.faces
     neutral = np.asarray(surface.capture.neutral, np.float64)
     voxel = voxel_size(neutral)
-    limit = GRAZED_COSINE
-    angle = FACE_ANGLE_DEG
-    if surface.filmed_along is not None:
-        limit = ONE_DIRECTION_COSINE
-        angle = ONE_DIRECTION_FACE_ANGLE_DEG
-    rows = np.flatnonzero(allowed & _beside_face(surface, at, angle) & (surface.facing < limit))
+    allowed = allowed & surface.outside & skin_of(surface.capture) & ~ears_of(at)
+    grazed = allowed & _grazed(surface, at)
+    clothes = allowed & surface.kinds["body"] & _is_off_border(surface) & ~grazed
+    rows = np.flatnonzero(grazed | clothes)
     depths = voxel * DEPTH_VOXELS * np.arange(1, MAX_DEPTHS + 1)
     offsets = np.zeros((len(rows), len(depths), 3))
     offsets[:, :, NORMAL_AXIS["stga"]] = -depths
     fits = ~surface.beside_masks(rows, offsets, -MARGIN_SHARE)
+    large = clothes[rows]
+    fits[large] &= ~_reaches_beside(surface, rows[large], offsets[large])
     deepest = np.zeros(len(neutral))
     np.maximum.at(deepest, faces[rows], depths[fits.argmax(1), None])
     rows = rows[fits.any(1)]
     cells = np.floor(neutral[faces[rows]].mean(1) / (CELL_VOXELS * voxel))
     _, first = np.unique(cells, axis=0, return_index=True)
-    grazed = np.zeros(len(faces), bool)
-    grazed[rows[first]] = True
-    return grazed, neutral - deepest[:, None] * vertex_normals(neutral, faces)
+    chosen = np.zeros(len(faces), bool)
+    chosen[rows[first]] = True
+    return chosen, neutral - deepest[:, None] * vertex_normals(neutral, faces)
 
 
-def _beside_face(surface: Surface, at: HeadCoordinates, angle_deg: float) -> np.ndarray:
-    """(F,) bool: the outside of head and neck, but for ears and the face, up to so far from
+def _reaches_beside(surface: Surface, rows: np.ndarray, offsets: np.ndarray) -> np.ndarray:
+    """(N, K) bool: whether a splat at one of the offsets (N, K, 3), as `beside_masks` has them,
+    would show beside masks."""
+    neutral = np.asarray(surface.capture.neutral, np.float64)
+    area = face_areas(neutral, surface.capture.faces[rows])
+    size = np.maximum(np.sqrt(2 * area), CELL_VOXELS * voxel_size(neutral))
+    plane = np.delete(np.eye(3), NORMAL_AXIS["stga"], axis=0)
+    reach = SPLAT_REACH * size[:, None, None] * np.concatenate([plane, -plane])
+    ends = [offsets + end[:, None] for end in reach.swapaxes(0, 1)]
+    return np.any([surface.beside_masks(rows, offsets) for offsets in ends], axis=0)
+
+
+def _grazed(surface: Surface, at: HeadCoordinates) -> np.ndarray:
+    """(F,) bool: what no camera sees well, of head and neck but for the face, up to an angle from
     straight ahead."""
-    kinds = surface.kinds
+    limit = GRAZED_COSINE
+    angle_deg = FACE_ANGLE_DEG
+    if surface.filmed_along is not None:
+        limit = ONE_DIRECTION_COSINE
+        angle_deg = ONE_DIRECTION_FACE_ANGLE_DEG
     beside = np.degrees(np.abs(at.azimuth)) > angle_deg
-    beside |= kinds["scalp"] | kinds["body"]
-    beside &= surface.outside & skin_of(surface.capture) & (at.level > CHIN_LEVEL)
-    return np.asarray(beside & ~ears_of(at))
+    beside |= surface.kinds["scalp"] | surface.kinds["body"]
+    return np.asarray(beside & (surface.facing < limit) & (at.level > CHIN_LEVEL))
+
+
+def _is_off_border(surface: Surface) -> np.ndarray:
+    """(F,) bool: triangles that lie farther than BORDER_CELLS from the mesh's edge."""
+    neutral = np.asarray(surface.capture.neutral, np.float64)
+    centers = neutral[surface.capture.faces].mean(1)
+    if not surface.border.any():
+        return np.ones(len(centers), bool)
+    distance, _ = cKDTree(centers[surface.border]).query(centers)
+    return np.asarray(distance > BORDER_CELLS * CELL_VOXELS * voxel_size(neutral))
 
 
 def _open_front(surface: Surface, at: HeadCoordinates) -> np.ndarray:

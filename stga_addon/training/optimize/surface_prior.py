@@ -8,7 +8,7 @@ from functools import cached_property
 import numpy as np
 
 from ...avatar.embedding import face_frames, to_local, to_world
-from ...avatar.lattice import NORMAL_AXIS, lattice_splats
+from ...avatar.lattice import NORMAL_AXIS, SCALE, lattice_splats
 from ...avatar.splats import SH_C0, Splats, joined
 from ...flame.quaternions import from_matrices, to_matrices
 from ..settings import TrainingSettings
@@ -18,6 +18,7 @@ from .change import Turn
 from .frames import FrameStore
 from .likeness import eyeballs_of, lining_of
 from .state import parameters_and_average
+from .surface import Surface
 from .unseen_hair import UnseenHair
 
 WELL_SEEN_COSINE = 0.8
@@ -31,11 +32,12 @@ what is plausible at a turn; the least share of the way that is worth it."""
 HIDDEN_ORDER = 1
 HIDDEN_OPACITY = 3.0
 HIDDEN_FLATNESS = 0.25
+LEAST_WIDTH_SHARE = 0.75
 BACKING_OPACITY = 5.0
 CELL_WIDTH = 0.6
-"""Of the layer on hidden triangles: order of the lattice where none is chosen, logit, and how much
-thinner it is than the lattice's splats; logit, and least standard deviation in cells, of the one
-behind what views graze."""
+"""Of the layer on hidden triangles: order of the lattice where none is chosen, logit, how much
+thinner it is than the lattice's splats and how much narrower it may become; logit, and least
+standard deviation in cells, of the one behind what may be looked through."""
 BESIDE_LID_SHARE = 0.6
 """Of the scale of the layer under lids, at their edges and in the mouth, where it would stand out
 beside the eye and the lips."""
@@ -189,7 +191,7 @@ class SurfacePrior:
     def _flatten(
         self, backend: Backend, bound: np.ndarray, columns: Mapping[str, np.ndarray]
     ) -> None:
-        """Splats on skin and clothes stay thin, those of hair behind as wide as closes it."""
+        """Splats on skin and clothes stay thin, those of the layer behind as wide as closes it."""
         face = columns["face"]
         limit = FLAT_VOXELS * self._frames.voxel
         axis = NORMAL_AXIS[self._frames.convention]
@@ -197,8 +199,7 @@ class SurfacePrior:
         rotation = columns["parameters/rotation"][rows]
         log_scale = columns["parameters/log_scale"][rows]
         limits = limit / self._frames.unit_lengths[face[rows]]
-        is_layer = self._surface.closed & (self._surface.facing < BEHIND_COSINE)
-        least = np.where(is_layer, self._hair.least_width, 0.0)[face[rows]]
+        least = self._least_width[face[rows]]
         off = thickness(rotation, log_scale, axis) > FLAT_TOLERANCE * limits
         off |= width(rotation, log_scale, axis) * FLAT_TOLERANCE < least
         off = np.flatnonzero(off)
@@ -206,6 +207,16 @@ class SurfacePrior:
         values = parameters_and_average(dict(zip(("rotation", "log_scale"), flat, strict=True)))
         moments = dict.fromkeys(("first/rotation", "first/log_scale"), 0.0)
         backend.assign(bound[rows[off]], {**values, **moments})
+
+    @cached_property
+    def _least_width(self) -> np.ndarray:
+        """(F,) of the `width` of the layer on triangles that face away from all cameras, or where
+        the mesh ends, in local units; smaller, it has gaps. 0 elsewhere."""
+        surface = self._surface
+        is_layer = surface.closed & ((surface.facing < BEHIND_COSINE) | surface.border)
+        hair = self._hair.least_width
+        skin = LEAST_WIDTH_SHARE * SCALE / HIDDEN_ORDER * self._frames.units * border_inset(surface)
+        return np.where(is_layer, np.where(hair > 0, hair, skin), 0.0)
 
     def _keep_layer(
         self,
@@ -354,13 +365,18 @@ def hidden_splats(frames: FrameStore, settings: TrainingSettings) -> Splats:
     hair = UnseenHair(frames)
     layer = layer.rows((surface.closed & ~hair.has_strands)[layer.face])
     face = layer.face
-    inset = np.where(surface.border, BORDER_INSET, 1.0)[face]
+    inset = border_inset(surface)[face]
     xyz = layer.xyz * inset[:, None]
     xyz[:, axis] += frames.layer_height[face]
     log_scale = layer.log_scale + np.log(inset * frames.hair_widening[face])[:, None]
     log_scale[:, axis] += np.log(HIDDEN_FLATNESS)
     layer = replace(layer, xyz=xyz.astype(np.float32), log_scale=log_scale.astype(np.float32))
     return joined([layer, hair.splats(settings.sh_degree, HIDDEN_OPACITY)])
+
+
+def border_inset(surface: Surface) -> np.ndarray:
+    """(F,) share of the size that the hidden layer has on each triangle."""
+    return np.where(surface.border, BORDER_INSET, 1.0)
 
 
 def splats_behind(frames: FrameStore, sh_degree: int) -> Splats:

@@ -17,7 +17,7 @@ STRAND_COSINE = -0.3
 """Of the angle between a triangle and the camera that it faces most, below which strands grow:
 longer than the layer's splats, they would stand in outlines."""
 STRANDS = 10000
-STRAND_SHARE = 1.1
+STRAND_SHARE = 1.35
 STRAND_SHAPE = (2.6, 0.38, 0.13)
 """How many a whole scalp would have; the product of a strand's standard deviations along and across
 its growth, as a share of a strand's part of the surface, so that they hide what is below; these and
