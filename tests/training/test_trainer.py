@@ -24,7 +24,7 @@ from stga_addon.training.optimize.surface import GRAZING_COSINE, UNSEEN_COSINE
 from stga_addon.training.optimize.trainer import Trainer
 
 from .test_driven_offsets import squeezed
-from .toys import assert_only_selected_changed, bits, quick_settings
+from .toys import assert_only_selected_changed, bits, hidden_layer_size, quick_settings
 
 WHITE = np.ones(3, np.float32)
 
@@ -87,7 +87,7 @@ def test_a_local_iteration_leaves_frozen_rows_bit_identical(toy):
 @pytest.mark.parametrize("degree", [0, 3])
 @pytest.mark.parametrize("camera", [0, 2])
 def test_local_gradient_is_the_whole_images(toy, degree, camera):
-    """Catches tiles left out, and pixels read that no tile rendered (they are NaN)."""
+    """Catches tiles left out, and pixels that count though no tile rendered them."""
     trainer = make_trainer(toy)
     disturb(trainer)
     view, target = large(view_of(toy, 1, camera))
@@ -100,7 +100,7 @@ def test_local_gradient_is_the_whole_images(toy, degree, camera):
     screen_gradient = screen.copy()
     wanted = rows[focus[rows]].copy()
     for buffer in step._buffers._buffers.values():
-        buffer.fill(np.nan if buffer.dtype.kind == "f" else 0)
+        buffer.fill(1e3 if buffer.dtype.kind == "f" else 0)
     for array in trainer.state.gradients:
         array.fill(7.0)
     rows, screen, loss = step._backward(frames, view, target, options, focus)
@@ -189,10 +189,10 @@ def test_splats_of_a_triangle_by_the_mesh(toy, monkeypatch, most, first, whole):
     settings = quick_settings(lattice=None, density_interval=10)
     trainer = Trainer(toy, settings, {})
     triangles = len(toy.faces)
-    hidden = int(trainer.frames.surface.hidden.sum())  # three each, in which no view splits
-    shown = triangles - hidden
-    assert len(trainer) == first * shown + 3 * hidden
-    assert trainer.initial_count == whole * shown + 3 * hidden
+    layer = hidden_layer_size(trainer.frames)
+    shown = triangles - int(trainer.frames.surface.hidden.sum())
+    assert len(trainer) == first * shown + layer
+    assert trainer.initial_count == whole * shown + layer
     even = replace(settings, density_interval=0)
     assert len(initial_splats(toy, even)) == whole * triangles
     assert len(initial_splats(toy, quick_settings(lattice=0))) == triangles

@@ -130,6 +130,17 @@ class Rows(CpuBackend):
         return found
 
 
+def hidden_layer_size(frames):
+    """How many splats lie on triangles that no camera faces: points of a lattice at most as far
+    apart as hull points, 15 a triangle at most."""
+    capture = frames.capture
+    corners = np.asarray(capture.neutral)[capture.faces[frames.surface.hidden]]
+    sides = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    leg = np.sqrt(np.linalg.norm(sides, axis=1))
+    rows = np.clip(np.ceil(leg / frames.voxel), 1, 4).astype(int) + 1
+    return int((rows * (rows + 1) // 2).sum())
+
+
 def bits(state):
     """Every array as bytes per row, so that NaN and −0 compare; without gradients."""
     arrays = {

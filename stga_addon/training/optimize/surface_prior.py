@@ -29,15 +29,16 @@ DOUBT = 0.3
 MIN_PULL = 0.02
 """Gradient, as a share of the median of well seen splats, at which a splat is pulled halfway to
 what is plausible at a turn; the least share of the way that is worth it."""
-HIDDEN_ORDER = 1
+HIDDEN_SPACING_VOXELS = 1.0
+MAX_HIDDEN_ORDER = 4
 HIDDEN_OPACITY = 3.0
 HIDDEN_FLATNESS = 0.25
-LEAST_WIDTH_SHARE = 0.75
+LEAST_WIDTH_SHARE = 0.9
 BACKING_OPACITY = 5.0
 CELL_WIDTH = 0.6
-"""Of the layer on hidden triangles: order of the lattice where none is chosen, logit, how much
-thinner it is than the lattice's splats and how much narrower it may become; logit, and least
-standard deviation in cells, of the one behind what may be looked through."""
+"""Of the layer on hidden triangles: spacing and largest order of the lattice where none is chosen,
+logit, how much thinner it is than the lattice's splats and how much narrower it may become;
+logit, and least standard deviation in cells, of the one behind what may be looked through."""
 BESIDE_LID_SHARE = 0.6
 """Of the scale of the layer under lids, at their edges and in the mouth, where it would stand out
 beside the eye and the lips."""
@@ -46,7 +47,8 @@ LINING_SHARE = 0.5
 EYE_DEPTH_M = 0.0005
 """Least depth of splats below the eyeballs that they are on."""
 BORDER_INSET = 0.6
-"""Of the distance from the middle of a triangle, and of the scale, at the mesh's edge."""
+"""Of the distance from the middle of a triangle, and of the scale, at the mesh's edge, of a lattice
+of order 1; a finer one reaches less beyond."""
 FLAT_VOXELS = 0.25
 FLAT_TOLERANCE = 1.02
 """Largest standard deviation of splats on skin and clothes along the normal; how much more is worth
@@ -215,7 +217,9 @@ class SurfacePrior:
         surface = self._surface
         is_layer = surface.closed & ((surface.facing < BEHIND_COSINE) | surface.border)
         hair = self._hair.least_width
-        skin = LEAST_WIDTH_SHARE * SCALE / HIDDEN_ORDER * self._frames.units * border_inset(surface)
+        order = hidden_order(self._frames)
+        inset = border_inset(surface, order)
+        skin = LEAST_WIDTH_SHARE * SCALE * inset / order * self._frames.units
         return np.where(is_layer, np.where(hair > 0, hair, skin), 0.0)
 
     def _keep_layer(
@@ -354,18 +358,25 @@ def hidden_splats(frames: FrameStore, settings: TrainingSettings) -> Splats:
     capture = frames.capture
     surface = frames.surface
     axis = NORMAL_AXIS[frames.convention]
-    layer = lattice_splats(
-        capture.neutral,
-        capture.faces,
-        HIDDEN_ORDER if settings.lattice is None else settings.lattice,
-        settings.sh_degree,
-        HIDDEN_OPACITY,
-        convention=frames.convention,
-    )
     hair = UnseenHair(frames)
-    layer = layer.rows((surface.closed & ~hair.has_strands)[layer.face])
+    is_layer = surface.closed & ~hair.has_strands
+    order = hidden_order(frames)
+    if settings.lattice is not None:
+        order[:] = settings.lattice
+    parts = []
+    for one in np.unique(order):
+        lattice = lattice_splats(
+            capture.neutral,
+            capture.faces,
+            int(one),
+            settings.sh_degree,
+            HIDDEN_OPACITY,
+            convention=frames.convention,
+        )
+        parts.append(lattice.rows((is_layer & (order == one))[lattice.face]))
+    layer = joined(parts)
     face = layer.face
-    inset = border_inset(surface)[face]
+    inset = border_inset(surface, order)[face]
     xyz = layer.xyz * inset[:, None]
     xyz[:, axis] += frames.layer_height[face]
     log_scale = layer.log_scale + np.log(inset * frames.hair_widening[face])[:, None]
@@ -374,9 +385,19 @@ def hidden_splats(frames: FrameStore, settings: TrainingSettings) -> Splats:
     return joined([layer, hair.splats(settings.sh_degree, HIDDEN_OPACITY)])
 
 
-def border_inset(surface: Surface) -> np.ndarray:
-    """(F,) share of the size that the hidden layer has on each triangle."""
-    return np.where(surface.border, BORDER_INSET, 1.0)
+def hidden_order(frames: FrameStore) -> np.ndarray:
+    """(F,) order of the hidden layer's lattice, the higher the larger the triangles: colors and
+    ends of the mesh would be as coarse as these."""
+    spacing = HIDDEN_SPACING_VOXELS * frames.voxel
+    order = np.ceil(frames.units * frames.unit_lengths / spacing)
+    return np.clip(order, 1, MAX_HIDDEN_ORDER).astype(int)
+
+
+def border_inset(surface: Surface, order: np.ndarray) -> np.ndarray:
+    """(F,) share of the size that the hidden layer, lattices of these orders (F,), has on each
+    triangle."""
+    inset = 1 - (1 - BORDER_INSET) / np.maximum(order, 1) ** 2
+    return np.where(surface.border, inset, 1.0)
 
 
 def splats_behind(frames: FrameStore, sh_degree: int) -> Splats:

@@ -47,6 +47,10 @@ MAX_LIGHT_RATIO = 2.0
 SMOOTHING = {"scalp": (SMOOTHED, 1.0), "body": (2 * SMOOTHED, 3.0)}
 """Triangles over which copied colors are smoothed, and by how much those above and below count as
 farther than those beside: collars are level, and shadows of a chin are on the neck's front only."""
+SOFTENED = 4
+SAME_COLOR_DEVIATION = 0.12
+"""How many times as many triangles are softened over, and by how much colors, in 0…1, may differ
+that count as the same but for their shade: collars and hairlines stay sharp."""
 SHOWN_COSINE = 0.5
 ASIDE_SHARE = 0.75
 """Of the angle between a triangle and the camera that it faces most, above which its color depends
@@ -147,11 +151,16 @@ def plausible_aside(splats: Splats, along: np.ndarray, sides: UnseenSides) -> Sp
 
 
 def _smoothed(color: np.ndarray, places: np.ndarray, smoothing: tuple[int, float]) -> np.ndarray:
-    """Colors (N, 3), of each the median of those around it, as SMOOTHING has it; places (N, 3) to
-    the head's left, up and ahead."""
+    """Colors (N, 3), of each the median of those around it, as SMOOTHING has it, and of such
+    medians the mean of similar ones: what is copied from a lit and a shaded side would have
+    patches of both. places (N, 3) to the head's left, up and ahead."""
     count, level_weight = smoothing
     places = places * [1, level_weight, 1]
-    return np.asarray(np.median(color[nearest_rows(places, places, count)], axis=1))
+    median = np.median(color[nearest_rows(places, places, count)], axis=1)
+    around = median[nearest_rows(places, places, SOFTENED * count)]
+    difference = (around - median[:, None]) / SAME_COLOR_DEVIATION
+    weight = np.exp(-(difference**2).sum(2, keepdims=True) / 2)
+    return np.asarray((weight * around).sum(1) / weight.sum(1))
 
 
 def _as_nearest(

@@ -12,12 +12,12 @@ from stga_addon.training.effects.plan import plan_effects
 from stga_addon.training.optimize import cpu_backend, frames, initial_splats, trainer
 from stga_addon.training.optimize.density import DensityControl
 from stga_addon.training.optimize.image_preparation import exposure_correction
-from stga_addon.training.optimize.surface import Surface
 from stga_addon.training.run import session
 from stga_addon.training.run.checkpoint import read_checkpoint
 from stga_addon.training.run.folder import Run
 from stga_addon.training.settings import make_settings
 
+from ..toys import hidden_layer_size
 from .scenes import unlike_cameras
 
 # What each effect calls, by where the call is made from.
@@ -59,8 +59,9 @@ def test_off_calls_nothing_and_on_calls_all(painted, tmp_path, monkeypatch):
     assert calls == {}
     assert state.parameters.sh.shape[1] == 1
     assert not state.driven_offsets
-    hidden = int(Surface(painted()).hidden.sum())  # half as many
-    assert len(state) == 6 * len(painted().faces) - 3 * hidden
+    store = frames.FrameStore(painted(), "stga")
+    shown = int((~store.surface.hidden).sum())
+    assert len(state) == 6 * shown + hidden_layer_size(store)
     calls, state = train(painted(), tmp_path / "on", monkeypatch, "on")
     assert set(calls) == set(CALLS)
     assert calls["background"] == ITERATIONS
