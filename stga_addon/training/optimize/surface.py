@@ -7,7 +7,7 @@ import numpy as np
 from scipy.ndimage import binary_dilation
 from scipy.spatial import cKDTree
 
-from ...avatar.embedding import face_frames
+from ...avatar.embedding import FaceFrames, face_frames
 from ...avatar.lattice import NORMAL_AXIS
 from ...capture.camera import look_at
 from ...capture.images import read_view
@@ -210,12 +210,9 @@ class Surface:
                       the axes of their frames
         margin_share  of the masks' height, which still counts as inside; negative: as outside
         """
-        capture = self.capture
         offsets = np.broadcast_to(offsets, (len(rows), *offsets.shape[-2:]))
         seen, beside = np.zeros((2, *offsets.shape[:2]), int)
-        for view, mask in self.masks:
-            mesh = np.asarray(capture.mesh(view.timestep), np.float64)
-            frames = face_frames(mesh, capture.faces, mesh, "stga")
+        for (view, mask), frames in zip(self.masks, self._mask_frames, strict=True):
             points = np.einsum("nij,nkj->nki", frames.rotation[rows], offsets)
             points += frames.origin[rows, None]
             column, row, within = pixels_of(points.reshape(-1, 3), view.camera)
@@ -232,6 +229,15 @@ class Surface:
             small, _, mask = read_view(view, scale)
             if mask is not None:
                 found.append((small, mask))
+        return found
+
+    @cached_property
+    def _mask_frames(self) -> list[FaceFrames]:
+        """Of the meshes that the views of `masks` show."""
+        found = []
+        for view, _ in self.masks:
+            mesh = np.asarray(self.capture.mesh(view.timestep), np.float64)
+            found.append(face_frames(mesh, self.capture.faces, mesh, "stga"))
         return found
 
     @cached_property

@@ -202,9 +202,11 @@ class SurfacePrior:
         log_scale = columns["parameters/log_scale"][rows]
         limits = limit / self._frames.unit_lengths[face[rows]]
         least = self._least_width[face[rows]]
-        off = thickness(rotation, log_scale, axis) > FLAT_TOLERANCE * limits
-        off |= width(rotation, log_scale, axis) * FLAT_TOLERANCE < least
-        off = np.flatnonzero(off)
+        is_off = thickness(rotation, log_scale, axis) > FLAT_TOLERANCE * limits
+        layer = np.flatnonzero(least > 0)
+        widths = width(rotation[layer], log_scale[layer], axis)
+        is_off[layer] |= widths * FLAT_TOLERANCE < least[layer]
+        off = np.flatnonzero(is_off)
         flat = flattened(rotation[off], log_scale[off], axis, limits[off], least[off])
         values = parameters_and_average(dict(zip(("rotation", "log_scale"), flat, strict=True)))
         moments = dict.fromkeys(("first/rotation", "first/log_scale"), 0.0)
