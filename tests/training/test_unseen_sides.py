@@ -635,6 +635,23 @@ def test_nobody_looks_through_a_side(bundled, tmp_path):
         assert alpha_of(layer, camera, frames)[own].min() > 0.9
 
 
+def test_the_end_behind_a_bust_stays(bundled, tmp_path):
+    """Catches a hem behind a bust that training frays."""
+    capture = filmed(bundled, painted(bundled), TURNS_DEG, 0.0, tmp_path)
+    trainer = Trainer(capture, quick_settings("global", lattice=None), {})
+    surface = trainer.frames.surface
+    state = trainer.state
+    rows = (surface.border & surface.closed)[state.face] & ~state.unbound
+    assert rows.sum() > 100
+    before = [array[rows].copy() for array in state.parameters[:3]]
+    for array in state.parameters[:3]:
+        array[rows] += np.random.default_rng(0).normal(0, 0.01, array[rows].shape)
+    for name in ("strays", "unseen sides"):
+        trainer.changes[name].apply(trainer._backend, Turn(20, 0.1, len(state)))
+    for array, kept in zip(trainer.state.parameters[:3], before, strict=True):
+        assert_allclose(array[rows], kept, atol=1e-6)
+
+
 def test_nobody_looks_through_what_a_collar_hides(bundled, tmp_path):
     """Catches a neck and clothes that are opaque for the cameras only, which see a collar before
     them, so that from aside the background shows through; and a layer that reaches beyond the end

@@ -69,7 +69,7 @@ PINNED_KINDS = ("parameters", "average", "first", "second")
 INNER_PARAMETERS = ("xyz", "rotation", "log_scale", "opacity")
 """Second moments of positions and shapes; of all that is compared with well seen splats; what is
 read of the splats that may be pulled; arrays of those whose color is pinned; parameters of the
-inner layer that stay."""
+inner layer, and of the layer's end, that stay."""
 
 
 class SurfacePrior:
@@ -115,6 +115,7 @@ class SurfacePrior:
         self._shorten_steps(backend, bound, columns, moments)
         self._flatten(backend, bound, columns)
         self._keep_layer(backend, bound, columns, is_inner)
+        self._keep_end(backend, bound, columns, is_inner)
         self._shrink_lining(backend, bound, columns)
         self._sink_eyes(backend, bound, columns)
 
@@ -240,6 +241,37 @@ class SurfacePrior:
         kept = {name: getattr(inner, name) for name in INNER_PARAMETERS}
         backend.assign(bound[rows], parameters_and_average(kept))
 
+    def _keep_end(
+        self,
+        backend: Backend,
+        bound: np.ndarray,
+        columns: Mapping[str, np.ndarray],
+        is_inner: np.ndarray,
+    ) -> None:
+        """Splats of the layer where the mesh ends, the first ones of their triangles, stay as its
+        lattice has them: masks would fray the end."""
+        lattice = self._end
+        triangles = len(self._surface.border)
+        size = np.bincount(lattice.face, minlength=triangles)
+        count = np.bincount(columns["face"][~is_inner], minlength=triangles)
+        is_whole = (size > 0) & (count >= size)  # not where another lattice was chosen
+        rows = np.flatnonzero(is_whole[columns["face"]] & ~is_inner)
+        rows = rows[np.argsort(columns["face"][rows], kind="stable")]
+        face = columns["face"][rows]
+        number = np.arange(len(rows)) - np.searchsorted(face, face)
+        is_first = number < size[face]
+        place = (np.searchsorted(lattice.face, face) + number)[is_first]
+        kept = {name: getattr(lattice, name)[place] for name in INNER_PARAMETERS}
+        backend.assign(bound[rows[is_first]], parameters_and_average(kept))
+
+    @cached_property
+    def _end(self) -> Splats:
+        """The layer on triangles at the mesh's end, sorted by triangle."""
+        surface = self._surface
+        order = hidden_order(self._frames)
+        layer = layer_on(self._frames, surface.closed & surface.border, order, 0)
+        return layer.rows(np.argsort(layer.face, kind="stable"))
+
     def _shrink_lining(
         self, backend: Backend, bound: np.ndarray, columns: Mapping[str, np.ndarray]
     ) -> None:
@@ -357,34 +389,40 @@ def above_unseen_hair(frames: FrameStore, splats: Splats) -> np.ndarray:
 def hidden_splats(frames: FrameStore, settings: TrainingSettings) -> Splats:
     """A dense opaque layer on the `closed` triangles, in which no view splits splats: on skin and
     clothes, or where the outer layer of hair is, of strands where no outline shows it."""
-    capture = frames.capture
     surface = frames.surface
-    axis = NORMAL_AXIS[frames.convention]
     hair = UnseenHair(frames)
-    is_layer = surface.closed & ~hair.has_strands
     order = hidden_order(frames)
     if settings.lattice is not None:
         order[:] = settings.lattice
+    layer = layer_on(frames, surface.closed & ~hair.has_strands, order, settings.sh_degree)
+    return joined([layer, hair.splats(settings.sh_degree, HIDDEN_OPACITY)])
+
+
+def layer_on(
+    frames: FrameStore, triangles: np.ndarray, order: np.ndarray, sh_degree: int
+) -> Splats:
+    """The hidden layer on some triangles (F,) bool: lattices of these orders (F,)."""
+    capture = frames.capture
     parts = []
     for one in np.unique(order):
         lattice = lattice_splats(
             capture.neutral,
             capture.faces,
             int(one),
-            settings.sh_degree,
+            sh_degree,
             HIDDEN_OPACITY,
             convention=frames.convention,
         )
-        parts.append(lattice.rows((is_layer & (order == one))[lattice.face]))
+        parts.append(lattice.rows((triangles & (order == one))[lattice.face]))
     layer = joined(parts)
     face = layer.face
-    inset = border_inset(surface, order)[face]
+    axis = NORMAL_AXIS[frames.convention]
+    inset = border_inset(frames.surface, order)[face]
     xyz = layer.xyz * inset[:, None]
     xyz[:, axis] += frames.layer_height[face]
     log_scale = layer.log_scale + np.log(inset * frames.hair_widening[face])[:, None]
     log_scale[:, axis] += np.log(HIDDEN_FLATNESS)
-    layer = replace(layer, xyz=xyz.astype(np.float32), log_scale=log_scale.astype(np.float32))
-    return joined([layer, hair.splats(settings.sh_degree, HIDDEN_OPACITY)])
+    return replace(layer, xyz=xyz.astype(np.float32), log_scale=log_scale.astype(np.float32))
 
 
 def hidden_order(frames: FrameStore) -> np.ndarray:
