@@ -215,14 +215,12 @@ class SurfacePrior:
 
     @cached_property
     def _least_width(self) -> np.ndarray:
-        """(F,) of the `width` of the layer on triangles that face away from all cameras, or where
-        the mesh ends, in local units; smaller, it has gaps. 0 elsewhere."""
+        """(F,) of the `width` of the layer on triangles that face away from all cameras, in local
+        units; smaller, it has gaps. 0 elsewhere."""
         surface = self._surface
-        is_layer = surface.closed & ((surface.facing < BEHIND_COSINE) | surface.border)
+        is_layer = surface.closed & (surface.facing < BEHIND_COSINE)
         hair = self._hair.least_width
-        order = hidden_order(self._frames)
-        inset = border_inset(surface, order)
-        skin = LEAST_WIDTH_SHARE * SCALE * inset / order * self._frames.units
+        skin = LEAST_WIDTH_SHARE * SCALE * self._frames.units / hidden_order(self._frames)
         return np.where(is_layer, np.where(hair > 0, hair, skin), 0.0)
 
     def _keep_layer(
@@ -269,7 +267,8 @@ class SurfacePrior:
         """The layer on triangles at the mesh's end, sorted by triangle."""
         surface = self._surface
         order = hidden_order(self._frames)
-        layer = layer_on(self._frames, surface.closed & surface.border, order, 0)
+        is_end = surface.closed & surface.border & ~self._hair.has_strands
+        layer = layer_on(self._frames, is_end, order, 0)
         return layer.rows(np.argsort(layer.face, kind="stable"))
 
     def _shrink_lining(
