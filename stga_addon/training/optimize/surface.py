@@ -233,7 +233,7 @@ class Surface:
 
     @cached_property
     def _mask_frames(self) -> list[FaceFrames]:
-        """Of the meshes that the views of `masks` show."""
+        """The triangles' frames in the meshes that the views of `masks` show."""
         found = []
         for view, _ in self.masks:
             mesh = np.asarray(self.capture.mesh(view.timestep), np.float64)

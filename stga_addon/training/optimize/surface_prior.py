@@ -403,16 +403,17 @@ def layer_on(
     """The hidden layer on some triangles (F,) bool: lattices of these orders (F,)."""
     capture = frames.capture
     parts = []
-    for one in np.unique(order):
+    for number in np.unique(order):
+        rows = np.flatnonzero(triangles & (order == number)).astype(np.int32)
         lattice = lattice_splats(
             capture.neutral,
-            capture.faces,
-            int(one),
+            capture.faces[rows],
+            int(number),
             sh_degree,
             HIDDEN_OPACITY,
             convention=frames.convention,
         )
-        parts.append(lattice.rows((triangles & (order == one))[lattice.face]))
+        parts.append(replace(lattice, face=rows[lattice.face]))
     layer = joined(parts)
     face = layer.face
     axis = NORMAL_AXIS[frames.convention]

@@ -47,7 +47,7 @@ MAX_LIGHT_RATIO = 2.0
 SMOOTHING = {"scalp": (SMOOTHED, 1.0), "body": (2 * SMOOTHED, 3.0)}
 """Triangles over which copied colors are smoothed, and by how much those above and below count as
 farther than those beside: collars are level, and shadows of a chin are on the neck's front only."""
-SOFTENED = 4
+SOFTENING_FACTOR = 4
 SAME_COLOR_DEVIATION = 0.12
 """How many times as many triangles are softened over, and by how much colors, in 0…1, may differ
 that count as the same but for their shade: collars and hairlines stay sharp."""
@@ -157,7 +157,7 @@ def _smoothed(color: np.ndarray, places: np.ndarray, smoothing: tuple[int, float
     count, level_weight = smoothing
     places = places * [1, level_weight, 1]
     median = np.median(color[nearest_rows(places, places, count)], axis=1)
-    around = median[nearest_rows(places, places, SOFTENED * count)]
+    around = median[nearest_rows(places, places, SOFTENING_FACTOR * count)]
     difference = (around - median[:, None]) / SAME_COLOR_DEVIATION
     weight = np.exp(-(difference**2).sum(2, keepdims=True) / 2)
     return np.asarray((weight * around).sum(1) / weight.sum(1))
