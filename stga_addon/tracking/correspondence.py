@@ -78,7 +78,7 @@ def calibrate(
     """
     neutral = model.v_template
     faces = model.faces
-    colors = _colors(model)
+    colors = head_colors(model)
     located, count = _located(neutral, faces, colors, detector)
     if located is None:
         raise StgaError(
@@ -118,7 +118,7 @@ def calibrate(
     return places, reliable
 
 
-def _colors(model: FlameModel) -> np.ndarray:
+def head_colors(model: FlameModel) -> np.ndarray:
     """(V, 3) of the pictures: a detector needs irises to tell open eyes from closed ones, of models
     whose eyes are closed in some."""
     colors = np.tile(SKIN_RGB, (len(model.v_template), 1))

@@ -64,12 +64,14 @@ class Triangulation:
                  position) is the mean squared distance of x from the rays, up to a constant
     residual     (N,) median distance of the rays from `position`, 0 where there is none
     seen         (N,) bool: by two cameras at least, or by the only one
+    eye          (3,) position of the only camera; None of several
     """
 
     position: np.ndarray
     information: np.ndarray
     residual: np.ndarray
     seen: np.ndarray
+    eye: np.ndarray | None = None
 
 
 def rays(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -323,7 +325,7 @@ def triangulated(
     guess[seen] = pose_from_one_camera(camera, pixels[seen], head[seen] / scale)
     depth = ((guess - origin) * directions).sum(1, keepdims=True)
     across = seen[:, None, None] * (np.eye(3) - directions[:, :, None] * directions[:, None])
-    return Triangulation(origin + depth * directions, across, np.zeros(len(head)), seen)
+    return Triangulation(origin + depth * directions, across, np.zeros(len(head)), seen, origin)
 
 
 def observed_landmarks(
@@ -334,7 +336,8 @@ def observed_landmarks(
     root = (vectors * np.sqrt(np.maximum(values, 0))[:, None, :]) @ vectors.swapaxes(1, 2)
     residuals = np.minimum(found.residual * world.scale / RESIDUAL_SCALE_M, MAX_RESIDUALS)
     weight = np.where(found.seen & reliable, np.exp(-(residuals**2)), 0.0)
-    return Observation(world.apply(found.position), root, weight)
+    eye = None if found.eye is None else world.apply(found.eye)
+    return Observation(world.apply(found.position), root, weight, eye)
 
 
 def landmarks_in_capture(

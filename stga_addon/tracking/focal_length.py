@@ -1,40 +1,55 @@
-"""Focal length of a single camera, from landmarks of a head that turns: a near head changes its
-shape in the image; and cameras of a rig that see the head larger or smaller than the others do."""
+"""Focal length of a single camera, from landmarks of a head and what is likely; and cameras of a rig
+that see the head larger or smaller than the others do."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from ..capture.mesh_geometry import Similarity
 from ..capture.model import evenly_spread
-from ..flame.forward import RIGID_SIZE
+from ..flame.forward import RIGID_SIZE, TRANSLATION_SIZE
 from . import fit as head_fit
 from .fit import HeadFit, RecordedTake, TimestepLandmarks
 from .head_model import HeadModel
 from .posed_points import PosedPoints, SurfacePoints, head_rotation, split
-from .solve import LANDMARK_SIGMA_M, Observation, person, solve_identity
+from .solve import LANDMARK_SIGMA_M, Observation, person, residuals, solve_identity
 
 CANDIDATES = 64
+"""Timesteps, spread over the take, among which the most differently turned ones are looked for."""
 TIMESTEPS = 12
+"""Timesteps whose landmarks are compared."""
 LANDMARKS = 80
-"""Timesteps of which the most differently turned are chosen, and how many; landmarks used."""
-MIN_TURN_DEG = (
-    20.0  # Between two timesteps; below it, what is near cannot be told from what is large
-)
-USUAL_SIGMA = 0.35  # Standard deviation of the inverse focal length about that of a phone, relative
-NEAREST = 2.0
-FARTHEST = 0.2
-"""Largest and smallest inverse, relative to that of a phone: 104° and 15° over the diagonal."""
-OWN_SIGMA_M = LANDMARK_SIGMA_M
+"""Landmarks that are compared, spread over the reliable ones."""
+OWN_SIGMA_M = 0.002
+"""Standard deviation of what a person's landmark misses the head by in all timesteps alike."""
 NOISE_SIGMA_M = 0.0006
-"""Standard deviations of what a landmark misses the head by in all timesteps alike, which says
-nothing of focal lengths, and beyond that in one of them."""
-SOLVES = 6
+"""Standard deviation of what a landmark misses the head by beyond that in one timestep."""
+RATIOS = np.geomspace(0.5, 6.0, 7)
+"""Focal lengths that the head is fitted for, relative to a phone's: 104° to 12° over the diagonal."""
+FINE_RATIOS = np.geomspace(0.5, 6.0, 400)
+"""Focal lengths between which the posterior is read."""
 ROUNDS = 2
-CONVERGED = 0.01
-"""Inverse focal lengths that are tried; fits of the head for each, as its depth is that of the fit
-before; and the relative change after which no more are tried."""
+"""Fits of the head for each focal length, as its depth is that of the fit before."""
+CAMERA_ASPECTS = (16 / 9, 4 / 3, 3 / 2)
+"""Longer over shorter side of images as cameras record them; others were cropped."""
+ASPECT_TOLERANCE = 0.005
+"""Relative difference up to which an image has one of these."""
+CAMERA_SIGMA = 0.5
+"""Standard deviation of the logarithm of a camera's focal length about a phone's."""
+CROPPED_SIGMA = 1.2
+"""The same where images were cropped, which makes them narrower."""
+DISTANCE_M = 1.1
+"""Median distance of a camera from a face, unless a phone is held in the hand."""
+DISTANCE_SIGMA = 0.5
+"""Standard deviation of the distance's logarithm."""
+DATA_WEIGHT = 0.5
+"""Weight of the landmarks' likelihood: their errors are not independent."""
+CHOSEN_QUANTILE = 0.6
+"""Of the posterior. A focal length that is too long by half costs little in views from the side, one
+that is too short by half makes another person."""
+INTERVAL = (0.1, 0.9)
+"""Quantiles of the posterior that are reported."""
 MAX_SCALE_DIFFERENCE = 0.043  # Of a camera from the median of all; 5 % of focal length show
 MAX_SIDE_DEG = 60.0
 """Between the way the head faces and a camera, beyond which its landmarks are not compared: on the
@@ -51,41 +66,53 @@ HERE = Similarity(
 )  # The camera's own world, in meters, in which the head is fitted
 
 
-def solved_focal(head: HeadModel, take: RecordedTake) -> float | None:
-    """Focal length in pixels of the only camera of `take`, whose own is that of a phone
+@dataclass(frozen=True)
+class FocalEstimate:
+    """Focal length in pixels of a camera without calibration, the ends of the interval that holds
+    it with a probability of 80 %, and the largest angle between two poses of the head."""
+
+    pixels: float
+    low: float
+    high: float
+    turn_deg: float
+
+
+def estimated_focal(head: HeadModel, take: RecordedTake) -> FocalEstimate:
+    """Focal length of the only camera of `take`, whose own is that of a phone
     (`open.usual_focal`).
 
-    The maximum of its posterior, by the secant method; the inverse has a normal prior about the
-    camera's own. None where the head turns too little, or where landmarks say less of it than the
-    prior.
+    A quantile of its posterior. The likelihood is that of landmarks of the most differently turned
+    timesteps, under the best fit of the head for each focal length; the prior knows the angle of
+    view of phones and the distance at which people are filmed.
     """
+    from scipy.interpolate import CubicSpline
+
     rows = np.array(evenly_spread(np.flatnonzero(take.reliable).tolist(), LANDMARKS))
+    whole = [(own.confidence[:, rows] > 0).sum() for own in take.landmarks.values()]
+    enough = max(whole) / 2
     seen = {
         t: replace(own, points=own.points[:, rows], confidence=own.confidence[:, rows])
-        for t, own in take.landmarks.items()
-        if (own.confidence[:, rows] > 0).all()
+        for (t, own), count in zip(take.landmarks.items(), whole, strict=True)
+        if count >= enough
     }
     own_head, own_places = _with_own_places(head, take.places[rows])
-    timesteps = _turned(own_head, own_places, seen)
-    if not timesteps:
-        return None
+    timesteps, turn_deg = _turned(own_head, own_places, seen)
     views = [seen[t] for t in timesteps]
-
-    def slope(inverse: float) -> float:
-        return _slope(own_head, own_places, views, inverse) + (inverse - 1) / USUAL_SIGMA**2
-
-    tried = [1.0, 0.6]
-    slopes = [slope(inverse) for inverse in tried]
-    rise = (slopes[1] - slopes[0]) / (tried[1] - tried[0])
-    while len(tried) < SOLVES and rise > 0:
-        inverse = float(np.clip(tried[-1] - slopes[-1] / rise, FARTHEST, NEAREST))
-        if abs(inverse - tried[-1]) < CONVERGED:
-            break
-        tried.append(inverse)
-        slopes.append(slope(inverse))
-        rise = (slopes[-1] - slopes[-2]) / (tried[-1] - tried[-2])
-    by_landmarks = rise - 1 / USUAL_SIGMA**2
-    return views[0].cameras[0].fl_x / tried[-1] if by_landmarks > 1 / USUAL_SIGMA**2 else None
+    camera = views[0].cameras[0]
+    slopes, distances = _fits(own_head, own_places, views)
+    tried = np.log(RATIOS)
+    fine = np.log(FINE_RATIOS)
+    cost = DATA_WEIGHT * CubicSpline(tried, slopes).antiderivative()(fine)
+    sides = max(camera.width, camera.height), min(camera.width, camera.height)
+    aspect = sides[0] / sides[1]
+    is_whole = any(abs(aspect / usual - 1) < ASPECT_TOLERANCE for usual in CAMERA_ASPECTS)
+    cost += (fine / (CAMERA_SIGMA if is_whole else CROPPED_SIGMA)) ** 2 / 2
+    distance = np.interp(fine, tried, np.log(distances))
+    cost += ((distance - np.log(DISTANCE_M)) / DISTANCE_SIGMA) ** 2 / 2
+    density = np.exp(cost.min() - cost)
+    below = np.cumsum(density) / density.sum()
+    quantiles = np.interp((CHOSEN_QUANTILE, *INTERVAL), below, fine)
+    return FocalEstimate(*(camera.fl_x * np.exp(quantiles)).tolist(), turn_deg)
 
 
 def _with_own_places(head: HeadModel, places: SurfacePoints) -> tuple[HeadModel, SurfacePoints]:
@@ -112,21 +139,18 @@ def _with_own_places(head: HeadModel, places: SurfacePoints) -> tuple[HeadModel,
 
 def _turned(
     head: HeadModel, places: SurfacePoints, take: Mapping[int, TimestepLandmarks]
-) -> list[int]:
-    """Timesteps at which the head is turned most differently; none where it does not turn."""
+) -> tuple[list[int], float]:
+    """Timesteps at which the head is turned most differently, and the largest angle between two of
+    them in degrees."""
     timesteps = evenly_spread(sorted(take), CANDIDATES)
-    if len(timesteps) < 2:
-        return []
     starts = _observed(head, places, [take[t] for t in timesteps])[1]
     turns = np.stack([head_rotation(start) for start in starts])
     cosine = (np.einsum("aij,bij->ab", turns, turns) - 1) / 2
-    apart = np.arccos(np.clip(cosine, -1, 1))
-    if np.degrees(apart.max()) < MIN_TURN_DEG:
-        return []
-    chosen = [int(number) for number in np.unravel_index(apart.argmax(), apart.shape)]
+    apart = np.degrees(np.arccos(np.clip(cosine, -1, 1)))
+    chosen = [int(apart.max(axis=0).argmax())]
     while len(chosen) < min(TIMESTEPS, len(timesteps)):
         chosen.append(int(apart[chosen].min(axis=0).argmax()))
-    return sorted({timesteps[number] for number in chosen})
+    return sorted({timesteps[number] for number in chosen}), float(apart.max())
 
 
 def _observed(
@@ -140,44 +164,67 @@ def _observed(
     return found, np.stack([head_fit.rigid_start(neutral, own) for own in found])
 
 
-def _slope(
-    head: HeadModel, places: SurfacePoints, views: Sequence[TimestepLandmarks], inverse: float
-) -> float:
-    """Derivative of the negative log-likelihood by the inverse focal length; both are relative to
-    the cameras' own.
-
-    At the best fit of the head it is that with a head that stays: rays turn away from its points.
-    """
+def _fits(
+    head: HeadModel, places: SurfacePoints, views: Sequence[TimestepLandmarks]
+) -> tuple[np.ndarray, np.ndarray]:
+    """For each of RATIOS the derivative of the negative log-likelihood by the logarithm of the
+    focal length, and the head's median distance in meters."""
     camera = views[0].cameras[0]
-    trial = replace(camera, fl_x=camera.fl_x / inverse, fl_y=camera.fl_y / inverse)
-    views = [replace(view, cameras=(trial,)) for view in views]
-    subject = person(head, np.zeros(head.model.n_identity))
+    shape = np.zeros(head.model.n_identity)
     frames = np.zeros(0)
-    observed: list[Observation] = []
-    for _ in range(ROUNDS):
-        seen, starts = _observed(subject, places, views)
-        frames = frames if len(frames) else np.pad(starts, ((0, 0), (head.model.n_expression, 0)))
-        visibility = head_fit.LandmarkVisibility(subject, places)
-        observed = []
-        factor = LANDMARK_SIGMA_M / NOISE_SIGMA_M
-        for view, own, values in zip(views, seen, frames, strict=True):
-            weight = own.weight * visibility.weighted(view, values, HERE).confidence[0]
-            observed.append(replace(own, root=own.root * factor, weight=weight))
-        identity = solve_identity(head, places, observed, starts, metric=True)
-        subject = person(head, identity.shape)
-        frames = identity.frames
+    slopes = []
+    distances = []
+    before = 1.0
+    for ratio in RATIOS:
+        trial = replace(camera, fl_x=camera.fl_x * ratio, fl_y=camera.fl_y * ratio)
+        trials = [replace(view, cameras=(trial,)) for view in views]
+        if len(frames):  # as large in the image as before
+            frames[:, -TRANSLATION_SIZE:] *= ratio / before
+        before = ratio
+        for _ in range(ROUNDS if len(frames) else ROUNDS + 1):
+            subject = person(head, shape)
+            observed, starts = _observed(subject, places, trials)
+            if not len(frames):
+                frames = np.pad(starts, ((0, 0), (head.model.n_expression, 0)))
+            visibility = head_fit.LandmarkVisibility(subject, places)
+            factor = LANDMARK_SIGMA_M / NOISE_SIGMA_M
+            weighted = []
+            for view, own, values in zip(trials, observed, frames, strict=True):
+                weight = own.weight * visibility.weighted(view, values, HERE).confidence[0]
+                weighted.append(replace(own, root=own.root * factor, weight=weight))
+            identity = solve_identity(head, places, weighted, frames, metric=True, shape=shape)
+            shape = identity.shape
+            frames = identity.frames
+        subject = person(head, shape)
+        slopes.append(_slope(subject, places, trials, weighted, frames))
+        distances.append(float(np.median(-frames[:, -1])))
+    return np.array(slopes), np.array(distances)
+
+
+def _slope(
+    subject: HeadModel,
+    places: SurfacePoints,
+    views: Sequence[TimestepLandmarks],
+    observed: Sequence[Observation],
+    frames: np.ndarray,
+) -> float:
+    """Derivative of the negative log-likelihood by the logarithm of the focal length, at the best
+    fit: there it is that with a head that stays, whose image grows about the principal point."""
     points = PosedPoints(subject.model, places)
     total = 0.0
-    rotation = camera.world_to_camera[:3, :3]
     for view, own, values in zip(views, observed, frames, strict=True):
+        camera = view.cameras[0]
         at = points.positions(*split(values))
-        residual = np.einsum("nij,nj->ni", own.root, at - own.position) / LANDMARK_SIGMA_M
-        _, depth = camera.project(at)
-        flat = (view.points[0] - [camera.cx, camera.cy]) / [camera.fl_x, camera.fl_y]
-        flat = flat * depth[:, None]
-        away = np.einsum("nij,nj->ni", own.root, flat @ rotation[:2]) / LANDMARK_SIGMA_M
+        residual, _ = residuals(points, values, own)
+        eye = camera.position
+        grown = at - eye
+        axis = camera.world_to_camera[2, :3]
+        depth = grown @ axis
+        across = grown - depth[:, None] * axis  # its image moves away from the axis by this
+        along = np.linalg.norm(own.position - eye, axis=1) / np.linalg.norm(grown, axis=1)
+        moved = np.einsum("nij,nj->ni", own.root, across * along[:, None]) / LANDMARK_SIGMA_M
         weight = own.weight / np.sqrt(1 + (residual**2).sum(1))
-        total -= float((weight * (residual * away).sum(1)).sum())
+        total += float((weight * (residual * moved).sum(1)).sum())
     return total
 
 

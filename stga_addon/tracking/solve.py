@@ -46,6 +46,9 @@ ROUGH_TAKE_ITERATIONS = 2
 CONVERGED_STEP = 1e-3
 """Largest change of a parameter (standard deviations, radians, meters) after which iterations
 stop."""
+MIN_DEPTH_RATIO = 0.2
+"""Depth of a point on the head, in that of its landmark, below which residuals no longer grow: a
+head that a step moved behind the camera comes back."""
 WINDOW = 192
 OVERLAP = 24
 """Timesteps solved at once, and how many of them two windows share: memory does not grow with the
@@ -58,12 +61,20 @@ Terms = Callable[[int, np.ndarray], tuple[np.ndarray, np.ndarray]]
 
 @dataclass(frozen=True)
 class Observation:
-    """Landmarks of one timestep in meters: position (N, 3), square root of the information (N, 3,
-    3), weight (N,)."""
+    """Landmarks of one timestep in meters.
+
+    position  (N, 3)
+    root      (N, 3, 3) square root of the information
+    weight    (N,)
+    eye       (3,) of the only camera, None of several: residuals are then measured in its image,
+              at the depth of `position`, because a head that shrinks into the camera would
+              otherwise miss every ray by less
+    """
 
     position: np.ndarray
     root: np.ndarray
     weight: np.ndarray
+    eye: np.ndarray | None = None
 
 
 @dataclass(frozen=True)
@@ -80,11 +91,12 @@ def solve_identity(
     head: HeadModel,
     places: SurfacePoints,
     observations: Sequence[Observation],
-    rigid: np.ndarray,
+    start: np.ndarray,
     metric: bool = False,
+    shape: np.ndarray | None = None,
 ) -> Identity:
-    """Identity common to some timesteps, with their expressions and poses; rigid (T, 18) is where
-    poses start.
+    """Identity common to some timesteps, with their expressions and poses, which begin at `start`:
+    poses (T, 18), or with expressions (T, E + 18). The identity begins at `shape` (I,), else at 0.
 
     The scale of the world is solved as a component: a head `scale` times as large as the model's
     fits best. Where the world is `metric`, it is 1, and the size of the head is the person's.
@@ -100,9 +112,9 @@ def solve_identity(
     points = PosedPoints(replace(model, shapedirs=sized), places)
     shared = known + 1
     own = expressions + RIGID_SIZE
-    state = np.zeros(shared + own * len(observations))
-    for number, start in enumerate(rigid):
-        state[shared + own * (number + 1) - RIGID_SIZE : shared + own * (number + 1)] = start
+    frames = np.pad(start, ((0, 0), (own - start.shape[1], 0)))
+    begun = np.zeros(known) if shape is None else shape
+    state = np.concatenate([begun, [0.0], frames.ravel()])
     for _ in range(IDENTITY_ITERATIONS):
         precision, pull = prior_terms(head, state[shared:].reshape(-1, own))
         matrix = np.diag(np.concatenate([np.ones(shared), precision.ravel()]))
@@ -228,15 +240,32 @@ def normal_equations(
     points: PosedPoints, parameters: np.ndarray, observation: Observation
 ) -> tuple[np.ndarray, np.ndarray]:
     """Jᵀ W J and −Jᵀ W r of one timestep by its parameters (K + 18,), with soft-L1 weights."""
-    positions, jacobian = points.linearized(*split(parameters))
-    residual = (
-        np.einsum("nij,nj->ni", observation.root, positions - observation.position)
-        / LANDMARK_SIGMA_M
-    )
+    residual, jacobian = residuals(points, parameters, observation)
     weight = observation.weight / np.sqrt(1 + (residual**2).sum(1))
-    rows = (np.sqrt(weight)[:, None, None] / LANDMARK_SIGMA_M) * (observation.root @ jacobian)
-    flat = rows.reshape(-1, rows.shape[2])
+    flat = (np.sqrt(weight)[:, None, None] * jacobian).reshape(-1, jacobian.shape[2])
     return flat.T @ flat, -flat.T @ (np.sqrt(weight)[:, None] * residual).ravel()
+
+
+def residuals(
+    points: PosedPoints, parameters: np.ndarray, observation: Observation
+) -> tuple[np.ndarray, np.ndarray]:
+    """What landmarks miss by at parameters (K + 18,), in LANDMARK_SIGMA_M: (N, 3), and its
+    derivatives (N, 3, K + 18)."""
+    positions, jacobian = points.linearized(*split(parameters))
+    away = positions - observation.position
+    residual = np.einsum("nij,nj->ni", observation.root, away) / LANDMARK_SIGMA_M
+    derivative = (observation.root @ jacobian) / LANDMARK_SIGMA_M
+    if observation.eye is None:
+        return residual, derivative
+    along = observation.position - observation.eye
+    distance = np.maximum(np.linalg.norm(along, axis=1), np.finfo(np.float64).tiny)
+    direction = along / distance[:, None]
+    depth = ((positions - observation.eye) * direction).sum(1)
+    depth = np.maximum(depth, MIN_DEPTH_RATIO * distance)
+    enlarged = distance / depth
+    nearer = np.einsum("ni,nip->np", direction, jacobian) / depth[:, None]
+    derivative -= residual[:, :, None] * nearer[:, None, :]
+    return enlarged[:, None] * residual, enlarged[:, None, None] * derivative
 
 
 def solve_in_time(

@@ -1,0 +1,108 @@
+"""Makes `tracking/networks/landmark_bias.npz`: how far the networks' landmarks lie from those of the
+bundled head, in pictures of it from many directions.
+
+python -m stga_addon.development.landmark_bias
+"""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+
+from ..capture.camera import Camera, look_at
+from ..files import write_npz
+from ..flame.forward import flame_forward, neutral_frame
+from ..flame.parts import flame_model
+from ..tracking.correspondence import head_colors, shaded_image
+from ..tracking.face_networks import FIRST_IRIS_POINT, FaceNetworks
+from ..tracking.landmark_bias import BIAS_FILE
+from ..tracking.landmarks import read_places
+from ..tracking.recorded import BUNDLED_PLACES
+
+AZIMUTHS_DEG = tuple(range(-60, 61, 15))
+ELEVATIONS_DEG = tuple(range(-45, 46, 15))
+PICTURE_SIZE_PX = 512
+DISTANCE_M = 1.2
+FACE_HEIGHT_M = 0.2
+FACE_RATIO = 0.42  # Of the picture's height
+PEOPLE = 5
+"""The neutral head, and so many more, less one, of random identities and expressions."""
+IDENTITY_COMPONENTS = 30
+IDENTITY_SIGMA = 0.8
+EXPRESSION_SHAPES = 4
+EXPRESSION_WEIGHT = 0.4
+SEED = 0
+
+
+def main() -> None:
+    """Write the file."""
+    model = flame_model(None)
+    places, reliable = read_places(BUNDLED_PLACES, len(model.faces))
+    detector = FaceNetworks()
+    colors = head_colors(model)
+    generator = np.random.default_rng(SEED)
+    shape = len(AZIMUTHS_DEG), len(ELEVATIONS_DEG), len(places), 2
+    found = np.full((PEOPLE, *shape), np.nan)
+    for person in range(PEOPLE):
+        identity = np.zeros(model.n_identity)
+        weights = np.zeros(model.n_expression)
+        if person:
+            identity[:IDENTITY_COMPONENTS] = generator.normal(
+                0, IDENTITY_SIGMA, IDENTITY_COMPONENTS
+            )
+            chosen = generator.choice(len(model.expression_names), EXPRESSION_SHAPES, replace=False)
+            moves = [not model.expression_names[number].startswith("eyeLook") for number in chosen]
+            weights[chosen[moves]] = EXPRESSION_WEIGHT
+        mesh = flame_forward(model, identity, replace(neutral_frame(model), expr=weights))
+        at = places.on(mesh, model.faces)
+        center = at[reliable].mean(0)
+        for row, azimuth in enumerate(AZIMUTHS_DEG):
+            for column, elevation in enumerate(ELEVATIONS_DEG):
+                camera = _camera(center, azimuth, elevation)
+                faces = detector.detect(shaded_image(mesh, model.faces, camera, colors))
+                if faces:
+                    missed = faces[0] - camera.project(at)[0]
+                    found[person, row, column] = missed * DISTANCE_M / camera.fl_x
+    offset = _filled(found)
+    offset[:, :, FIRST_IRIS_POINT:] = 0  # gaze is found from them, and lids hide their eyeballs
+    write_npz(
+        BIAS_FILE,
+        {
+            "azimuth_deg": np.array(AZIMUTHS_DEG, np.float32),
+            "elevation_deg": np.array(ELEVATIONS_DEG, np.float32),
+            "offset_m": offset.astype(np.float16),
+        },
+        compressed=True,
+    )
+
+
+def _camera(center: np.ndarray, azimuth_deg: float, elevation_deg: float) -> Camera:
+    turn = math.radians(azimuth_deg)
+    rise = math.radians(elevation_deg)
+    across = math.cos(rise)
+    direction = np.array([math.sin(turn) * across, math.sin(rise), math.cos(turn) * across])
+    focal = DISTANCE_M * FACE_RATIO * PICTURE_SIZE_PX / FACE_HEIGHT_M
+    eye = center + DISTANCE_M * direction
+    return look_at(eye, center, PICTURE_SIZE_PX, PICTURE_SIZE_PX, focal)
+
+
+def _filled(found: np.ndarray) -> np.ndarray:
+    """Means (A, E, N, 2) over the people; a direction without a face in anyone's pictures has that
+    of the next ones towards the front."""
+    seen = ~np.isnan(found)
+    mean = np.where(seen, found, 0).sum(0) / np.maximum(seen.sum(0), 1)
+    known = seen.any(axis=(0, 3, 4))
+    middle = len(AZIMUTHS_DEG) // 2, len(ELEVATIONS_DEG) // 2
+    cells = [(row, column) for row in range(known.shape[0]) for column in range(known.shape[1])]
+    for row, column in sorted(
+        cells, key=lambda cell: abs(cell[0] - middle[0]) + abs(cell[1] - middle[1])
+    ):
+        if not known[row, column]:
+            inner_row = row - int(np.sign(row - middle[0]))
+            inner_column = column - int(np.sign(column - middle[1]))
+            mean[row, column] = (mean[inner_row, column] + mean[row, inner_column]) / 2
+    return mean
+
+
+if __name__ == "__main__":
+    main()
