@@ -1,7 +1,6 @@
 """Commands of the command line, and their errors: one sentence, exit code 2."""
 
 import json
-import re
 import shutil
 import subprocess
 import sys

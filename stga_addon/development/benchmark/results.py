@@ -92,10 +92,11 @@ def sections(capture: str, share: float) -> dict[str, Section]:
 
 
 def report(run: Path) -> str:
-    """Without the Pareto front, which docs/benchmarks.md shows as curves; tables' rules are short,
-    as docs are counted in words."""
+    """The tables of a report, without what docs/benchmarks.md shows as curves or the tables say
+    already; tables' rules are short, as docs are counted in words."""
     text = (run / "report.txt").read_text(encoding="utf-8")
-    text = re.sub(r"^Pareto front.*\n", "", text, flags=re.MULTILINE)
+    beside = r"^(Pareto front|Evaluation while|.* dB apart).*\n"
+    text = re.sub(beside, "", text, flags=re.MULTILINE)
     return re.sub(r"(?<=\|) -+ (?=\|)", "---", text)
 
 
