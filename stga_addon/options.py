@@ -97,9 +97,9 @@ def _form(spec: Any, hint: Any, is_required: bool) -> dict[str, Any]:
     flag = flag_of(spec)
     is_named = flag.startswith("-")
     help = str(asked["help"])
-    is_told = isinstance(default, str | int | float) and default and default is not True
-    if is_told and "default" not in help:
-        help += f" (default {default})"
+    is_number = isinstance(default, int | float) and not isinstance(default, bool)
+    if (is_number or (isinstance(default, str | Path) and default != "")) and "default" not in help:
+        help += f" (default {default:g})" if is_number else f" (default {default})"
     form: dict[str, Any] = {"help": help.replace("%", "%%"), "default": None}
     if is_named:
         form |= {"names": (flag,), "dest": spec.name, "required": is_required}

@@ -9,10 +9,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 from avatar.conftest import splats_of
+from fuzz.arguments import COMMANDS as FUZZED
 from PIL import Image
 
+from stga_addon import api
 from stga_addon.avatar.splats import SH_C0
 from stga_addon.cli.main import make_parser
+from stga_addon.export.formats import FORMATS
 from stga_addon.export.ply import write_ply
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -167,13 +170,33 @@ def test_what_a_page_names_is_there(page):
     assert not re.search(r"pythonhosted|pypi\.org", TEXTS[page])
 
 
-def test_readme_renders_a_ply(tmp_path, monkeypatch):
-    """Catches a public rendering function that is not the one which the README shows."""
+def test_every_format_is_documented_and_fuzzed():
+    """Catches an export format that formats.md or the fuzz lacks, and one that is gone."""
+    page = TEXTS[ROOT / "docs/formats.md"].partition("\n# Output\n")[2]
+    words = set(re.findall(r"`(?:--format )?([a-z-]+)`", page))
+    assert words.issuperset(FORMATS)
+    assert set(re.findall(r"`--format ([a-z-]+)`", page)) <= set(FORMATS)
+    assert set(FORMATS) <= set(re.findall(r"'([a-z-]+)'", str(FUZZED["export"])))
+
+
+def test_readme_trains_exports_and_renders(toy_root, tmp_path, monkeypatch):
+    """Catches requests that do not do what the README shows."""
+    (example,) = re.findall(r"```python\n(.*?)```", TEXTS[ROOT / "README.md"], re.DOTALL)
+    (tmp_path / "captures").mkdir()
+    (tmp_path / "captures/anna").symlink_to(toy_root)
+    monkeypatch.chdir(tmp_path)
+    exec(example.replace('preset="draft"', "iterations=2"), {})
+    assert Path("anna.html").read_text(encoding="utf-8").startswith("<!")
+    assert Path("anna.mp4").read_bytes()[4:8] == b"ftyp"
+
+
+def test_api_renders_a_ply(tmp_path, monkeypatch):
+    """Catches a public rendering function that is not the one which api.py shows."""
     splats = splats_of(np.zeros((1, 3)), log_scale=np.log(0.05), opacity=5, sh=-0.5 / SH_C0)
     write_ply(tmp_path / "splats.ply", splats)
     monkeypatch.chdir(tmp_path)
-    (example,) = re.findall(r"```python\n(.*?)```", TEXTS[ROOT / "README.md"], re.DOTALL)
-    exec(example, {})
+    example = str(api.__doc__).partition("Work that takes long")[0]
+    exec("\n".join(re.findall(r">>> (.*)", example)), {})
     pixels = np.asarray(Image.open("splats.png"))
     assert pixels.shape == (480, 640, 3)
     assert pixels[240, 320].max() < 10, "a black splat at the camera's target"

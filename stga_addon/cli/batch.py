@@ -25,10 +25,14 @@ class BatchOptions:
     """A plan, or captures with what a plan has in its file."""
 
     sources: tuple[Path, ...] = option(
-        "a plan (docs/batch.md), or captures", flag="PLAN.toml|CAPTURE"
+        "a plan (docs/commands.md#batches), or captures", flag="PLAN.toml|CAPTURE"
     )
-    out: Path | None = option("folder of the batch, where captures are given", None, metavar="RUNS")
-    preset: str | None = like(TrainingSettings, "preset")
+    out: Path | None = option("folder of the batch; required with captures", None, metavar="RUNS")
+    preset: str | None = like(
+        TrainingSettings,
+        "preset",
+        help="quality of each capture; it, --budget or --iterations is required with captures",
+    )
     seconds: float | None = like(TrainingSettings, "seconds", help="training time of each capture")
     iterations: int | None = like(TrainingSettings, "iterations")
     seed: int = like(TrainingSettings, "seed")

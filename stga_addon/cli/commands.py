@@ -360,7 +360,9 @@ def _info(options: Namespace, head: OpenHead | None) -> None:
 
 @dataclass(frozen=True)
 class RenderOutput:
-    out: Path | None = option("folder for PNGs", None, metavar="DIR", group="output")
+    out: Path | None = option(
+        "folder for PNGs; required without --video", None, metavar="DIR", group="output"
+    )
     video: Path | None = option(
         "every timestep from one camera, as MP4", None, metavar="FILE.mp4", group="output"
     )

@@ -1,5 +1,5 @@
 """What `development` adds to the tables of commands and requests: `demo`, and `benchmark`, each
-seed of which is a job of a batch (docs/batch.md): one after another on this machine, at once on
+seed of which is a job of a batch (docs/commands.md): one after another on this machine, at once on
 several."""
 
 from argparse import Namespace

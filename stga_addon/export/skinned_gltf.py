@@ -1,5 +1,5 @@
 """Skinned splats: a rigged avatar as glTF, a skinned and morphing mesh with the splats that are
-bound to its triangles (docs/skinned-splats.md)."""
+bound to its triangles (docs/formats.md)."""
 
 import gzip
 from collections.abc import Mapping

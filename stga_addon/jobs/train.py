@@ -110,9 +110,7 @@ class _Continue:
         MAX_GROWTH,
         metavar="SHARE",
     )
-    seconds: float | None = like(
-        TrainingSettings, "seconds", help="training time (default 20s to refine, 1m to extend)"
-    )
+    seconds: float | None = like(TrainingSettings, "seconds", help="training time")
     iterations: int | None = like(TrainingSettings, "iterations")
     seed: int = like(TrainingSettings, "seed")
     flame: Path | None = like(Train, "flame", help="FLAME model file, if it has moved")
@@ -134,7 +132,7 @@ class Refine(_Continue):
 
     region: str = option(
         "region of the capture, vertex mask of FLAME, or file of triangle weights "
-        "(docs/formats.md)",
+        "(docs/formats.md); required without --resume",
         "",
         metavar="NAME|FILE",
         is_path=is_region_file,
@@ -143,6 +141,8 @@ class Refine(_Continue):
     frames: tuple[int, int] | None = option(
         "timesteps to train on (default: all)", None, 0, metavar="FIRST-LAST"
     )
+    _: KW_ONLY
+    seconds: float | None = like(_Continue, "seconds", help="training time (default 20s)")
 
     def check(self) -> None:
         """Raise StgaError unless there is one region and one budget."""
@@ -159,7 +159,11 @@ class Refine(_Continue):
 class Extend(_Continue):
     """Extend a finished avatar by further takes of the same head, in a run of its own."""
 
-    captures: tuple[Path, ...] = option("captures of the same head", flag="CAPTURE")
+    captures: tuple[Path, ...] = option(
+        "captures of the same head; required without --resume", flag="CAPTURE"
+    )
+    _: KW_ONLY
+    seconds: float | None = like(_Continue, "seconds", help="training time (default 1m)")
 
     def check(self) -> None:
         """Raise StgaError unless there is a take and one budget."""

@@ -60,7 +60,7 @@ MIN_SEEN_SHARE = 0.5
 PART_TIMESTEPS = 24  # At most, of the parts of a take that are searched at once
 FEW_CAMERAS = 3
 """Median over the timesteps of the cameras that see a face, up to which expressions and poses of
-dense tracking are nearer to the truth than those of the surface (docs/experiments.md)."""
+dense tracking are nearer to the truth than those of the surface."""
 OFFSET_DENSITY = 1.5e10
 """Weight of SURFACE_POINTS points over a head, in 1/m⁴: the two priors below are relative to it."""
 SMOOTHING_M = 0.009  # Length over which offsets are smoothed

@@ -80,8 +80,8 @@ class TrainingSettings:
     """Settings of one training run.
 
     strategy       "selective" trains local and global iterations in turn (STGA, training); "global"
-                   only global ones, which measured best at equal time (docs/results.md); "refine"
-                   and "extend" continue a finished run
+                   only global ones (as good at equal time, docs/benchmarks.md);
+                   "refine" and "extend" continue a finished run
     seconds, iterations   the budget: wall time of training (evaluation not counted), or iterations;
                           one of the two, or neither with a preset, which brings its iterations
     lattice        order of the barycentric lattice per triangle: 0 → 1 splat, 2 → 6, 4 → 15 (STGA,
@@ -143,13 +143,13 @@ class TrainingSettings:
     """
 
     strategy: str = option(
-        "which splats an iteration trains (default global; selective with --schedule paper)",
+        "which splats an iteration trains (default global, with --schedule paper selective)",
         "global",
         choices=(*STRATEGIES, *CONTINUATIONS),
         offered=STRATEGIES,
     )
     schedule: str = option(
-        "paper: the settings of the STGA paper (default: what measured best)",
+        "default: what measured best; paper: the settings of the STGA paper",
         "default",
         choices=("default", "paper"),
     )
@@ -206,7 +206,7 @@ class TrainingSettings:
     )
     stop_when_flat: bool = option("stop when more time no longer helps", False)
     preset: str | None = option(
-        "quality, and with it training time; `stga presets` shows the times",
+        "quality, and with it training time, in place of a budget; `stga presets` shows the times",
         None,
         choices={name: preset.purpose for name, preset in PRESETS.items()},
     )
@@ -294,7 +294,7 @@ PAPER_SETTINGS = {
     "lattice": 4,
     "selection": SelectionOptions(threshold=0.01, zero_pose="all"),
 }
-"""Where they differ from the defaults, which measured best (docs/results.md)."""
+"""Where they differ from the defaults, which measured best (docs/benchmarks.md)."""
 
 GAUSSIAN_AVATARS_SETTINGS = {
     **_PUBLISHED,

@@ -25,7 +25,7 @@ from .tiny import ITERATIONS, check_interrupted, interrupt_batch, splats_of, tin
 pytestmark = pytest.mark.slow
 KILLS = int(os.environ.get("STGA_BATCH_KILLS", 2))
 """Workers that are killed, every second one with a checkpoint; 20 in the measurement of
-docs/batch.md."""
+docs/commands.md."""
 
 
 def killer(jobs, kills, ended, killed, resumable):

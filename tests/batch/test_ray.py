@@ -85,7 +85,7 @@ print(sorted((entry.job.name, str(entry.state), entry.error) for entry in batch.
 """
 KILLS = int(os.environ.get("STGA_BATCH_NODE_KILLS", 2))
 """Nodes that are killed, every second one when a job has a checkpoint; 6 in the measurement of
-docs/batch.md."""
+docs/commands.md."""
 
 
 def run_script(script, *arguments, **variables):

@@ -408,7 +408,7 @@ for count in map(int, sys.argv[1:]):
     print(*cost(count))
 """
 JOBS = int(os.environ.get("STGA_BATCH_JOBS", 2000))
-"""Jobs of the larger batch; 10,000 in the measurement of docs/batch.md."""
+"""Jobs of the larger batch; a measurement had 10,000."""
 
 
 @pytest.mark.slow

@@ -4,6 +4,7 @@ import json
 import shutil
 import subprocess
 import sys
+from argparse import ArgumentParser
 from dataclasses import replace
 from pathlib import Path
 from time import process_time
@@ -31,10 +32,12 @@ from stga_addon.avatar.file import read_avatar, write_avatar
 from stga_addon.avatar.filmed import filmed_avatar
 from stga_addon.capture.open import open_capture
 from stga_addon.cli import commands
+from stga_addon.cli.commands import COMMANDS
 from stga_addon.development.package import ROOT
 from stga_addon.errors import StgaError
 from stga_addon.export.ply import read_ply
 from stga_addon.jobs.render import unique_names
+from stga_addon.options import option_fields
 from stga_addon.selection import SelectionOptions
 from stga_addon.training.evaluate.forecast import kept_line
 from stga_addon.training.run.checkpoint import read_checkpoint
@@ -459,3 +462,30 @@ def test_what_is_left_of_flame_is_said(tmp_path, capsys):
     assert stga(*words, "--out", tmp_path / "a.glb") == 0
     said = "--motion-only leaves them out, but not the meshes of the take."
     assert said in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_help_states_each_default_once(name):
+    """Catches a default that `--help` hides, or two at once; 0 and folders as well."""
+    parser = ArgumentParser()
+    COMMANDS[name].add_arguments(parser, None)
+    shown = {action.dest: str(action.help) for action in parser._actions}
+    kinds = [item[0] if isinstance(item, tuple) else item for item in COMMANDS[name].options]
+    for spec in (spec for kind in kinds for spec in option_fields(kind) if spec.name in shown):
+        text = shown[spec.name]
+        assert text.count("(default") <= 1
+        assert " to extend" not in text
+        if isinstance(spec.default, int | float | Path) and not isinstance(spec.default, bool):
+            assert "default" in text, text
+
+
+@pytest.mark.parametrize(
+    ("name", "field"),
+    [("refine", "region"), ("extend", "captures"), ("render", "out"), ("batch", "out")],
+)
+def test_help_says_what_is_required(name, field):
+    """Catches an argument that `--help` shows as optional and the command refuses to do without."""
+    parser = ArgumentParser()
+    COMMANDS[name].add_arguments(parser, None)
+    (text,) = (action.help for action in parser._actions if action.dest == field)
+    assert "required" in str(text)

@@ -1,4 +1,4 @@
-"""The test vector of docs/skinned-splats.md: ten splats on four triangles, and where they are.
+"""The test vector of docs/formats.md: ten splats on four triangles, and where they are.
 
     PYTHONPATH=tests:. python -m export.ten_splats
 

@@ -147,7 +147,17 @@ TRACK = [
         ],
     ]
 ]
-FORMATS = ("ply", "ply-sequence", "gaussian-avatars", "usd", "web", "gltf", "spz", "obj")
+FORMATS = (
+    "ply",
+    "ply-sequence",
+    "gaussian-avatars",
+    "usd",
+    "web",
+    "skinned-gltf",
+    "gltf",
+    "spz",
+    "obj",
+)
 SUFFIXES = {"usd": ".usdc", "web": ".html", "gltf": ".glb", "skinned-gltf": ".glb", "spz": ".spz"}
 COMMANDS = {
     "info": (3, [*CAPTURE, EFFECT, DEVICE]),

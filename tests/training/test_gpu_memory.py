@@ -85,7 +85,7 @@ def test_memory_is_the_cpus_and_as_documented(toy, monkeypatch):
     on_cpu = per_item([*on_cpu, cpu_bytes(toy, 4096, small, 1.0)])
     on_gpu = [gpu_bytes(toy, *size, 1 << 16) for size in sizes]
     on_gpu = per_item([*on_gpu, gpu_bytes(toy, 4096, small, 1 << 17)])
-    text = (Path(__file__).parents[2] / "docs/performance.md").read_text(encoding="utf-8")
+    text = (Path(__file__).parents[2] / "docs/benchmarks.md").read_text(encoding="utf-8")
     rows = [
         re.search(rf"\ba\s{name} (\d[\d,]*) and (\d[\d,]*\d)", text)
         for name in ("splat", "pixel", "pair")

@@ -355,6 +355,6 @@ def test_progress_tells_what_a_person_wants_to_know(toy, tmp_path):
     evaluating_s = read_metrics(tmp_path)[-2]["evaluation_s"]
     assert training[-1]["left_s"] == pytest.approx(2 * evaluating_s)
     assert all(found["per_second"] > 0 and np.isfinite(found["loss"]) for found in training)
-    assert told[-1].stage == "Finished"
+    assert told[-1].stage == "Trained"
     assert "psnr" in figures[-1]
     assert first == [training[0]["splats"]]

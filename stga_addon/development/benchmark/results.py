@@ -1,8 +1,8 @@
-"""Writes docs/results.md: tables of quality, each with the version and the command that measured
-it.
+"""Writes the section Quality of docs/benchmarks.md: tables, each with the version and the command
+that measured it.
 
-    python -m stga_addon.development.benchmark.results CAPTURE [--share 1] [--out docs/results.md]
-        [--folder out/results]
+    python -m stga_addon.development.benchmark.results CAPTURE [--share 1]
+        [--out docs/benchmarks.md] [--folder out/results]
 
 CAPTURE: one with a tracked mesh and the splits val and test, as `studio_head`. Takes less than 25
 minutes on two otherwise idle cores. What was measured stays in --folder and is not measured again.
@@ -23,7 +23,9 @@ from pathlib import Path
 
 from ... import __version__
 
-HEADER = """# Results
+HEADER = """# Benchmarks
+
+## Quality
 
 Written by `python -m stga_addon.development.benchmark.results {capture}`, on {machine}.
 RUN is a new folder. Compare figures within a table.
@@ -42,6 +44,8 @@ avatar on both, three times as long; *refine* trains the mouth (*region*) alone,
 *all-in-turn* (or *all*) leaves it; *s to 98 %*: until both takes have 98 % of the PSNR
 of *anew*.
 """
+END = "\n<!-- What benchmark.results writes ends here. -->\n"
+"""What stands after it in the page stays."""
 PARTS = (("whole image", ""), ("head", "_mask"), ("moving", "_moving"))
 """Row of the table, and suffix of the metrics as `stga eval` writes them."""
 
@@ -88,10 +92,11 @@ def sections(capture: str, share: float) -> dict[str, Section]:
 
 
 def report(run: Path) -> str:
-    """Without the Pareto front, which docs/performance.md shows as curves; tables' rules are short,
-    as docs are counted in words."""
+    """The tables of a report, without what docs/benchmarks.md shows as curves or the tables say
+    already; tables' rules are short, as docs are counted in words."""
     text = (run / "report.txt").read_text(encoding="utf-8")
-    text = re.sub(r"^Pareto front.*\n", "", text, flags=re.MULTILINE)
+    beside = r"^(Pareto front|Evaluation while|.* dB apart).*\n"
+    text = re.sub(beside, "", text, flags=re.MULTILINE)
     return re.sub(r"(?<=\|) -+ (?=\|)", "---", text)
 
 
@@ -142,7 +147,7 @@ def main() -> None:
     )
     parser.add_argument("capture", type=Path)
     parser.add_argument("--share", type=float, default=1.0, help="of all budgets")
-    parser.add_argument("--out", type=Path, default=Path("docs/results.md"))
+    parser.add_argument("--out", type=Path, default=Path("docs/benchmarks.md"))
     parser.add_argument("--folder", type=Path, default=Path("out/results"))
     options = parser.parse_args()
     capture = options.capture.resolve()
@@ -155,9 +160,11 @@ def main() -> None:
             commands = "\n".join(section.commands)
             table = section.table(folder / name).strip()
             source = f"Version {__version__}:\n\n```\n{commands}\n```\n{section.note}"
-            done.write_text(f"## {section.title}\n\n{source}\n{table}\n", encoding="utf-8")
+            done.write_text(f"### {section.title}\n\n{source}\n{table}\n", encoding="utf-8")
         text.append(done.read_text(encoding="utf-8"))
-    options.out.write_text("\n".join(text), encoding="utf-8")
+    before = options.out.read_text(encoding="utf-8") if options.out.exists() else ""
+    kept = before.partition(END)[2]
+    options.out.write_text("\n".join(text) + END + kept, encoding="utf-8")
 
 
 if __name__ == "__main__":

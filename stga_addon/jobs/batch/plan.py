@@ -1,5 +1,5 @@
-"""Plan of a batch, a TOML file of jobs (docs/batch.md) or some captures with a job each; and what
-an engine is, which carries them out."""
+"""Plan of a batch, a TOML file of jobs (docs/commands.md#batches) or some captures with a job
+each; and what an engine is, which carries them out."""
 
 import os
 import re

@@ -27,8 +27,7 @@ MAX_VIEW_ERROR_RATIO = 4.0
 """Errors above this multiple of the median come from lids, lips and teeth, not from the view."""
 MIN_STRAIN_GAIN_DB = 0.35
 """Mean gain of sampled colors, in frames and in cameras that are left out, from which splats follow
-deformation: with less, trainings with and without differ by no more than their noise
-(docs/experiments.md)."""
+deformation: with less, trainings with and without differ by no more than their noise."""
 MIN_TRACKED_STRAIN_GAIN_DB = -0.35
 """The same of a capture by `stga track`, whose mesh lies beside what is seen by so much that colors
 sampled there show nothing of what trainings gain."""
@@ -211,7 +210,7 @@ def strain(facts: CaptureFacts) -> Verdict:
 
 def normal_color(facts: CaptureFacts) -> Verdict:
     """On where skin turns enough in a light that stays. What left-out frames show of it in sampled
-    colors is less than what trainings gain (docs/experiments.md)."""
+    colors is less than what trainings gain."""
     change = facts.signal_change("normal")
     turn = np.degrees(3**0.5 * change)  # by component before
     reason = f"triangles turn by {turn:.1f}° (root mean square over frames)"

@@ -37,8 +37,8 @@ class DensityControl:
                    default 0.25, ours
     seed           of the halves' distances
     region_share   `split_share` where a region is trained, as in a refinement, which has few turns
-    min_opacity    0…1, below which splats are pruned; ours, by docs/experiments.md, 0.005 in 3D
-                   Gaussian Splatting. A half has twice as much at least
+    min_opacity    0…1, below which splats are pruned; ours, 0.005 in 3D Gaussian
+                   Splatting. A half has twice as much at least
     narrowing      by which halves are narrower than their parent along its longest axis; 1.6 in 3D
                    Gaussian Splatting, along all
     distance       of a half's center from its parent's, in the parent's standard deviation along

@@ -240,7 +240,7 @@ class _Session:
             elif self._evaluate_finally():
                 self._tell("Measuring residuals")
                 self._write_residuals()
-        self._tell("Interrupted" if self.interrupts else "Finished")
+        self._tell("Interrupted" if self.interrupts else "Trained")
         if self.interrupts:
             raise KeyboardInterrupt
 

@@ -1,4 +1,4 @@
-"""An independent reader of skinned splats, written from docs/skinned-splats.md."""
+"""An independent reader of skinned splats, written from docs/formats.md."""
 
 import gzip
 import json

@@ -1,6 +1,6 @@
 // @ts-check
 // Reading of skinned splats: glTF with a skinned, morphing mesh and splats bound to its triangles
-// (docs/skinned-splats.md).
+// (docs/formats.md).
 
 /** @import { DataArray, Values } from './types.js' */
 
