@@ -376,7 +376,8 @@ def _mode(path: Path) -> int:
 
 
 def usable_path(text: str) -> Path:
-    """Raises StgaError for a name that no file can have: empty, too long or with a NUL."""
+    """Raises StgaError for a name that no file can have (empty, too long or with a NUL), that is
+    not UTF-8, folders above included, or relative where the folder it counts from was removed."""
     try:
         os.lstat(text)
         too_long = False
@@ -389,7 +390,24 @@ def usable_path(text: str) -> Path:
         raise StgaError(f"'{text}' is not a usable path (too long)")
     if not text:
         raise StgaError("the path is empty")
+    check_encodable(Path(text))
     return Path(text)
+
+
+def check_encodable(path: Path) -> None:
+    """Raise StgaError where the path or a folder above is not named in UTF-8: the JSON of runs and
+    requests, USD and other libraries cannot hold it. Also where the path is relative, and the
+    folder in which this process works was removed."""
+    try:
+        whole = os.path.abspath(path)
+    except FileNotFoundError as error:
+        problem = "the working folder was removed; change to one that exists"
+        raise StgaError(f"{path}: is not a usable path ({problem})") from error
+    try:
+        whole.encode("utf-8")
+    except UnicodeEncodeError as error:
+        problem = "the name of this file or of a folder above is not UTF-8; rename it"
+        raise StgaError(f"{whole}: is not a usable path ({problem})") from error
 
 
 def file_size(path: Path) -> int:
