@@ -12,7 +12,16 @@ from typing import Any
 import numpy as np
 
 from ..errors import StgaError, shorten
-from ..files import check_encodable, is_file, is_folder, matching, naming, npz_outlines, read_json, read_npy
+from ..files import (
+    check_encodable,
+    is_file,
+    is_folder,
+    matching,
+    naming,
+    npz_outlines,
+    read_json,
+    read_npy,
+)
 from ..flame.forward import FlameFrame
 from ..flame.model import BUNDLED_HEAD, EXPRESSION_NAMES
 from ..flame.parts import flame_model, found_regions, key_regions
