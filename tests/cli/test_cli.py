@@ -321,7 +321,8 @@ def test_interruption_and_mistakes_have_their_codes(root, monkeypatch, capsys):
     monkeypatch.setattr("stga_addon.cli.main.address_space_gb", lambda: 0.8)
     for kind in (ImportError, OSError, RuntimeError, SystemError):
         fails_with(kind("failed to map\nsegment"))
-        sentence = refused(capsys, "info", root).splitlines()[-1]
+        assert stga("info", root) == 2
+        sentence = capsys.readouterr().err.splitlines()[-1]
         assert "'info' failed within the 0.8 GB of addresses" in sentence
         assert sentence.endswith("(ulimit -v); expected 4 GB or no limit: 'failed to map segment'")
 
