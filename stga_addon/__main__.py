@@ -4,6 +4,8 @@ import sys
 from importlib import import_module
 from importlib.util import find_spec
 
+MAX_CAUSE_CHARACTERS = 300
+
 try:
     from .cli.main import main
 
@@ -11,6 +13,11 @@ try:
         import_module(".development.commands", __package__)  # adds its commands and requests
 except ModuleNotFoundError as error:
     print(f"stga: {sys.executable} lacks the package '{error.name}'", file=sys.stderr)
+    raise SystemExit(2) from None
+except (ImportError, MemoryError, OSError, SystemError) as error:
+    # a library that gets no memory (ulimit -v), or is damaged
+    cause = " ".join(str(error).split())[:MAX_CAUSE_CHARACTERS] or type(error).__name__
+    print(f"stga: {sys.executable} cannot load what it needs ({cause})", file=sys.stderr)
     raise SystemExit(2) from None
 except KeyboardInterrupt:
     raise SystemExit(130) from None

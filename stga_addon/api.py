@@ -3,10 +3,9 @@
 Other modules may move. Importing this one needs numpy alone; rendering needs numba, training what
 the extra `train` of the package brings.
 
-    >>> from pathlib import Path
     >>> from PIL import Image
     >>> import stga_addon.api as stga
-    >>> splats = stga.read_splats(Path("splats.ply"))
+    >>> splats = stga.read_splats("splats.ply")
     >>> camera = stga.look_at((0, 0, 1), (0, 0, 0), width=640, height=480, focal_length=800)
     >>> image = stga.render(splats, camera, background=(1, 1, 1))
     >>> Image.fromarray(stga.to_uint8(image)).save("splats.png")
@@ -14,30 +13,34 @@ the extra `train` of the package brings.
 Work that takes long is a request, which `perform` carries out, as the command line does:
 
     >>> settings = stga.make_settings(preset="draft")
-    >>> stga.perform(stga.Train(Path("runs/anna"), Path("captures/anna"), settings))
-    >>> stga.perform(stga.Export(Path("runs/anna"), Path("anna.html"), "web"))
+    >>> stga.perform(stga.Train("runs/anna", "captures/anna", settings))
+    >>> stga.perform(stga.Export("runs/anna", "anna.html", "web"))
+
+Where a Path is expected, a str or another os.PathLike may stand.
 """
 
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from .avatar.file import Avatar, read_avatar, write_avatar
+from .avatar import file as _avatar_file
+from .avatar.file import Avatar
 from .avatar.splats import Splats
+from .capture import open as _capture
 from .capture.camera import Camera, camera_from_gl, look_at, turntable
 from .capture.model import Capture
-from .capture.open import open_capture
 from .errors import StgaError
-from .export.ply import write_ply
-from .export.splat_files import read_splats
+from .export import ply as _ply
+from .export import splat_files as _splat_files
+from .jobs import perform as _perform
 from .jobs.analyze import Analyze, Select
 from .jobs.convert_motion import ConvertMotion
 from .jobs.export import Export
 from .jobs.finished_run import Evaluate, MakeExact, Relight
-from .jobs.perform import perform
 from .jobs.render import Render
 from .jobs.track import MakeAvatar, Track
 from .jobs.train import Extend, Refine, Resume, Train
 from .progress import Cancelled, Progress, Report
+from .schema import takes_paths as _takes_paths
 from .training.settings import TrainingSettings, make_settings
 
 if TYPE_CHECKING:
@@ -83,6 +86,13 @@ __all__ = [
     "write_avatar",
     "write_ply",
 ]
+
+open_capture = _takes_paths(_capture.open_capture)
+perform = _takes_paths(_perform.perform)
+read_avatar = _takes_paths(_avatar_file.read_avatar)
+read_splats = _takes_paths(_splat_files.read_splats)
+write_avatar = _takes_paths(_avatar_file.write_avatar)
+write_ply = _takes_paths(_ply.write_ply)
 
 _LOADED_WHEN_USED = {
     "render": "render.render",

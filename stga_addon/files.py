@@ -39,7 +39,14 @@ WEB_PAGE = re.compile(rb"(<\?xml[^>]*>|<!--.*?-->|\s)*<(!doctype html|html|head|
 CHANGED_LINE_ENDS = (
     "was carried over as text, which changed its line ends (CR LF); copy it again as binary"
 )
-MAX_UNPACKED_BYTES = 4 << 30  # Of an npz: a checkpoint of four million splats
+MAX_ARRAYS_BYTES = 1 << 30
+"""Largest sum of the arrays that are read from an npz: an avatar of four million splats."""
+MAX_CHECKPOINT_BYTES = 4 << 30
+"""The same of a checkpoint, which has an avatar's arrays three times over."""
+MIN_UNPACKED_BYTES = 32 << 20
+"""Bytes to which any file of packed splats may unpack."""
+MAX_UNPACKED_RATIO = 16
+"""How many times its size a larger one may unpack to; splats reach 3, without harmonics 10."""
 MAX_NAME_BYTES = 255
 """Longest name of a file or folder on the file systems of Linux, macOS and Windows."""
 PARTIAL_NAME = re.compile(
@@ -369,7 +376,8 @@ def _mode(path: Path) -> int:
 
 
 def usable_path(text: str) -> Path:
-    """Raises StgaError for a name that no file can have: empty, too long or with a NUL."""
+    """Raises StgaError for a name that no file can have (empty, too long or with a NUL), that is
+    not UTF-8, folders above included, or relative where the folder it counts from was removed."""
     try:
         os.lstat(text)
         too_long = False
@@ -382,7 +390,24 @@ def usable_path(text: str) -> Path:
         raise StgaError(f"'{text}' is not a usable path (too long)")
     if not text:
         raise StgaError("the path is empty")
+    check_encodable(Path(text))
     return Path(text)
+
+
+def check_encodable(path: Path) -> None:
+    """Raise StgaError where the path or a folder above is not named in UTF-8: the JSON of runs and
+    requests, USD and other libraries cannot hold it. Also where the path is relative, and the
+    folder in which this process works was removed."""
+    try:
+        whole = os.path.abspath(path)
+    except FileNotFoundError as error:
+        problem = "the working folder was removed; change to one that exists"
+        raise StgaError(f"{path}: is not a usable path ({problem})") from error
+    try:
+        whole.encode("utf-8")
+    except UnicodeEncodeError as error:
+        problem = "the name of this file or of a folder above is not UTF-8; rename it"
+        raise StgaError(f"{whole}: is not a usable path ({problem})") from error
 
 
 def file_size(path: Path) -> int:
@@ -538,15 +563,27 @@ def check_version(path: Path, kind: str, found: object, known: int) -> None:
     raise StgaError(f"{path}: {problem}")
 
 
-def read_npz(path: Path, names: Collection[str] | None = None) -> dict[str, np.ndarray]:
+def allowed_bytes(size: int) -> int:
+    """Bytes to which a packed file of `size` bytes may unpack."""
+    return MIN_UNPACKED_BYTES + MAX_UNPACKED_RATIO * size
+
+
+def read_npz(
+    path: Path, names: Collection[str] | None = None, limit: int = MAX_ARRAYS_BYTES
+) -> dict[str, np.ndarray]:
     """Read the arrays of an npz that are among `names`, by default every one, without pickle.
-    Raises StgaError where it is missing, truncated, above 4 GiB unpacked, or holds objects."""
+    Raises StgaError where it is missing, truncated or holds objects, and, before anything is
+    unpacked, where the arrays have more than `limit` bytes together."""
     arrays = {}
     with _npz_entries(path) as entries:
-        for name, entry, archive in entries:
-            if names is None or name in names:
-                with archive.open(entry) as stream:
-                    arrays[name] = _read_array(stream, entry.file_size)
+        chosen = [each for each in entries if names is None or each[0] in names]
+        unpacked = sum(entry.file_size for _, entry, _ in chosen)
+        if unpacked > limit:
+            problem = f"unpacks to {unpacked} bytes, more than the {limit} allowed"
+            raise StgaError(f"{path}: {problem}")
+        for name, entry, archive in chosen:
+            with archive.open(entry) as stream:
+                arrays[name] = _read_array(stream, entry.file_size)
     return arrays
 
 
@@ -567,10 +604,6 @@ def _npz_entries(path: Path) -> Iterator[list[tuple[str, zipfile.ZipInfo, zipfil
     """Name and entry of each array of an npz, and the open archive. Raises as `read_npz`."""
     file_size(path)  # refuses pipes, whose reading need never end
     with _reading(path, "npz"), zipfile.ZipFile(path) as archive:
-        unpacked = sum(entry.file_size for entry in archive.infolist())
-        if unpacked > MAX_UNPACKED_BYTES:
-            problem = f"unpacks to {unpacked} bytes, more than the {MAX_UNPACKED_BYTES} allowed"
-            raise StgaError(f"{path}: {problem}")
         entries = []
         for entry in archive.infolist():
             if not entry.filename.endswith(".npy"):

@@ -1,20 +1,24 @@
 """Dataclasses whose fields state their allowed values: validation, and JSON in both directions."""
 
 import dataclasses
+import inspect
 import math
+import os
 import re
 import types
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import field
-from functools import cache
+from functools import cache, wraps
 from pathlib import Path
-from typing import Any, Union, get_args, get_origin, get_type_hints
+from typing import Any, ParamSpec, TypeVar, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
 
 from .errors import StgaError, shorten
 from .files import usable_path
 
+P = ParamSpec("P")
+R = TypeVar("R")
 MAX_COUNT = (1 << 31) - 1  # Largest whole number that kernels can count to
 KIND = "kind"  # Key that names the dataclass where a field may hold one of several
 ARRAY = "array"  # Key of an array's place in JSON: its name among the arrays beside it
@@ -72,6 +76,36 @@ def validate(value: Any, prefix: str = "") -> None:
                 validate(part, f"{prefix}{name}.")
     if hasattr(value, "check"):
         value.check()
+
+
+def takes_paths(function: Callable[P, R]) -> Callable[P, R]:
+    """The function, which also takes a str or an os.PathLike where it expects a Path, or a
+    dataclass with such fields. Raises StgaError for a name that no file can have."""
+    signature = inspect.signature(function, eval_str=True)
+
+    @wraps(function)
+    def call(*arguments: P.args, **named: P.kwargs) -> R:
+        bound = signature.bind(*arguments, **named)
+        for name, value in bound.arguments.items():
+            bound.arguments[name] = _with_path(signature.parameters[name].annotation, value)
+        return function(*bound.args, **bound.kwargs)
+
+    return call
+
+
+def _with_path(hint: Any, value: Any) -> Any:
+    kinds = alternatives(hint)
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        hints = type_hints(type(value))
+        found = {spec.name: getattr(value, spec.name) for spec in dataclasses.fields(value)}
+        paths = {name: _with_path(hints[name], own) for name, own in found.items()}
+        changed = {name: own for name, own in paths.items() if own is not found[name]}
+        return dataclasses.replace(value, **changed) if changed else value
+    if tuple[Path, ...] in kinds and isinstance(value, (tuple, list)):
+        return tuple(_with_path(Path, item) for item in value)
+    if Path in kinds and str not in kinds and isinstance(value, (str, os.PathLike)):
+        return value if isinstance(value, Path) else usable_path(os.fspath(value))
+    return value
 
 
 def complaint(name: str, expected: str, value: Any) -> str:

@@ -10,8 +10,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from capture import factory
 from refusal import refusal
 
+from stga_addon import api
 from stga_addon.errors import StgaError
 from stga_addon.schema import from_json, setting, to_json, validate
 
@@ -185,3 +187,32 @@ def test_an_array_that_is_not_there(named):
         from_json(Cloud, plain, arrays={"points": np.zeros(3)})
     found = from_json(Cloud, {"points": {"array": "a"}}, arrays={"a": np.zeros(3)})
     assert found.points.shape == (3,)
+
+
+class Named:
+    """An os.PathLike of other people."""
+
+    def __init__(self, path):
+        self.path = path
+
+    def __fspath__(self):
+        return str(self.path)
+
+
+@pytest.mark.parametrize("kind", [str, Path, Named])
+def test_the_python_interface_takes_names_as_paths(tmp_path, kind):
+    """Catches an AttributeError of a function, or a request, whose path is a str or an
+    os.PathLike."""
+    root = factory.write_mesh_capture(tmp_path / "ball")
+    capture = api.open_capture(kind(root))
+    assert len(capture.timesteps) > 0
+    avatar = tmp_path / "a.npz"
+    factory.write_avatar_of(capture, avatar)
+    splats = api.read_avatar(kind(avatar)).splats
+    api.write_avatar(kind(avatar), api.read_avatar(path=kind(avatar)))
+    api.write_ply(kind(tmp_path / "a.ply"), splats)
+    assert len(api.read_splats(kind(tmp_path / "a.ply"))) == len(splats)
+    api.perform(api.Export(kind(avatar), kind(tmp_path / "b.ply"), "ply"), say=lambda _: None)
+    assert (tmp_path / "b.ply").stat().st_size > 1000
+    with refusal("'a.x00b' is not a usable path"):
+        api.read_splats("a\0b")

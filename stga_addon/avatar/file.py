@@ -12,7 +12,7 @@ import numpy as np
 
 from ..capture.transforms import DEFAULT_PRINCIPAL_POINT, PRINCIPAL_POINTS
 from ..errors import StgaError, shorten
-from ..files import check_version, npz_outlines, parse_json, read_npz, write_npz
+from ..files import check_version, converted, npz_outlines, parse_json, read_npz, write_npz
 from .embedding import CONVENTIONS, FaceFrames, face_areas, face_frames
 from .offsets import COLOR, OFFSETS, POSITION, SCALE, SIGNALS, moved_frames, offset_of
 from .splats import ARRAYS, SH_C0, Splats, sh_color
@@ -213,17 +213,14 @@ def write_avatar(path: Path, avatar: Avatar) -> None:
     Raises StgaError where the avatar would not be read back: wrong shapes, NaN, splats on missing
     triangles.
     """
-    _check(path, avatar)
+    check_avatar(path, avatar)
     header: dict[str, Any] = {"format": FORMAT, "version": VERSION}
     header |= {name: kind(getattr(avatar, name)) for name, kind in _HEADER.items()}
     masks = np.array(list(avatar.regions.values()), bool).reshape(-1, len(avatar.faces))
     arrays = avatar.arrays | {"region_faces": masks}
     if avatar.light is not None:
-        # by vertex in half precision: 30 bytes a vertex
-        rest = dict(vars(avatar.light))
-        for name in _LIGHT_ARRAYS:
-            arrays[_PREFIX + name] = np.asarray(rest.pop(name), np.float16)
-        header["light"] = rest
+        light_arrays, header["light"] = _light_parts(avatar.light)
+        arrays |= light_arrays
     arrays["header"] = np.frombuffer(json.dumps(header).encode(), np.uint8)
     write_npz(path, arrays)
 
@@ -245,7 +242,7 @@ def read_avatar(path: Path) -> Avatar:
     optional = (*_OPTIONAL_ARRAYS, *OFFSETS, *(_PREFIX + name for name in _LIGHT_ARRAYS))
     arrays = read_npz(path, (*needed, *optional))
     avatar = _avatar_of(path, header, arrays)
-    _check(path, avatar)
+    check_avatar(path, avatar)
     light = _light(path, arrays, header["light"]) if "light" in header else None
     return replace(avatar, light=light)
 
@@ -290,13 +287,17 @@ def _read_header(path: Path, arrays: Mapping[str, np.ndarray]) -> dict[str, Any]
     return header
 
 
-def _check(path: Path, avatar: Avatar) -> None:
+def check_avatar(path: Path, avatar: Avatar) -> None:
     """Raise StgaError where the parts of an avatar do not fit each other."""
     _check_shapes(path, avatar)
     for name, array in avatar.arrays.items():
         _check_finite(path, name, array)
     _check_index(path, "faces", avatar.faces, len(avatar.neutral), "vertices")
     _check_index(path, "face", avatar.splats.face, len(avatar.faces), "faces")
+    if avatar.light is not None:
+        arrays, rest = _light_parts(avatar.light)
+        _check_light_shapes(path, {"neutral": avatar.neutral, **arrays})
+        _light(path, arrays, rest)
 
 
 def _check_shapes(path: Path, avatar: Avatar) -> None:
@@ -367,6 +368,13 @@ def _check_light_shapes(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
         array = arrays.get(_PREFIX + name, np.zeros(0))
         sizes = tuple(len(arrays["neutral"]) if size < 0 else size for size in shape)
         _check_shape(path, _PREFIX + name, array, "float16", sizes)
+
+
+def _light_parts(light: AvatarLight) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    """Arrays of a light, in half precision (30 bytes a vertex), and what the header holds."""
+    rest = dict(vars(light))
+    arrays = {_PREFIX + name: converted(rest.pop(name), np.float16) for name in _LIGHT_ARRAYS}
+    return arrays, rest
 
 
 def _light(path: Path, arrays: Mapping[str, np.ndarray], rest: object) -> AvatarLight:

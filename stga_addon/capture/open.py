@@ -12,7 +12,16 @@ from typing import Any
 import numpy as np
 
 from ..errors import StgaError, shorten
-from ..files import is_file, is_folder, matching, naming, read_json, read_npy, read_npz
+from ..files import (
+    check_encodable,
+    is_file,
+    is_folder,
+    matching,
+    naming,
+    npz_outlines,
+    read_json,
+    read_npy,
+)
 from ..flame.forward import FlameFrame
 from ..flame.model import BUNDLED_HEAD, EXPRESSION_NAMES
 from ..flame.parts import flame_model, found_regions, key_regions
@@ -79,10 +88,11 @@ def open_capture(
             f"principal point convention {shorten(principal_point)} is not one of "
             f"{', '.join(PRINCIPAL_POINTS)}"
         )
+    check_encodable(folder)
     if folder.suffix.lower() == ".npz" and is_file(folder):
         path = folder.resolve()
         # A file that names its expressions is of the bundled head, and needs no model file.
-        bundled = EXPRESSION_NAMES in read_npz(path)
+        bundled = EXPRESSION_NAMES in npz_outlines(path)
         model_file = BUNDLED_HEAD if bundled else _model_file(path, flame)
         return sequence_capture(path, read_motion(path, flame_model(model_file)), model_file, {})
     if not is_folder(folder):

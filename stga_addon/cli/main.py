@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from .. import __version__
-from ..errors import StgaError, one_line, telling_refusals
+from ..errors import StgaError, one_line, shorten, telling_refusals
 from ..jobs.avatar_source import FOLDER, OpenHead, read_head
 from ..worker.machine import address_space_gb
 from .commands import COMMANDS
@@ -24,6 +24,8 @@ from .commands import COMMANDS
 MIN_ADDRESS_SPACE_GB = 4.0
 """Below, a small training was seen to abort at 0.8; threads and libraries reserve what they never
 use."""
+LIBRARY_FAILURES = (MemoryError, ImportError, OSError, RuntimeError, SystemError)
+"""What libraries raise where they get no memory, while they load or later."""
 DROPPED_INTERRUPT_S = 0.05  # After which an interrupt that was dropped is raised again
 
 
@@ -67,10 +69,10 @@ def _run(arguments: list[str] | None, head: OpenHead | None) -> int:
         if (error.name or "").startswith(__package__.rpartition(".")[0]):
             raise
         return _fail(f"'{command}' needs the package '{error.name}', which {sys.executable} lacks")
-    except MemoryError:
-        return _fail(f"'{command}' needs more memory than there is")
     except RecursionError:
         return _fail(f"'{command}': its input is nested too deeply")
+    except LIBRARY_FAILURES as error:
+        return _fail(_memory_refusal(command, error))
     except KeyboardInterrupt as error:
         # without what destructors of objects that were half made say
         hook = sys.unraisablehook
@@ -81,6 +83,19 @@ def _run(arguments: list[str] | None, head: OpenHead | None) -> int:
         _fail("interrupted")
         return 130
     return 0
+
+
+def _memory_refusal(command: str, error: Exception) -> str:
+    """A sentence for one of LIBRARY_FAILURES. Raises the error where it is of another cause."""
+    if isinstance(error, MemoryError):
+        return f"'{command}' needs more memory than there is"
+    given = address_space_gb()
+    if given >= MIN_ADDRESS_SPACE_GB:
+        raise error
+    expected = f"expected {MIN_ADDRESS_SPACE_GB:g} GB or no limit"
+    cause = shorten(" ".join(str(error).split()) or type(error).__name__)
+    limit = f"the {given:.1f} GB of addresses that this process may have (ulimit -v)"
+    return f"'{command}' failed within {limit}; {expected}: {cause}"
 
 
 def _warn_of_a_tight_limit() -> None:

@@ -1,5 +1,6 @@
 """Reading of skinned splats, and unpacking them into the files that the add-on opens."""
 
+import math
 import struct
 import zlib
 from dataclasses import dataclass
@@ -9,14 +10,16 @@ from typing import Any
 
 import numpy as np
 
-from ..avatar.file import Avatar, AvatarLight, write_avatar
+from ..avatar.file import Avatar, AvatarLight, check_avatar, write_avatar
 from ..avatar.offsets import OFFSETS
 from ..avatar.splats import Splats, logits
 from ..capture.glb import UNREADABLE, accessor_values, glb_chunks
-from ..errors import StgaError
+from ..errors import StgaError, shorten
 from ..files import read_bytes, write_npz
-from ..flame.model import JOINTS
+from ..flame.model import JOINTS, POSE_FEATURES, model_of
 from ..flame.quaternions import to_axis_angle
+from ..flame.sequence import motion_of
+from .playback import MAX_FPS, MIN_FPS
 from .rig import Rig
 from .skinned_gltf import AXES, EXTRA, VERSION
 from .spz import of_smallest_three
@@ -24,7 +27,24 @@ from .spz import of_smallest_three
 AVATAR_FILE = "avatar.npz"
 MODEL_FILE = "flame_model.npz"
 MOTION_FILE = "motion.npz"
-MAX_VALUES = 1 << 28
+KNOWN_ARRAYS = (
+    *("splats_per_face", "unbound", "xyz", "log_scale", "opacity", "rotation", "rotation_largest"),
+    *("color", "sh", "neutral", "joint_basis", "correctives", "strain_range", *OFFSETS),
+    *("light_transfer", "light_occlusion", "light_irradiance", "light_roughness"),
+)
+"""Arrays that are unpacked; a page alone needs the others."""
+MIN_NUMBERS = 1 << 24
+"""Numbers that any file may unpack to: FLAME's shapes and correctives have two million."""
+MAX_NUMBERS_PER_BYTE = 8
+"""How many a byte of a larger file; splats reach 4."""
+MAX_SKIPPED_BYTES = 1 << 28
+"""Bytes of all arrays before they are unpacked, also of those that are not read."""
+BLOCK_BYTES = 1 << 20
+"""Bytes of an array that is not read which are unpacked at a time."""
+MAX_PLANES = 8
+MAX_MOVED_NUMBERS = 1 << 27
+"""Coordinates that shapes without a name move in all frames: half a gigabyte."""
+BIND_TOLERANCE = 1e-6
 MAX_OPACITY = 1 - 1e-6
 
 
@@ -47,35 +67,52 @@ def read_skinned_splats(path: Path) -> SkinnedSplats:
             raise ValueError(f"it has no {EXTRA}; such files come from the format skinned-gltf")
         if header["version"] != VERSION:
             raise ValueError(f"version {header['version']}; known is {VERSION}")
-        place = header["byteOffset"], header["byteOffset"] + header["byteLength"]
-        if place[1] > len(binary):
+        fps = float(header["fps"])
+        if not MIN_FPS <= fps <= MAX_FPS:
+            raise ValueError(f"fps is {fps:g}; expected from {MIN_FPS:g} to {MAX_FPS:g}")
+        start = _whole(header["byteOffset"])
+        end = start + _whole(header["byteLength"])
+        if end > len(binary):
             raise ValueError("it is cut off")
-        arrays = _arrays(header["arrays"], binary[slice(*place)])
+        arrays = _arrays(header["arrays"], binary[start:end])
         rig, faces = _rig(document, binary, arrays, header)
-        return SkinnedSplats(_avatar(header, arrays, rig, faces), rig, float(header["fps"]))
+        avatar = _avatar(header, arrays, rig, faces)
     except (*UNREADABLE, struct.error, zlib.error) as error:
         raise StgaError(f"{path}: is no file of skinned splats ({error})") from error
+    check_avatar(path, avatar)
+    return SkinnedSplats(avatar, rig, fps)
 
 
 def unpack_skinned_splats(path: Path, folder: Path) -> SkinnedSplats:
     """Write what a file holds into a folder as avatar, FLAME-form model and motion. Raises
-    StgaError where the rig has other joints than FLAME."""
+    StgaError, before anything is written, where one of them would not be read back, or the rig has
+    other joints than FLAME."""
     found = read_skinned_splats(path)
-    rig = found.rig
-    if rig.joint_names != JOINTS[: len(rig.joint_names)]:
-        joints = ", ".join(rig.joint_names)
-        raise StgaError(f"{path}: has the joints {joints}; expected {', '.join(JOINTS)}")
-    folder.mkdir(parents=True, exist_ok=True)
+    model = _model(path, found.rig, found.avatar.faces)
+    motion = _motion(path, found.rig)
+    motion_of(path, motion, model_of(path, model))
     write_avatar(folder / AVATAR_FILE, found.avatar)
-    write_npz(folder / MODEL_FILE, _model(rig, found.avatar.faces))
-    write_npz(folder / MOTION_FILE, _motion(rig))
+    write_npz(folder / MODEL_FILE, model)
+    write_npz(folder / MOTION_FILE, motion)
     return found
 
 
-def _model(rig: Rig, faces: np.ndarray) -> dict[str, np.ndarray]:
-    """Arrays of a FLAME model; of each joint that the rig lacks, one that moves nothing."""
+def _flame_joints(path: Path, rig: Rig) -> list[int]:
+    """Number in JOINTS of each joint of the rig. Raises StgaError where FLAME lacks one, or has
+    them in another order."""
+    if set(rig.joint_names) <= set(JOINTS):
+        places = [JOINTS.index(name) for name in rig.joint_names]
+        if places == sorted(set(places)) and places[0] == 0:
+            return places
+    joints = shorten(", ".join(rig.joint_names))
+    raise StgaError(f"{path}: has the joints {joints}; expected of {', '.join(JOINTS)}")
+
+
+def _model(path: Path, rig: Rig, faces: np.ndarray) -> dict[str, np.ndarray]:
+    """Arrays of a FLAME model; of each joint that the rig lacks, one that moves nothing. Raises
+    StgaError as `_flame_joints`."""
     own = rig.basis[: rig.expressions]
-    missing = len(JOINTS) - len(rig.parents)
+    joints = _flame_joints(path, rig)
     # the weights of vertices, of least norm, that give a joint's place and how shapes move it
     shaped = np.concatenate([rig.base[None], own])
     places = np.concatenate([rig.joint_rest[None], rig.joint_basis[: rig.expressions]])
@@ -83,27 +120,36 @@ def _model(rig: Rig, faces: np.ndarray) -> dict[str, np.ndarray]:
     regressor = np.linalg.lstsq(
         system, np.moveaxis(places, 2, 1).reshape(len(system), -1), rcond=None
     )[0].T
-    parents = [*rig.parents, *range(len(rig.parents) - 1, len(JOINTS) - 1)]
+    parents = np.zeros(len(JOINTS), np.int64)
+    parents[joints] = [-1 if parent < 0 else joints[parent] for parent in rig.parents]
+    vertices = len(rig.base)
+    joint_regressor = np.zeros((len(JOINTS), vertices))
+    joint_regressor[joints] = regressor
+    weights = np.zeros((vertices, len(JOINTS)))
+    weights[:, joints] = rig.weights
     arrays = {
         "v_template": rig.base,
         "shapedirs": np.moveaxis(own, 0, 2),
         "n_identity": np.array(0),
-        "J_regressor": np.pad(regressor, ((0, missing), (0, 0))),
+        "J_regressor": joint_regressor,
         "kintree_table": np.array([parents, range(len(JOINTS))], np.int64),
-        "weights": np.pad(rig.weights, ((0, 0), (0, missing))),
+        "weights": weights,
         "f": faces,
     }
+    correctives = np.zeros((len(JOINTS) - 1, 9, vertices, 3))
     if len(rig.correctives):
-        arrays["posedirs"] = np.moveaxis(rig.correctives, 0, 2)
+        correctives[np.array(joints[1:]) - 1] = rig.correctives.reshape(-1, 9, vertices, 3)
+    arrays["posedirs"] = np.moveaxis(correctives.reshape(POSE_FEATURES, vertices, 3), 0, 2)
     if rig.expression_names:
         arrays["expression_names"] = np.array(rig.expression_names)
     return arrays
 
 
-def _motion(rig: Rig) -> dict[str, np.ndarray]:
+def _motion(path: Path, rig: Rig) -> dict[str, np.ndarray]:
+    """Arrays of a FLAME motion. Raises StgaError as `_flame_joints`, and where it is too large."""
     frames = len(rig.pose)
     turns = np.zeros((frames, len(JOINTS), 3))
-    turns[:, : len(rig.parents)] = rig.pose
+    turns[:, _flame_joints(path, rig)] = rig.pose
     motion = {
         "expr": rig.coefficients[:, : rig.expressions],
         "rotation": turns[:, 0],
@@ -114,103 +160,210 @@ def _motion(rig: Rig) -> dict[str, np.ndarray]:
     }
     others = rig.coefficients[:, rig.expressions :]
     if others.size:
-        moved = np.einsum("tr,rvc->tvc", others, rig.basis[rig.expressions :])
+        if frames * rig.base.size > MAX_MOVED_NUMBERS:
+            problem = f"moves {len(rig.base)} vertices without sliders in {frames} frames"
+            raise StgaError(f"{path}: {problem}; expected up to {MAX_MOVED_NUMBERS} coordinates")
+        moved = np.empty((frames, *rig.base.shape), np.float32)
+        for frame, own in enumerate(others):
+            moved[frame] = np.einsum("r,rvc->vc", own, rig.basis[rig.expressions :])
         motion["dynamic_offset"] = moved
     return motion
 
 
+def _whole(value: object, least: int = 0) -> int:
+    """Raises ValueError unless it is a whole number from `least` on."""
+    if type(value) is not int or value < least:
+        raise ValueError(f"{shorten(value)}; expected a whole number from {least}")
+    return value
+
+
 def _arrays(entries: dict[str, Any], packed: bytes) -> dict[str, np.ndarray]:
-    """Arrays by their entries in the header; raises ValueError where they are not whole."""
-    counts = {name: int(np.prod(entry["shape"])) for name, entry in entries.items()}
-    planes = {n: 4 if e["type"] == "float32" else int(e["planes"]) for n, e in entries.items()}
-    sizes = {name: planes[name] * count for name, count in counts.items()}
-    if min(sizes.values(), default=0) < 0 or sum(sizes.values()) > MAX_VALUES:
+    """Those of KNOWN_ARRAYS by their entries in the header. Raises ValueError where they are not
+    whole, or, before they are unpacked, too large."""
+    shapes = {name: [_whole(n) for n in entry["shape"]] for name, entry in entries.items()}
+    planes = {name: _planes(entry) for name, entry in entries.items()}
+    sizes = {name: planes[name] * math.prod(shape) for name, shape in shapes.items()}
+    known = {name for name in entries if name.removesuffix(AXES) in KNOWN_ARRAYS}
+    numbers = sum(math.prod(shapes[name]) for name in known)
+    allowed = MIN_NUMBERS + MAX_NUMBERS_PER_BYTE * len(packed)
+    if numbers > allowed or sum(sizes.values()) > MAX_SKIPPED_BYTES:
         raise ValueError("its arrays are larger than any avatar's")
     stream = zlib.decompressobj(wbits=zlib.MAX_WBITS | 16)
-    raw = stream.decompress(packed, sum(sizes.values()) + 1)
-    if len(raw) != sum(sizes.values()):
-        raise ValueError("its arrays are not whole")
+    rest = packed
     arrays = dict[str, np.ndarray]()
-    at = 0
     for name, entry in entries.items():
-        block = np.frombuffer(raw, np.uint8, sizes[name], at)
-        at += sizes[name]
-        shape = [int(size) for size in entry["shape"]]
-        if entry["type"] == "float32":
-            arrays[name] = block.view("<f4").reshape(shape).astype(np.float64)
-            continue
-        factors = 256 ** np.arange(planes[name], dtype=np.int64)
-        integers = factors @ block.reshape(planes[name], -1).astype(np.int64) + int(entry["low"])
-        values = np.moveaxis(integers.reshape([*shape[-1:], *shape[:-1]]), 0, -1)
-        arrays[name] = values * float(entry["step"]) if entry["type"] == "fixed" else values
+        raw = b""
+        missing = sizes[name]
+        while missing:
+            block = stream.decompress(rest, missing if name in known else min(missing, BLOCK_BYTES))
+            rest = stream.unconsumed_tail
+            if not block:
+                raise ValueError("its arrays are not whole")
+            missing -= len(block)
+            raw += block if name in known else b""
+        if name in known:
+            arrays[name] = _array(entry, shapes[name], planes[name], raw)
+    if stream.decompress(rest, 1):
+        raise ValueError("its arrays are not whole")
     for name in [name for name in arrays if name.endswith(AXES)]:
         axes = arrays.pop(name)
         arrays[name.removesuffix(AXES)] = arrays[name.removesuffix(AXES)] @ axes.T
     return arrays
 
 
+def _planes(entry: dict[str, Any]) -> int:
+    """Bytes of a number of an array. Raises ValueError."""
+    if entry["type"] == "float32":
+        return np.dtype(np.float32).itemsize
+    planes = _whole(entry["planes"], 1)
+    if planes > MAX_PLANES:
+        raise ValueError(f"an array of {planes} planes; expected 1 to {MAX_PLANES}")
+    return planes
+
+
+def _array(entry: dict[str, Any], shape: list[int], planes: int, raw: bytes) -> np.ndarray:
+    """An array by its entry and its bytes. Raises ValueError."""
+    block = np.frombuffer(raw, np.uint8)
+    if entry["type"] == "float32":
+        return block.view("<f4").reshape(shape).astype(np.float64)
+    integers = np.zeros(math.prod(shape), np.int64)
+    for plane, own in enumerate(block.reshape(planes, -1)):
+        integers |= own.astype(np.int64) << 8 * plane
+    if (integers < 0).any():
+        raise ValueError("an array holds numbers of more than 63 bits")
+    integers += _whole(entry["low"], -(2**62))
+    values = np.moveaxis(integers.reshape([*shape[-1:], *shape[:-1]]), 0, -1)
+    return values * float(entry["step"]) if entry["type"] == "fixed" else values
+
+
+def _joints(document: dict[str, Any]) -> list[int]:
+    """Nodes of the skin's joints. Raises ValueError where they are malformed."""
+    joints = [_whole(joint) for joint in document["skins"][0]["joints"]]
+    if len(set(joints)) != len(joints) or not 0 < len(joints) <= len(JOINTS):
+        raise ValueError(f"{len(joints)} joints; expected 1 to {len(JOINTS)} different nodes")
+    if max(joints) >= len(document["nodes"]):
+        raise ValueError("a joint that is no node")
+    return joints
+
+
+def _bind(matrices: np.ndarray) -> tuple[float, np.ndarray]:
+    """Unit, and places (J, 3) of the joints at rest, of inverse bind matrices (J, 16), column by
+    column. Raises ValueError unless each is a translation times the unit."""
+    columns = matrices.reshape(-1, 4, 4)
+    unit = float(columns[0, 0, 0])
+    expected = np.tile(np.diag([unit, unit, unit, 1.0]), (len(columns), 1, 1))
+    expected[:, 3, :3] = columns[:, 3, :3]
+    if not (np.isfinite(columns).all() and unit > 0):
+        raise ValueError("inverse bind matrices that are not finite, or scale by 0 or less")
+    if np.abs(columns - expected).max() > BIND_TOLERANCE * max(unit, 1):
+        raise ValueError("inverse bind matrices that turn; expected a translation times a unit")
+    return unit, -columns[:, 3, :3]
+
+
+def _mesh(
+    document: dict[str, Any], binary: bytes, joints: int, unit: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Base (V, 3), shapes (R, V, 3) and skinning weights (V, J). Raises ValueError where they are
+    together larger than the file can hold."""
+    values = partial(accessor_values, document, binary)
+    primitive = document["meshes"][0]["primitives"][0]
+    attributes = primitive["attributes"]
+    base = unit * values(attributes["POSITION"], width=3)
+    count = len(base)
+    targets = primitive.get("targets", [])
+    if base.size * (1 + len(targets)) > MIN_NUMBERS + MAX_NUMBERS_PER_BYTE * len(binary):
+        raise ValueError(f"{len(targets)} shapes of {count} vertices are more than it can hold")
+    basis = np.empty((len(targets), count, 3))
+    for number, target in enumerate(targets):
+        basis[number] = unit * values(target["POSITION"], count, 3)
+    weights = np.zeros((count, joints))
+    for number in range(sum(name.startswith("JOINTS") for name in attributes)):
+        shares = values(attributes[f"WEIGHTS_{number}"], count, 4)
+        own = values(attributes[f"JOINTS_{number}"], count, 4).astype(int)
+        for column in range(4):
+            np.add.at(weights, (np.arange(count), own[:, column]), shares[:, column])
+    for name, array in (("POSITION", base), ("targets", basis), ("WEIGHTS", weights)):
+        if not np.isfinite(array).all():
+            raise ValueError(f"{name} holds values that are not finite")
+    return base, basis, weights
+
+
+def _animated(
+    document: dict[str, Any], binary: bytes, joints: list[int], shapes: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Rotations (T, J, 4) xyzw, translation (T, 3) of the root and weights (T, R) of the motion."""
+    motion = document["animations"][0]
+    outputs = dict[tuple[str, int], int]()
+    for channel in motion["channels"]:
+        target = channel["target"]
+        sampler = motion["samplers"][_whole(channel["sampler"])]
+        node = -1 if target["path"] == "weights" else target["node"]
+        outputs[target["path"], node] = sampler["output"]
+    values = partial(accessor_values, document, binary)
+    for joint in joints:
+        if ("rotation", joint) not in outputs:
+            raise ValueError(f"its motion does not turn joint {joint}")
+    frames = len(values(outputs["rotation", joints[0]]))
+    turns = np.stack([values(outputs["rotation", joint], frames, 4) for joint in joints], axis=1)
+    if ("translation", joints[0]) not in outputs:
+        raise ValueError("its motion does not move the root")
+    coefficients = np.zeros((frames, 0))
+    if ("weights", -1) in outputs:
+        rows = frames * shapes
+        coefficients = values(outputs["weights", -1], rows, 1).reshape(frames, shapes)
+    return turns, values(outputs["translation", joints[0]], frames, 3), coefficients
+
+
 def _rig(
     document: dict[str, Any], binary: bytes, arrays: dict[str, np.ndarray], header: dict[str, Any]
 ) -> tuple[Rig, np.ndarray]:
-    """The rig, and the mesh's triangles (F, 3)."""
+    """The rig, and the mesh's triangles (F, 3). Raises one of UNREADABLE."""
     values = partial(accessor_values, document, binary)
-    skin = document["skins"][0]
-    joints = skin["joints"]
-    bind = values(skin["inverseBindMatrices"]).reshape(-1, 4, 4)
-    unit = bind[0, 0, 0]
-    mesh = document["meshes"][0]
-    primitive = mesh["primitives"][0]
-    attributes = primitive["attributes"]
-    base = unit * values(attributes["POSITION"])
-    targets = [unit * values(each["POSITION"]) for each in primitive.get("targets", [])]
-    weights = np.zeros((len(base), len(joints)))
-    for number in range(sum(name.startswith("JOINTS") for name in attributes)):
-        shares = values(attributes[f"WEIGHTS_{number}"])
-        own = values(attributes[f"JOINTS_{number}"]).astype(int)
-        for column in range(4):
-            np.add.at(weights, (np.arange(len(base)), own[:, column]), shares[:, column])
-    rest = -bind[:, 3, :3]
-    outputs = dict[tuple[str, int], np.ndarray]()
-    motion = document["animations"][0]
-    for channel in motion["channels"]:
-        target = channel["target"]
-        sampler = motion["samplers"][channel["sampler"]]
-        outputs[target["path"], target["node"]] = values(sampler["output"])
-    turns = np.stack([outputs["rotation", joint] for joint in joints], axis=1)
-    coefficients = np.zeros((len(turns), 0))
-    for (path, _), output in outputs.items():
-        if path == "weights":
-            coefficients = output.reshape(len(turns), -1)
+    joints = _joints(document)
+    bind = document["skins"][0]["inverseBindMatrices"]
+    unit, rest = _bind(values(bind, len(joints), 16))
+    base, basis, weights = _mesh(document, binary, len(joints), unit)
+    turns, translation, coefficients = _animated(document, binary, joints, len(basis))
     nodes = document["nodes"]
     parents = [
         [p for p, j in enumerate(joints) if joint in nodes[j].get("children", [])]
         for joint in joints
     ]
+    mesh = document["meshes"][0]
     names = mesh.get("extras", {}).get("targetNames", [])
-    expressions = int(header["expressions"])
+    expressions = _whole(header["expressions"])
     named = expressions if header["named"] else 0
+    correctives = arrays.get("correctives", np.zeros((0, *base.shape)))
+    moved = arrays["joint_basis"]
+    if expressions > len(basis) or moved.shape != (len(basis), len(joints), 3):
+        raise ValueError(f"{expressions} expressions, joint_basis {moved.shape}: of other shapes")
+    if len(correctives) and correctives.shape != (9 * (len(joints) - 1), *base.shape):
+        raise ValueError(f"correctives {correctives.shape}, not those of its mesh and joints")
     rig = Rig(
         base=base,
-        basis=np.reshape(targets, (-1, *base.shape)),
-        correctives=arrays.get("correctives", np.zeros((0, *base.shape))),
+        basis=basis,
+        correctives=correctives,
         joint_rest=rest,
-        joint_basis=arrays["joint_basis"],
+        joint_basis=moved,
         joint_names=tuple(str(nodes[joint]["name"]) for joint in joints),
         parents=tuple(own[0] if own else -1 for own in parents),
         weights=weights,
         coefficients=coefficients,
         pose=to_axis_angle(turns[..., [3, 0, 1, 2]]),
-        translation=outputs["translation", joints[0]] - rest[0],
+        translation=translation - rest[0],
         expressions=expressions,
         expression_names=tuple(str(name) for name in names[:named]),
     )
-    return rig, values(primitive["indices"]).reshape(-1, 3).astype(np.int32)
+    return rig, values(mesh["primitives"][0]["indices"], width=1).reshape(-1, 3).astype(np.int32)
 
 
 def _avatar(
     header: dict[str, Any], arrays: dict[str, np.ndarray], rig: Rig, faces: np.ndarray
 ) -> Avatar:
     per_face = arrays["splats_per_face"]
+    count = len(arrays["xyz"])
+    if len(per_face) != len(faces) or per_face.min() < 0 or per_face.sum() != count:
+        raise ValueError(f"splats_per_face does not count its {count} splats")
     rotation = of_smallest_three(arrays["rotation_largest"], arrays["rotation"])
     opacity = np.clip(arrays["opacity"], 1 - MAX_OPACITY, MAX_OPACITY)
     rest = arrays.get("sh", np.zeros((len(rotation), 0))).reshape(len(rotation), -1, 3)

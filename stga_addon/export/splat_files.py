@@ -56,6 +56,8 @@ def read_splats(path: Path, say: Say = warn) -> Splats:
         kind = UNREAD_SUFFIXES.get(suffix, f"files named {suffix}")
         raise StgaError(f"{path}: {kind} {CONVERTED}; expected {READ_FILES}")
     splats = READERS[suffix](path, say)
+    if not len(splats):
+        raise StgaError(f"{path}: holds no splats")
     finite = np.ones(len(splats), bool)
     for each in fields(splats):
         values = getattr(splats, each.name).reshape(len(splats), -1)

@@ -4,13 +4,14 @@ import gzip
 import math
 import struct
 import zlib
+from dataclasses import fields
 from pathlib import Path
 
 import numpy as np
 
 from ..avatar.splats import MAX_SH_DEGREE, Splats, in_world, logits
 from ..errors import StgaError
-from ..files import CHANGED_LINE_ENDS, line_ends_changed, read_bytes, replacing
+from ..files import CHANGED_LINE_ENDS, allowed_bytes, line_ends_changed, read_bytes, replacing
 from ..flame.quaternions import normalized
 from ..progress import Say, warn
 from .ply import READ_FILES
@@ -29,6 +30,8 @@ ANTIALIASED = 1
 MAX_FRACTION_BITS = 16
 """Resolution of positions: 2⁻¹⁶ m = 15 µm, within ±128 m; coarser where splats are farther away."""
 COORDINATE_BITS = 24
+MAX_COORDINATE = (1 << (COORDINATE_BITS - 1)) - 1
+"""Largest coordinate, in meters or in units of its resolution."""
 COLOR_SCALE = 0.15
 OTHERS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
 """Part of a quaternion -> the other three."""
@@ -39,14 +42,21 @@ def write_spz(path: Path, world: Splats, antialiased: bool = False) -> None:
 
     Axes as in the splats: x right, y up, z back. Quantized: positions as MAX_FRACTION_BITS says,
     standard deviations from 45 µm in steps of 6 %, rotations 10 bits a component, opacity and color
-    8 bits; coefficients above degree 0 are cut at ±1. antialiased as in `Avatar`. Source: Niantic's
-    README and `load-spz.cc`.
+    8 bits; coefficients above degree 0 are cut at ±1. antialiased as in `Avatar`. Raises StgaError
+    for values that are not finite, and positions beyond MAX_COORDINATE. Source: Niantic's README
+    and `load-spz.cc`.
     """
+    for each in fields(world):
+        if not np.isfinite(getattr(world, each.name)).all():
+            raise StgaError(f"{path}: {each.name} holds a value that is not finite")
+    largest = float(np.abs(world.xyz).max(initial=0))
+    if largest > MAX_COORDINATE:
+        limit = f"positions from -{MAX_COORDINATE} to {MAX_COORDINATE}"
+        raise StgaError(f"{path}: .spz holds {limit}, but a splat is at {largest:g}")
     # As many bits of a coordinate behind the point as the largest one leaves.
-    largest = max(float(np.abs(world.xyz).max(initial=0)), 1.0)
-    bits = max(min(MAX_FRACTION_BITS, COORDINATE_BITS - 2 - math.floor(math.log2(largest))), 0)
-    limit = 1 << (COORDINATE_BITS - 1)
-    whole = np.clip(np.round(world.xyz * 2.0**bits), -limit, limit - 1).astype("<i4")
+    bits = COORDINATE_BITS - 2 - math.floor(math.log2(max(largest, 1.0)))
+    bits = max(min(MAX_FRACTION_BITS, bits), 0)
+    whole = np.minimum(np.round(world.xyz * 2.0**bits), MAX_COORDINATE).astype("<i4")
     flags = ANTIALIASED if antialiased else 0
     header = MAGIC + struct.pack("<IIBBBB", VERSION, len(world), world.sh_degree, bits, flags, 0)
     # Of a unit quaternion xyzw the index of the largest part; of the others a sign bit, and nine
@@ -99,6 +109,8 @@ def _unpacked(path: Path, data: bytes, say: Say) -> Splats:
     needed = count * sum(parts)
     if count > MAX_SPZ_SPLATS or degree > MAX_SPZ_DEGREE:
         raise ValueError(f"{count} splats of degree {degree}")
+    if needed > allowed_bytes(len(data)):
+        raise ValueError(f"{count} splats in {len(data)} bytes")
     body = stream.decompress(stream.unconsumed_tail, needed + 1)
     if len(body) != needed:
         raise ValueError(f"{len(body)} bytes of {count} splats, expected {needed}")

@@ -1,7 +1,7 @@
 """FLAME head models: template, blend shapes, skeleton of five joints, regions of triangles."""
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +19,12 @@ FULL_COMPONENTS = 400
 FULL_IDENTITY = 300
 MASK_FILE = "FLAME_masks.pkl"
 MASK_PREFIX = "masks/"  # an npz model may carry its vertex masks itself
+MAX_MODEL_NUMBERS = 1 << 25
+"""Numbers of a head model with all that is filled in, each 8 bytes in memory: five times FLAME."""
+FILLED_NUMBERS_PER_VERTEX = 3 * POSE_FEATURES + 2 * len(JOINTS)
+"""Correctives, joint regressor and skinning weights, which a file may leave out."""
+TEMPLATE_KEYS = ("v_template", "mean")
+"""Keys of the neutral head, in FLAME's form and in a linear model's."""
 MODEL_KEYS = ("v_template", "shapedirs", "posedirs", "J_regressor", "kintree_table", "weights", "f")
 BUNDLED_HEAD = Path(__file__).with_name("head.npz")
 """The head model of this package: ICT-FaceKit (MIT License, Copyright (c) 2020 USC Institute for
@@ -80,6 +86,19 @@ def read_flame(path: Path) -> FlameModel:
     finite, and any class in a pickle that is not an array.
     """
     arrays = _model_arrays(path)
+    model = model_of(path, arrays)
+    return replace(model, masks=_masks(path, arrays, len(model.v_template)))
+
+
+def model_of(path: Path, arrays: Arrays) -> FlameModel:
+    """The model in the arrays of a file, without masks, as `read_flame` reads it; errors name
+    `path`."""
+    for key in MODEL_KEYS:
+        if key not in arrays:
+            raise StgaError(f"{path}: has no {key}, which a FLAME model needs")
+        if not arrays[key].size:
+            raise StgaError(f"{path}: {key} is empty")
+    _check_size(path, arrays)
     template = finite(path, arrays, "v_template", (None, 3))
     vertices = len(template)
     shapedirs = finite(path, arrays, "shapedirs", (vertices, 3, None))
@@ -94,7 +113,6 @@ def read_flame(path: Path) -> FlameModel:
         weights=finite(path, arrays, "weights", (vertices, len(JOINTS))),
         faces=_faces(path, arrays, vertices),
         expression_names=_expression_names(path, arrays, shapedirs.shape[2] - n_identity),
-        masks=_masks(path, arrays, vertices),
     )
 
 
@@ -102,8 +120,7 @@ def _model_arrays(path: Path) -> Arrays:
     """Those of MODEL_KEYS, and what else the file has of a model."""
     if path.suffix.lower() == ".npz":
         own = (*MODEL_KEYS, "n_identity", "shape_steps", EXPRESSION_NAMES)
-        stored = npz_outlines(path)
-        arrays = read_npz(path, [n for n in stored if n in own or n.startswith(MASK_PREFIX)])
+        arrays = read_model_npz(path, own)
         if "shape_steps" in arrays and "v_template" in arrays:
             steps = finite(path, arrays, "shape_steps", (None, len(arrays["v_template"]), 3))
             arrays["shapedirs"] = np.moveaxis(SHAPE_STEP_M * steps, 0, -1)
@@ -111,12 +128,25 @@ def _model_arrays(path: Path) -> Arrays:
             arrays.setdefault("posedirs", np.zeros((len(arrays["v_template"]), 3, POSE_FEATURES)))
     else:
         arrays = read_pickled_arrays(path, (*MODEL_KEYS, "n_identity"))
-    for key in MODEL_KEYS:
-        if key not in arrays:
-            raise StgaError(f"{path}: has no {key}, which a FLAME model needs")
-        if not arrays[key].size:
-            raise StgaError(f"{path}: {key} is empty")
     return arrays
+
+
+def read_model_npz(path: Path, names: Collection[str]) -> dict[str, np.ndarray]:
+    """Arrays of a head model, `names` and vertex masks. Raises StgaError before it is unpacked
+    where a model of these would have more than MAX_MODEL_NUMBERS."""
+    outlines = npz_outlines(path)
+    chosen = [name for name in outlines if name in names or name.startswith(MASK_PREFIX)]
+    _check_size(path, {name: outlines[name] for name in chosen})
+    return read_npz(path, chosen)
+
+
+def _check_size(path: Path, arrays: Arrays) -> None:
+    template = next((arrays[name] for name in TEMPLATE_KEYS if name in arrays), np.zeros(0))
+    vertices = len(template) if template.ndim else 0
+    numbers = sum(own.size for own in arrays.values()) + FILLED_NUMBERS_PER_VERTEX * vertices
+    if numbers > MAX_MODEL_NUMBERS:
+        problem = f"is a head model of {numbers} numbers; expected up to {MAX_MODEL_NUMBERS}"
+        raise StgaError(f"{path}: {problem}")
 
 
 def _identity_count(path: Path, arrays: Arrays, components: int) -> int:

@@ -210,6 +210,8 @@ def motion_of(path: Path, arrays: Arrays, model: FlameModel) -> FlameSequence:
         none = f"has none of {', '.join(FRAME_FIELDS)}"
         raise StgaError(f"{path}: {none}, which a FLAME motion is made of")
     count = next((len(array) for array in moving.values() if array.ndim), 0)
+    if count > MAX_TIMESTEP:
+        raise StgaError(f"{path}: has {count} timesteps, expected up to {MAX_TIMESTEP}")
     for name, array in moving.items():
         if array.ndim < 2 or len(array) != count or not count:
             other = array.ndim > 1 and count
@@ -325,13 +327,13 @@ def _vector(path: Path, arrays: Arrays, name: str, size: int) -> np.ndarray:
     vector = np.zeros(size)
     if name not in arrays:
         return vector
-    array = _finite(path, name, arrays[name])
+    array = arrays[name]
     given = array[0] if array.ndim == 2 and len(array) == 1 else array
     fits = given.size == size or (name in ("expr", "shape") and given.size < size)
     if given.ndim != 1 or not fits:
         expected = f"expected ({size},) or (1, {size})"
         raise StgaError(f"{path}: {name} has shape {array.shape}, {expected}")
-    vector[: given.size] = given
+    vector[: given.size] = _finite(path, name, given)
     return vector
 
 
@@ -339,7 +341,7 @@ def _offset(path: Path, arrays: Arrays, name: str, vertices: int) -> np.ndarray 
     """(V, 3) float64, None where absent or all zero; the parts' rows are added or dropped."""
     if name not in arrays:
         return None
-    array = _finite(path, name, arrays[name])
+    array = arrays[name]
     rows = array.shape[-2] if array.ndim >= 2 else 0
     accepted = [mine - theirs for mine in ADDED_VERTICES for theirs in ADDED_VERTICES]
     if array.ndim not in (2, 3) or rows - vertices not in accepted or array.size != rows * 3:
@@ -347,7 +349,7 @@ def _offset(path: Path, arrays: Arrays, name: str, vertices: int) -> np.ndarray 
         raise StgaError(f"{path}: {name} has shape {array.shape}, expected {expected}")
     offset = np.zeros((vertices, 3))
     kept = min(rows, vertices)
-    offset[:kept] = array.reshape(rows, 3)[:kept]
+    offset[:kept] = _finite(path, name, array).reshape(rows, 3)[:kept]
     return offset if offset.any() else None
 
 

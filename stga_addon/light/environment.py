@@ -55,10 +55,8 @@ def split_environment(
     """Harmonics (9, 3) of an environment, image (H, W, 3) linear radiance as of `pixel_directions`,
     and its brightest parts as at most `max_suns` suns, which throw shadows; harmonics hold the
     rest. rotation (3, 3): from Blender's axes to those of the result."""
-    step = max(1, len(image) // MIN_ROWS)  # means over squares of pixels
-    rows, columns = (size // step for size in image.shape[:2])
-    squares = image[: rows * step, : columns * step].reshape(rows, step, columns, step, 3)
-    image = np.asarray(squares, np.float64).mean((1, 3))
+    step = max(1, len(image) // MIN_ROWS)
+    image = np.asarray(image, np.float64) if step == 1 else _coarser(image, step)
     vectors, angle = pixel_directions(*image.shape[:2])
     vectors = vectors @ rotation.T
     rest = image.copy()
@@ -77,6 +75,22 @@ def split_environment(
         level = np.where(near, 0, level)
     values = (rest * angle[..., None]).reshape(-1, 3)
     return basis(vectors.reshape(-1, 3)).T @ values, tuple(suns)
+
+
+def _coarser(image: np.ndarray, step: int) -> np.ndarray:
+    """Means (H', W', 3), float64, over squares of about `step` pixels. Where step does not divide
+    height or width, pixels on the edge of two squares are shared, so that none is lost."""
+    rows, columns = (_share_of_pixels(size, size // step) for size in image.shape[:2])
+    wide = rows @ image.reshape(len(image), -1)
+    return np.einsum("cw,rwk->rck", columns, wide.reshape(len(rows), -1, 3), dtype=np.float64)
+
+
+def _share_of_pixels(size: int, count: int) -> np.ndarray:
+    """(count, size) float32: weights of pixels in means over `count` equal parts of them."""
+    edges = np.linspace(0, size, count + 1)[:, None]
+    place = np.arange(size)
+    covered = np.minimum(edges[1:], place + 1) - np.maximum(edges[:-1], place)
+    return np.asarray(np.maximum(covered, 0) * count / size, np.float32)
 
 
 MAX_LIGHTS = 64

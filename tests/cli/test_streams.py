@@ -2,6 +2,8 @@
 
 import logging
 import os
+import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -134,6 +136,29 @@ def test_a_tight_limit_of_addresses_is_said(capture):
     said = "stga: warning: this process may have 3.1 GB of addresses (ulimit -v); expected 4 GB"
     assert tight.stderr.startswith(said)
     assert "ulimit" not in shell(f"stga info {capture}").stderr
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="names there are Unicode")
+def test_folders_that_no_path_reaches(capture, tmp_path):
+    """Catches a run that cannot read its own run.json, or a traceback, where a folder's name is not
+    UTF-8, or the working folder was removed; and what is written before that is found."""
+    latin = os.path.join(os.fsencode(tmp_path), b"caf\xe9")
+    os.makedirs(os.path.join(latin, b"gone"))
+    shutil.copytree(os.fsencode(capture), os.path.join(latin, b"ball"))
+    inside = f"cd {tmp_path}/caf*; PYTHONPATH={ROOT}"
+    for arguments in (
+        "ball --out /run",
+        f"{capture} --out run",
+        f"{tmp_path}/caf*/ball --out /run",
+    ):
+        done = shell(f"{inside} stga train {arguments}")
+        assert done.returncode == 2
+        assert re.search("^stga .*not UTF-8; rename it[)]$", done.stderr, re.MULTILINE)
+    assert sorted(os.listdir(latin)) == [b"ball", b"gone"]
+    removed = f"mkdir {tmp_path}/gone; cd {tmp_path}/gone; rmdir {tmp_path}/gone"
+    done = shell(f"{removed}; PYTHONPATH={ROOT} stga train {capture} --out run")
+    assert done.returncode == 2
+    assert "--out: run: is not a usable path (the working folder was removed" in done.stderr
 
 
 # One that is interrupted where C code calls Python, as LLVM does for each kernel that it loads.

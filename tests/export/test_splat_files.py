@@ -122,6 +122,11 @@ def test_spz_by_its_bytes(tmp_path, version):
     assert_allclose(splats.sh[0, 1:], [[0.5, -0.5, 0]] * 3)
 
 
+def bomb():
+    """A million equal splats of degree 3, which gzip packs a thousand times."""
+    return b"NGSP\3\0\0\0" + struct.pack("<I", 1_000_000) + b"\3\0\0\0" + bytes(65_000_000)
+
+
 @pytest.mark.parametrize(
     ("content", "sentence"),
     [
@@ -129,10 +134,11 @@ def test_spz_by_its_bytes(tmp_path, version):
         (packed(3)[:-20], "is not a readable SPZ file"),
         (b"NGSP\4\0\0\0\1\0\0\0\0\0\0\0", "version 4; read are 1 to 3"),
         (gzip.compress(b"NGSP\3\0\0\0\xff\xff\xff\xff" + bytes(4), mtime=0), "4294967295 splats"),
-        (gzip.compress(b"NGSP\3\0\0\0\x80\x96\x98" + bytes(14), mtime=0), "9 bytes of 10000000"),
+        (gzip.compress(b"NGSP\3\0\0\0\xa0\x86\1" + bytes(14), mtime=0), "9 bytes of 100000"),
         (packed(2).replace(b"\x00", b"\r\n"), "SPZ file"),
+        (gzip.compress(bomb(), mtime=0), "1000000 splats in 63... bytes"),
     ],
-    ids=["text", "truncated", "version 4", "splats without end", "too few bytes", "as text"],
+    ids=["text", "truncated", "version 4", "without end", "too few bytes", "as text", "bomb"],
 )
 def test_broken_spz(tmp_path, content, sentence):
     """Catches a traceback, and memory allocated on the word of a header."""

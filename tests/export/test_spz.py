@@ -1,6 +1,7 @@
 """SPZ: read by gsply, and here."""
 
 import gzip
+import struct
 from dataclasses import replace
 
 import gsply
@@ -8,6 +9,8 @@ import numpy as np
 import pytest
 from avatar.conftest import random_splats, world_splats
 from numpy.testing import assert_allclose
+from refusal import refusal
+from scipy.spatial.transform import Rotation
 
 from stga_addon.avatar.embedding import to_world
 from stga_addon.export.formats import export_avatar
@@ -68,3 +71,41 @@ def test_far_and_extreme_splats(tmp_path):
     assert_allclose(np.abs(found.rotation), np.abs(splats.unit_rotations()), atol=2e-3)
     write_spz(tmp_path / "near.spz", splats.rows(np.array([2])))
     assert_allclose(read(tmp_path / "near.spz")[0].xyz, splats.xyz[[2]], atol=2**-17)
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "sentence"),
+    [
+        ("xyz", np.nan, "xyz holds a value that is not finite"),
+        ("opacity", np.inf, "opacity holds a value that is not finite"),
+        ("log_scale", -np.inf, "log_scale holds a value that is not finite"),
+        ("rotation", np.nan, "rotation holds a value that is not finite"),
+        ("sh", np.inf, "sh holds a value that is not finite"),
+        ("xyz", 1e7, "positions from -8388607 to 8388607, but a splat is at 1e\\+07"),
+    ],
+)
+def test_values_that_spz_cannot_hold(tmp_path, field, value, sentence):
+    """Catches a traceback, half a file, and far splats moved to another place in silence."""
+    splats = random_splats(5, 4, 1, 1)
+    array = getattr(splats, field).copy()
+    array[-1] = value
+    with refusal(f"a.spz: .*{sentence}"):
+        write_spz(tmp_path / "a.spz", replace(splats, **{field: array}))
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("version", [1, 2])
+def test_rotations_of_older_versions(tmp_path, version):
+    """Catches a wrong scale, zero, order or sign of the three bytes of a rotation, as gsply and
+    SciPy have them."""
+    count = 200
+    turns = Rotation.random(count, random_state=version)
+    xyz = np.rint((turns.as_quat(canonical=True)[:, :3] + 1) * 127.5).astype(np.uint8)
+    for each in {version, 2}:  # gsply takes the places of version 1 for those of 2
+        header = struct.pack("<4sIIBBBB", b"NGSP", each, count, 0, 12, 0, 0)
+        others = bytes(count * ((6 if each == 1 else 9) + 1 + 3 + 3))
+        (tmp_path / f"{each}.spz").write_bytes(gzip.compress(header + others + xyz.tobytes()))
+    found = read_splats(tmp_path / f"{version}.spz").rotation
+    assert_allclose(found, gsply.read_spz(tmp_path / "2.spz").quats, atol=5e-5)
+    off = Rotation.from_quat(found, scalar_first=True) * turns.inv()
+    assert np.degrees(np.median(off.magnitude())) < 0.8

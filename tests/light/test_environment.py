@@ -88,6 +88,16 @@ def test_an_environment_keeps_its_irradiance():
     assert_allclose(whole[0], world[0] + suns[0].color * 0.28209, rtol=1e-3)
 
 
+@pytest.mark.parametrize("height", [191, 383, 518, 1000])
+def test_a_height_that_does_not_divide(height):
+    """Catches the lowest rows and the last columns of a world left out of its light."""
+    vectors, angle = pixel_directions(height, 2 * height)
+    image = np.asarray(1 + vectors - vectors[..., [2]], np.float32)
+    truth = basis(vectors.reshape(-1, 3)).T @ (image * angle[..., None]).reshape(-1, 3)
+    found = split_environment(image, np.eye(3), max_suns=0)[0]
+    assert_allclose(found, truth, atol=2e-4 * np.abs(truth).max())
+
+
 def test_lights_of_a_text_file(tmp_path):
     """Catches defaults, strength and color that are lost, and mistakes without a sentence."""
     path = tmp_path / "lights.toml"

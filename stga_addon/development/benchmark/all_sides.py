@@ -24,6 +24,8 @@ from ..demo.run import side_by_side
 
 DIRECTIONS = 8
 JPEG_QUALITY = 88
+PICTURE_FORMATS = {".jpg": "JPEG", ".jpeg": "JPEG", ".png": "PNG"}
+"""Suffix of a picture -> Pillow's name of its format."""
 NEUTRAL = Act({})
 POSES = (
     Act({"jawOpen": 1.0}),
@@ -62,7 +64,9 @@ def write_sheet(path: Path, avatars: Sequence[Avatar], shots: Sequence[Shot]) ->
         images = [render_avatar(avatar, mesh, camera, (1, 1, 1)) for camera, mesh in shots]
         rows.append(side_by_side([to_uint8(image) for image in images]))
     with replacing(path) as partial:
-        Image.fromarray(np.concatenate(rows)).save(partial, format="JPEG", quality=JPEG_QUALITY)
+        Image.fromarray(np.concatenate(rows)).save(
+            partial, format=PICTURE_FORMATS[path.suffix.lower()], quality=JPEG_QUALITY
+        )
 
 
 def main() -> None:
@@ -73,6 +77,9 @@ def main() -> None:
     parser.add_argument("--sides", type=Path, required=True, metavar="FILE")
     parser.add_argument("--poses", type=Path, required=True, metavar="FILE")
     options = parser.parse_args()
+    for path in (options.sides, options.poses):
+        if path.suffix.lower() not in PICTURE_FORMATS:
+            parser.error(f"{path}: expected a name that ends in {', '.join(PICTURE_FORMATS)}")
     avatars = [read_avatar(run / AVATAR) for run in options.runs]
     for path, shots in zip((options.sides, options.poses), shots_of(options.runs[-1]), strict=True):
         write_sheet(path, avatars, shots)

@@ -21,7 +21,7 @@ from ...avatar.strain import (
 )
 from ...capture.model import Capture
 from ...errors import StgaError, shorten
-from ...files import check_version, read_npz, write_npz
+from ...files import MAX_CHECKPOINT_BYTES, check_version, read_npz, write_npz
 from ...schema import from_json, setting
 from ..optimize.state import OffsetState, TrainState, arrays_of, state_of
 from ..settings import TrainingSettings
@@ -116,7 +116,7 @@ def write_checkpoint(folder: Path, checkpoint: Checkpoint) -> None:
 def read_checkpoint(folder: Path) -> Checkpoint:
     """Raises StgaError where there is none, or it is damaged or of another format version."""
     path = folder / CHECKPOINT
-    arrays = read_npz(path)
+    arrays = read_npz(path, limit=MAX_CHECKPOINT_BYTES)
     try:
         meta = json.loads(arrays.pop("meta").tobytes())
         check_version(path, "checkpoint", meta.pop("version"), VERSION)

@@ -17,8 +17,8 @@ from stga_addon.flame.sequence import FlameSequence
 
 
 def test_directions_and_poses(tmp_path, monkeypatch):
-    """Catches directions in another order, a pose that is another one's or none, and a run whose
-    head has no such expressions."""
+    """Catches directions in another order, a pose that is another one's or none, a run whose
+    head has no such expressions, and a picture of another format than its name says."""
     model = flame_model(None)
     zero = np.zeros(model.n_identity)
     sequence = FlameSequence(model, zero, None, (0,), lambda _: neutral_frame(model))
@@ -33,11 +33,13 @@ def test_directions_and_poses(tmp_path, monkeypatch):
     splats.opacity[:] = 4
     avatar = Avatar(splats, "stga", model.v_template.astype(np.float32), faces)
     write_avatar(tmp_path / "avatar.npz", avatar)
-    files = [tmp_path / "sides.jpg", tmp_path / "poses.jpg"]
+    files = [tmp_path / "sides.png", tmp_path / "poses.jpg"]
     words = [str(tmp_path), "--sides", str(files[0]), "--poses", str(files[1])]
     monkeypatch.setattr("sys.argv", ["all_sides", *words])
     all_sides.main()
-    sides, poses = (np.asarray(Image.open(file), float) for file in files)
+    pictures = [Image.open(file) for file in files]
+    assert [picture.format for picture in pictures] == ["PNG", "JPEG"]
+    sides, poses = (np.asarray(picture, float) for picture in pictures)
     columns = np.split(np.pad(sides, ((0, 0), (0, 6), (0, 0))), 8, axis=1)
     middle = [column[120:240, 100:220].mean((0, 1)).argmax() for column in columns]
     assert [middle[0], *middle[2:7:2]] in ([0, 0, 2, 1], [1, 0, 2, 1])

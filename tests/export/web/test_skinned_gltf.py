@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from export import ten_splats
 from stga_addon.avatar.embedding import to_world
+from stga_addon.avatar.file import read_avatar
 from stga_addon.avatar.offsets import OFFSETS
 from stga_addon.avatar.splats import sh_color
 from stga_addon.export import skinned_gltf
@@ -23,9 +24,17 @@ from stga_addon.export.gltf import glb_bytes
 from stga_addon.export.playback import Playback
 from stga_addon.export.rig import BAKE_TOLERANCE_M, baked_rig
 from stga_addon.export.skinned_gltf import pack
-from stga_addon.export.skinned_reader import read_skinned_splats
+from stga_addon.export.skinned_reader import (
+    AVATAR_FILE,
+    MODEL_FILE,
+    MOTION_FILE,
+    read_skinned_splats,
+    unpack_skinned_splats,
+)
 from stga_addon.export.web import shared_constants
 from stga_addon.export.web.page import ELEMENT, PAGE, PLAYER, element_script, modules
+from stga_addon.flame.model import read_flame
+from stga_addon.flame.sequence import read_motion, sequence_mesh
 
 from .conftest import make_head
 from .web_data import document_of, planes, posed_mesh, read_web_data, splats_of
@@ -176,6 +185,79 @@ def test_ten_splats_are_where_the_page_says():
     assert np.abs(found - told).max() < 1e-4
 
 
+BYTES = {"type": "integer", "planes": 1, "low": 0}
+NAN = 99999
+"""Stands for NaN, which JSON has not, though its readers take it."""
+
+
+def set_bind(document, binary, matrix, column, row, value):
+    """Change a number of an inverse bind matrix in place."""
+    view = document["bufferViews"][document["accessors"][6]["bufferView"]]
+    at = view.get("byteOffset", 0) + 4 * (16 * matrix + 4 * column + row)
+    binary[at : at + 4] = np.float32(value).tobytes()
+
+
+@pytest.mark.parametrize(
+    ("damage", "problem"),
+    [
+        (lambda d, _: d["skins"][0].update(joints=[0, 0]), "joints; expected 1 to 5 different"),
+        (lambda d, _: d["skins"][0].update(joints=[0, 99]), "a joint that is no node"),
+        (lambda d, _: d["skins"][0].update(joints=["a", 1]), "expected a whole number"),
+        (lambda d, _: d["skins"][0].update(joints=[0]), "of another type or length"),
+        (lambda d, _: d["skins"][0].update(inverseBindMatrices=2), "of another type or length"),
+        (lambda d, _: d["nodes"][1].update(name="tail"), "has the joints 'root, tail'"),
+        (lambda d, b: set_bind(d, b, 1, 0, 1, 0.5), "matrices that turn"),
+        (lambda d, b: set_bind(d, b, 0, 0, 0, 0), "scale by 0 or less"),
+        (lambda d, b: set_bind(d, b, 1, 3, 0, np.nan), "matrices that are not finite"),
+        (lambda d, _: d["animations"][0]["channels"].pop(2), "does not turn joint 1"),
+        (lambda d, _: d["animations"][0]["channels"].pop(1), "does not move the root"),
+        (
+            lambda d, _: d["meshes"][0]["primitives"][0].update(targets=[{"POSITION": 4}] * 999),
+            "of another type or length",
+        ),
+    ],
+)
+def test_damaged_rigs_are_refused(damage, problem, tmp_path):
+    """Catches an exception of numpy, half a head, and files in a folder, by a file whose rig does
+    not fit."""
+    document, binary = document_of(ten_splats.FILE.read_bytes())
+    binary = bytearray(binary)
+    damage(document, binary)
+    (tmp_path / "a.glb").write_bytes(glb_bytes(document, bytes(binary)))
+    with refusal(f"a.glb: .*{problem}"):
+        unpack_skinned_splats(tmp_path / "a.glb", tmp_path / "unpacked")
+    assert [path.name for path in tmp_path.iterdir()] == ["a.glb"]
+
+
+def test_zeros_repeated_by_shapes_are_counted(tmp_path):
+    """Catches gigabytes of shapes that a small file makes of one accessor without data."""
+    document, binary = document_of(ten_splats.FILE.read_bytes())
+    zeros = {"count": 300_000, "type": "VEC3", "componentType": 5126}
+    document["accessors"].append(zeros)
+    primitive = document["meshes"][0]["primitives"][0]
+    own = {"POSITION": len(document["accessors"]) - 1}
+    primitive["attributes"] |= own
+    primitive["targets"] = [own] * 500
+    (tmp_path / "a.glb").write_bytes(glb_bytes(document, binary))
+    with refusal("500 shapes of 300000 vertices are more than it can hold"):
+        read_skinned_splats(tmp_path / "a.glb")
+
+
+def test_a_rig_with_some_of_the_joints(tmp_path):
+    """Catches the test vector refused, and a joint, its correctives or its motion given to another
+    joint of FLAME."""
+    found = unpack_skinned_splats(ten_splats.FILE, tmp_path / "unpacked")
+    model = read_flame(tmp_path / "unpacked" / MODEL_FILE)
+    motion = read_motion(tmp_path / "unpacked" / MOTION_FILE, model)
+    header, arrays = read_web_data(ten_splats.FILE.read_bytes())
+    for frame in motion.timesteps:
+        pose = arrays["coefficients"][frame], arrays["pose"][frame], frame
+        posed = sequence_mesh(motion, frame)
+        assert np.abs(posed - posed_mesh(header, arrays, *pose)).max() < 2e-4
+    assert found.rig.joint_names == ("root", "jaw")
+    assert read_avatar(tmp_path / "unpacked" / AVATAR_FILE).splats.xyz.shape == (10, 3)
+
+
 @pytest.mark.parametrize(
     ("changes", "problem"),
     [
@@ -183,13 +265,20 @@ def test_ten_splats_are_where_the_page_says():
         ({"byteLength": 50}, "not whole"),
         ({"arrays": {}}, "not whole"),
         ({"arrays": {"xyz": {"type": "float32", "shape": [1 << 40, 3]}}}, "larger than any"),
+        ({"arrays": {"xyz": {**BYTES, "shape": [1], "planes": 1 << 26}}}, "expected 1 to 8"),
+        ({"arrays": {"page": {**BYTES, "shape": [1 << 29]}}}, "larger than any"),
+        ({"arrays": {"xyz": {**BYTES, "shape": [1 << 25]}}}, "larger than any"),
+        *(({"fps": fps}, "fps is") for fps in (NAN, 0, 1e300, -10)),
+        ({"expressions": 3}, "3 expressions"),
+        ({"background": [2, 0, 0]}, "background"),
     ],
 )
 def test_damaged_splats_are_refused(changes, problem, tmp_path):
     """Catches an exception of numpy or zlib, or memory taken, by a file of another kind."""
     document, binary = document_of(ten_splats.FILE.read_bytes())
     document["extras"]["stga_splats"] |= changes
-    (tmp_path / "a.glb").write_bytes(glb_bytes(document, binary))
+    data = glb_bytes(document, binary).replace(str(NAN).encode(), b"  NaN")
+    (tmp_path / "a.glb").write_bytes(data)
     with refusal(problem):
         read_skinned_splats(tmp_path / "a.glb")
 
