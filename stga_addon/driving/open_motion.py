@@ -17,6 +17,7 @@ from ..flame.forward import FlameFrame
 from ..flame.parts import flame_model
 from ..flame.sequence import FlameSequence, strengthened, transferred_motion
 from ..options import option
+from .clocks import MAX_FPS, MIN_FPS
 from .head_map import head_map, person_of
 from .performance import (
     ARKIT_SHAPES,
@@ -30,7 +31,7 @@ from .performance import (
     resampled,
     smoothed,
 )
-from .performance_files import MAX_FPS, MAX_ROWS, MIN_FPS
+from .performance_files import MAX_ROWS
 from .performers import READ_SUFFIXES, is_performance, performer_of, read_performance
 
 PART_FIELDS = {"face": "expr", "jaw": "jaw_pose", "eyes": "eyes_pose"}

@@ -13,10 +13,10 @@ import numpy as np
 
 from ...errors import StgaError
 from .. import performance_files
-from ..clocks import DEFAULT_FPS
+from ..clocks import DEFAULT_FPS, MAX_FPS
 from ..open_motion import MotionOptions, corrected
 from ..performance import FacePacket, Performance
-from ..performance_files import MAX_FPS, MAX_ROWS
+from ..performance_files import MAX_ROWS
 from .decoders import Received, decode_live_link_face, decode_vmc
 
 Decoded = tuple[FacePacket | None, Any]
