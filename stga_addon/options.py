@@ -16,6 +16,21 @@ from .schema import alternatives, expectation, setting, type_hints
 MAX_DIGITS = 18  # Of a whole number on the command line, which fits 64 bits
 
 
+@dataclasses.dataclass(frozen=True)
+class When:
+    """A case in which an option has an effect.
+
+    holds      of a request, or of the options of a command by the same names
+    otherwise  what follows "has no effect", with values in braces, as {source}
+    """
+
+    holds: Callable[[Any], bool]
+    otherwise: str
+
+
+Need = str | tuple[str, ...] | When
+
+
 def option(
     help: str,
     default: Any = dataclasses.MISSING,
@@ -28,7 +43,7 @@ def option(
     bare: Any = None,
     offered: Collection[str] | None = None,
     group: str = "",
-    needs: tuple[str | tuple[str, ...], ...] = (),
+    needs: "tuple[Need, ...]" = (),
     **limits: Any,
 ) -> Any:
     """A dataclass field that people choose, with its limits (`schema.setting`).
@@ -41,7 +56,8 @@ def option(
     bare     the value where the option is given alone
     offered  those of the field's choices that people have
     group    options of one group exclude each other
-    needs    fields that have to be given with it, else it has no effect; of a tuple, one
+    needs    what has to hold, else it has no effect and is refused: fields that have to be given
+             with it, of a tuple one, and cases (`When`)
     """
     asked = {"help": help, "flag": flag, "metavar": metavar, "parse": parse, "bare": bare}
     asked |= {"group": group, "needs": needs, "offered": offered or limits.get("choices")}
@@ -137,27 +153,70 @@ def given_options(options: Namespace, kind: Any) -> dict[str, Any]:
     return found
 
 
-def refuse_useless(value: Any) -> None:
-    """Raise StgaError for the first option without effect, by its `needs`."""
-    specs = {spec.name: spec for spec in dataclasses.fields(value)}
-    for spec in option_fields(type(value)):
-        for needed in spec.metadata["needs"] if _is_changed(value, spec) else ():
-            names = (needed,) if isinstance(needed, str) else needed
-            if any(_is_changed(value, specs[name]) for name in names):
+def refuse_useless(value: Any, *kinds: Any) -> None:
+    """Raise StgaError for the first option that is given without effect, by its `needs`.
+
+    value: a dataclass of options, or the Namespace of those of the dataclasses `kinds`.
+    """
+    options = [*_nested_options(*(kinds or (type(value),)))]
+    flags = {each.spec.name: flag_of(each.spec) for each in options}
+    for each in options:
+        problem = _problem(value, each.needs, flags) if each.is_given(value) else None
+        if problem is not None:
+            raise StgaError(f"{flag_of(each.spec)}: has no effect {problem}")
+
+
+def serves(options: Namespace, name: str, *kinds: Any) -> bool:
+    """Whether an option of a command would have an effect."""
+    needs = (each.needs for each in _nested_options(*kinds) if each.spec.name == name)
+    return all(_problem(options, each, {}) is None for each in needs)
+
+
+@dataclasses.dataclass(frozen=True)
+class _NestedOption:
+    """An option, the field of the dataclass that it is in where that is nested, and all needs."""
+
+    spec: Any
+    within: str
+    needs: tuple[Need, ...]
+
+    def is_given(self, value: Any) -> bool:
+        nested = self.within and not isinstance(value, Namespace)
+        return _is_given(getattr(value, self.within) if nested else value, self.spec.name)
+
+
+def _nested_options(*kinds: Any) -> Iterator[_NestedOption]:
+    for kind in kinds:
+        hints = type_hints(kind)
+        for spec in option_fields(kind):
+            needs = spec.metadata["needs"]
+            if not dataclasses.is_dataclass(hints[spec.name]):
+                yield _NestedOption(spec, "", needs)
                 continue
-            useless = spec
-            without = " or ".join(flag_of(specs[name]) for name in names)
-            nested = getattr(value, spec.name)
-            if dataclasses.is_dataclass(nested):
-                inner: Any = type(nested)
-                useless = next(own for own in option_fields(inner) if _is_changed(nested, own))
-            raise StgaError(f"{flag_of(useless)}: has no effect without {without}")
+            for each in option_fields(hints[spec.name]):
+                yield _NestedOption(each, spec.name, (*needs, *each.metadata["needs"]))
 
 
-def _is_changed(value: Any, spec: Any) -> bool:
+def _is_given(value: Any, name: str) -> bool:
+    if isinstance(value, Namespace):
+        return getattr(value, name, None) is not None
+    spec = value.__dataclass_fields__[name]
     is_made = spec.default_factory is not dataclasses.MISSING
     default = spec.default_factory() if is_made else spec.default
-    return bool(getattr(value, spec.name) != default)
+    return bool(getattr(value, name) != default)
+
+
+def _problem(value: Any, needs: tuple[Need, ...], flags: Mapping[str, str]) -> str | None:
+    """What follows "has no effect", where one of the needs is not met."""
+    for need in needs:
+        if isinstance(need, When):
+            if not need.holds(value):
+                return need.otherwise.format_map(vars(value))
+            continue
+        names = (need,) if isinstance(need, str) else need
+        if not any(_is_given(value, name) for name in names):
+            return f"without {' or '.join(flags.get(name, f'--{name}') for name in names)}"
+    return None
 
 
 # Values on the command line

@@ -57,3 +57,11 @@ def test_the_other_person_moves_the_avatar(parts, tmp_path):
     first, drawn = (np.asarray(Image.open(out / f"0000{t}_01.png")).astype(int) for t in (0, 1))
     assert np.abs(drawn - expected).max() <= 1
     assert np.abs(drawn - first).max() > 50
+
+
+@pytest.mark.parametrize("more", ["--video {out}.mp4", "--turntable 90 --seconds 1 --out {out}"])
+def test_the_cameras_of_the_capture(parts, tmp_path, more):
+    """Catches a film of a motion that asks for cameras, though the capture has some."""
+    words = "render {avatar} --capture {capture} --motion {motion} --flame {model} " + more
+    assert stga(words.format(**parts, out=tmp_path / "film")) == 0
+    assert any(tmp_path.glob("film*"))

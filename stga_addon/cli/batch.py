@@ -12,12 +12,20 @@ from ..errors import StgaError
 from ..jobs.batch.engines import ENGINES
 from ..jobs.batch.plan import Plan, plan_of_captures, read_plan
 from ..jobs.train import Train
-from ..options import flag_of, given_options, like, option, option_fields
+from ..options import When, given_options, like, option
 from ..training.settings import TrainingSettings
 from ..worker.launch import PACKAGES_FOLDER
 from ..worker.machine import processors
 
 PLAN_SUFFIX = ".toml"
+
+
+CAPTURES = When(
+    lambda value: value.sources[0].suffix != PLAN_SUFFIX, "with a plan, which says that itself"
+)
+HERE = When(
+    lambda value: not getattr(value, "commands", None), "with --commands, which carries out nothing"
+)
 
 
 @dataclass(frozen=True)
@@ -27,20 +35,27 @@ class BatchOptions:
     sources: tuple[Path, ...] = option(
         "a plan (docs/commands.md#batches), or captures", flag="PLAN.toml|CAPTURE"
     )
-    out: Path | None = option("folder of the batch; required with captures", None, metavar="RUNS")
+    out: Path | None = option(
+        "folder of the batch; required with captures", None, metavar="RUNS", needs=(CAPTURES,)
+    )
     preset: str | None = like(
         TrainingSettings,
         "preset",
         help="quality of each capture; it, --budget or --iterations is required with captures",
+        needs=(CAPTURES,),
     )
-    seconds: float | None = like(TrainingSettings, "seconds", help="training time of each capture")
-    iterations: int | None = like(TrainingSettings, "iterations")
-    seed: int = like(TrainingSettings, "seed")
-    flame: Path | None = like(Train, "flame")
-    principal_point: str = like(Train, "principal_point")
-    device: str = like(Train, "device")
+    seconds: float | None = like(
+        TrainingSettings, "seconds", help="training time of each capture", needs=(CAPTURES,)
+    )
+    iterations: int | None = like(TrainingSettings, "iterations", needs=(CAPTURES,))
+    seed: int = like(TrainingSettings, "seed", needs=(CAPTURES,))
+    flame: Path | None = like(Train, "flame", needs=(CAPTURES,))
+    principal_point: str = like(Train, "principal_point", needs=(CAPTURES,))
+    device: str = like(Train, "device", needs=(CAPTURES,))
     commands: bool = option(
-        "prepare the jobs and print a command for each, for another scheduler", False
+        "prepare the jobs and print a command for each, for another scheduler",
+        False,
+        needs=(When(lambda value: not value.dry_run, "with --dry-run, which prepares nothing"),),
     )
 
 
@@ -54,8 +69,13 @@ class EngineOptions:
         "; ".join(f"{name}: {what}" for name, (what, _) in ENGINES.items()),
         "local",
         choices=ENGINES,
+        needs=(HERE,),
     )
-    address: str = option("of a running cluster (ray)", "")
+    address: str = option(
+        "of a running cluster (ray)",
+        "",
+        needs=(When(lambda value: value.engine == "ray", "without --engine ray"),),
+    )
 
 
 def run_batch_command(options: Namespace, head: object = None) -> None:
@@ -83,16 +103,13 @@ def run_batch_command(options: Namespace, head: object = None) -> None:
 
 
 def batch_plan(options: Namespace) -> Plan:
-    """Raises StgaError for a mistake in the plan, and for options without effect on one."""
+    """Raises StgaError for a mistake in the plan."""
     given = given_options(options, BatchOptions)
     sources = given.pop("sources")
     given.pop("commands", None)
     if sources[0].suffix == PLAN_SUFFIX:
         if len(sources) > 1:
             raise StgaError(f"{sources[1]}: cannot be given beside a plan")
-        useless = next((flag_of(s) for s in option_fields(BatchOptions) if s.name in given), None)
-        if useless is not None:
-            raise StgaError(f"{useless}: has no effect with a plan, which says that itself")
         return read_plan(sources[0])
     out = given.pop("out", None)
     if out is None:

@@ -4,9 +4,9 @@ progress of that on a terminal."""
 import os
 import sys
 from argparse import ArgumentParser, Namespace
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import ExitStack
-from dataclasses import dataclass, make_dataclass, replace
+from dataclasses import dataclass, field, fields, make_dataclass, replace
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
@@ -21,7 +21,7 @@ from ..export.formats import FORMATS
 from ..export.splat_files import is_splats
 from ..files import write_npz
 from ..format import describe_figures, describe_left, format_table
-from ..jobs.analyze import Analyze, Select, TimePresets
+from ..jobs.analyze import Analyze, Select, TimePresets, holds_avatar
 from ..jobs.avatar_source import OpenHead, avatar_path
 from ..jobs.convert_motion import ConvertMotion
 from ..jobs.export import Export
@@ -38,10 +38,19 @@ from ..jobs.track import (
     read_inputs,
 )
 from ..jobs.train import Extend, Refine, Resume, Selected, SelectForTake, Train
-from ..options import add_options, flag_of, given_options, like, option, option_fields
+from ..options import (
+    add_options,
+    flag_of,
+    given_options,
+    like,
+    option,
+    option_fields,
+    refuse_useless,
+    serves,
+)
 from ..progress import Clock, Progress, ignore
 from ..selection import SelectionOptions
-from ..training.run.folder import AVATAR, RUN, Run, claimed_folder, has_run, read_run
+from ..training.run.folder import AVATAR, Run, claimed_folder, has_run, read_run
 from ..training.settings import TrainingSettings, make_settings
 from .batch import BatchOptions, EngineOptions, run_batch_command
 
@@ -120,6 +129,7 @@ class Command:
     options    dataclasses whose fields are its options; a tuple: and which of them
     may_lack   fields without a default that need not be given
     uses_head  whether the open file's capture and avatar stand in for those that are not named
+    leaves     option -> those that have an effect beside it; others are refused
     """
 
     about: str
@@ -127,6 +137,12 @@ class Command:
     options: tuple[Any, ...]
     may_lack: tuple[str, ...] = ()
     uses_head: bool = False
+    leaves: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+
+    @property
+    def kinds(self) -> list[Any]:
+        """The dataclasses whose fields are options."""
+        return [item[0] if isinstance(item, tuple) else item for item in self.options]
 
     def add_arguments(self, parser: ArgumentParser, head: OpenHead | None) -> None:
         may_lack = [*self.may_lack]
@@ -141,14 +157,29 @@ class Command:
         head = head if self.uses_head else None
         if head is not None and getattr(options, "source", "") is None:
             options.source = head.avatar
+        self.refuse_useless(options)
         if head is not None and options.capture is not None:
             head = None
         elif head is not None:
-            options.capture = head.capture
-            options.flame = options.flame or head.flame
+            if serves(options, "capture", *self.kinds):
+                options.capture = head.capture
+            if options.flame is None and serves(options, "flame", *self.kinds):
+                options.flame = head.flame
             if "source" not in options:  # of an avatar's cameras: as in its training
                 options.principal_point = options.principal_point or head.principal_point
         self.run(options, head)
+
+    def refuse_useless(self, options: Namespace) -> None:
+        """Raise StgaError for the first option that is given without effect."""
+        specs = {spec.name: spec for kind in self.kinds for spec in option_fields(kind)}
+        for mode, left in self.leaves.items():
+            if getattr(options, mode) is None:
+                continue
+            for name, spec in specs.items():
+                if name not in (mode, *left) and getattr(options, name, None) not in (None, []):
+                    problem = f"has no effect with {flag_of(specs[mode])}"
+                    raise StgaError(f"{flag_of(spec)}: {problem}")
+        refuse_useless(options, *self.kinds)
 
 
 def _about(kind: Any) -> str:
@@ -295,13 +326,6 @@ def _continuing(kind: Any, seconds: float, *more: Any) -> Command:
         takes = given.get("captures")
         only = getattr(options, "select_only", None)
         if options.resume:
-            flags = [flag_of(spec) for spec in option_fields(kind) if given.get(spec.name)]
-            flags += ["--select-only"] if only else []
-            kept = "RUN", "--flame", "--device"
-            useless = next((flag for flag in flags if flag not in kept), None)
-            if useless is not None:
-                problem = "cannot be combined with --resume, which continues RUN as it began"
-                raise StgaError(f"{useless}: {problem}")
             if read_run(given["parent"]).continuation is None:
                 problem = "does not continue another run; resume it with `stga train --resume`"
                 raise StgaError(f"{given['parent']}: {problem}")
@@ -321,7 +345,10 @@ def _continuing(kind: Any, seconds: float, *more: Any) -> Command:
                 carry_out(kind(**given))
 
     resume = _lone("resume", bool, "RUN was stopped: continue it", False)
-    return Command(_about(kind), run, (kind, resume, *more), may_lack=("run", "captures"))
+    leaves = {"resume": ("parent", "flame", "device")}
+    leaves |= {spec.name: ("parent", "captures", "flame") for each in more for spec in fields(each)}
+    options = (kind, resume, *more)
+    return Command(_about(kind), run, options, may_lack=("run", "captures"), leaves=leaves)
 
 
 def _write_selection(request: Select | SelectForTake, path: Path | None) -> None:
@@ -335,7 +362,7 @@ def _write_selection(request: Select | SelectForTake, path: Path | None) -> None
 
 def _info(options: Namespace, head: OpenHead | None) -> None:
     path = options.capture
-    if (path / RUN).exists() or path.suffix == ".npz":
+    if holds_avatar(path):
         from ..jobs.finished_run import describe_light
 
         avatar = read_avatar(avatar_path(path))
@@ -381,7 +408,8 @@ def _render(options: Namespace, head: OpenHead | None) -> None:
 def _export(options: Namespace, head: OpenHead | None) -> None:
     given = given_options(options, Export)
     if head is not None:
-        given.setdefault("fps", head.fps)
+        if serves(options, "fps", Export):
+            given.setdefault("fps", head.fps)
         moves = FORMATS[options.file_format].source != "frame" or options.timestep is not None
         if options.motion is None and moves:
             given["played"] = head.played()

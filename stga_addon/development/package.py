@@ -19,6 +19,7 @@ from .compiled_kernels import compile_kernels
 from .demo.capture import unpack_capture
 from .editions import BARE, DEMO_FOLDER, SMALL, Edition, complete, edition_manifest
 from .wheels import (
+    PYTHONS,
     TARGETS,
     Target,
     collect_wheels,
@@ -176,6 +177,11 @@ def target_of(blender: Sequence[str]) -> Target:
         )
     python = ".".join(answer[:2])
     (major, minor) = map(int, answer[2:])
+    if python not in PYTHONS:
+        known = ", ".join(PYTHONS)
+        raise StgaError(
+            f"{shlex.join(blender)}: has Python {python}; wheels are locked for {known}"
+        )
     return Target(this_platform(), python, (f"{major}.{minor}.0", f"{major}.{minor + 1}.0"))
 
 

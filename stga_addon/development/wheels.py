@@ -69,6 +69,8 @@ MARKERS = {
 """Values of environment markers on each platform."""
 BLENDER_RANGES = {"3.11": ("4.2.0", "5.1.0"), "3.13": ("5.1.0", "")}
 """Python -> first Blender that brings it, and the first that no longer does."""
+PYTHONS = (*BLENDER_RANGES, "3.14")
+"""Pythons that `LOCK` has wheels for; of the last, for a Blender that is built with it."""
 PROVIDED = frozenset({"numpy"})
 """Packages that Blender brings."""
 LOCK = Path(__file__).with_name("wheels.lock")

@@ -1,34 +1,52 @@
 """When the rows of a recording are: timecodes, and numbers of seconds, their parts, or frames."""
 
 import re
-from collections.abc import Iterable
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from unicodedata import normalize
 
 import numpy as np
 
 from ..errors import StgaError, shorten
 
 TIMECODE = re.compile(
-    r"(?:\d{4}-\d\d-\d\d[T ])?(\d{1,3}):(\d{1,2}):(\d{1,2})"
+    r"(?:\d{1,4}[-/.]\d\d?[-/.]\d{1,4}[T ])?(?:(\d{1,3}):)?(\d{1,2}):(\d{1,2})"
     r"(?:([:;.,])(\d{1,9})(?:[.,](\d{1,6}))?)?(?:Z|[+-]\d\d:?\d\d)?",
     re.ASCII,
 )
-"""Also of a date in ISO 8601."""
-BASES = (24, 25, 30, 48, 50, 60, 100, 120)  # Frames per second that timecodes count
+"""Also behind a date, as in ISO 8601; hours may be missing."""
+BASES = (24, 25, 30, 48, 50, 60, 100, 120, 240)  # Frames per second that timecodes count
 USUAL_BASE = 60  # Of a take of less than a second, whose frame numbers do not tell
 DAY_S = 86_400.0
+DROP_DAY_S = (30 * DAY_S - 2 * 1296) * 1001 / 30_000
+"""A day in which 1296 minutes leave out two of 30 frames a second."""
 DROP_RATIO = 1000 / 1001  # Of drop-frame timecodes, with a semicolon, whose frames come slower
 CLOCK_TOLERANCE_S = 0.002  # Of milliseconds that are cut off or rounded
 MIN_DISTINCT_FRAMES = 3  # Frames of a second that tell milliseconds from shares of a frame
 UNITS_S = {
     **dict.fromkeys(("s", "sec", "secs", "second", "seconds"), 1.0),
     **dict.fromkeys(("ms", "msec", "millis", "millisecond", "milliseconds"), 1e-3),
-    **dict.fromkeys(("us", "µs", "usec", "micros", "microsecond", "microseconds"), 1e-6),
+    **dict.fromkeys(("us", "μs", "usec", "micros", "microsecond", "microseconds"), 1e-6),
     **dict.fromkeys(("ns", "nsec", "nanos", "nanosecond", "nanoseconds"), 1e-9),
 }
+"""As NFKC spells them, which makes the micro sign a Greek letter."""
 UNIT_NAMES = {1e-3: "milliseconds", 1e-6: "microseconds", 1e-9: "nanoseconds"}
-TIME_WORDS = ("timecode", "time", "timestamp", "elapsed", "t", "pts")
+TIME_WORDS = (
+    *("timecode", "time", "timestamp", "elapsed", "t", "pts"),
+    *("ts", "clock", "datetime", "date", "epoch", "unix", "utc"),
+)
 """Names of times, in the order in which one of several is taken."""
 BESIDE_TIMES = ("frame", "stamp", "code", "in", "relative", "media", "video")
+MIN_FPS = 1.0
+"""Least rows a second of a performance."""
+MAX_FPS = 1000.0
+"""Most rows a second of a performance."""
+MIN_ASCENDING = 0.9
+"""Fraction of the steps of a column of times that do not descend."""
+MIN_DISTINCT = 0.5
+"""Fraction of the values of a column of times that differ from all before."""
+MAX_DIFFERENCE = 0.05
+"""Relative difference of two columns' durations, above which they disagree."""
 MIN_ROWS_PER_S = 1.5
 MAX_ROWS_PER_S = 250.0
 """Of recordings of faces; of seconds and their thousandths, only one gives such a rate."""
@@ -40,30 +58,143 @@ GRID_TOLERANCE = 0.1  # Of a row's distance, within which all rows come evenly
 LONG_STEP = 1.5  # Times the median, above which rows are missing between two
 
 
-def time_column(names: Iterable[str]) -> tuple[int, float | None] | None:
-    """Place and unit (seconds; None: not said) of the column that says when rows are; None where
-    there is none. One that says its unit is taken first."""
+@dataclass(frozen=True)
+class _Column:
+    """A column that is called a time.
+
+    unit       seconds; None: not said
+    is_plain   whether its name says nothing else, as device_time does
+    rank       of its word in `TIME_WORDS`
+    """
+
+    name: str
+    unit: float | None
+    is_plain: bool
+    rank: int
+
+
+def find_times(
+    where: str, columns: Mapping[str, Sequence[object]], fps: float | None = None
+) -> tuple[np.ndarray | None, list[str]]:
+    """(T,) seconds of rows, None where nothing says them; and a sentence each for what was guessed,
+    and for columns of times that are not used.
+
+    columns  name -> texts or numbers (T,) of what is no shape. Used is the first that ascends at a
+             plausible rate; names with a unit and without other words go first
+    fps      rate at which whole numbers count frames; None: `DEFAULT_FPS`
+    Raises StgaError, beginning with `where`, where none is used and a plain one cannot be read.
+    """
+    used = None
+    notes = []
+    left_out = []
+    error = None
+    for column in _time_columns(columns):
+        try:
+            times, guess = _seconds(where, column, columns[column.name], fps)
+        except StgaError as unreadable:
+            error = error or (unreadable if column.is_plain else None)
+            left_out.append(f"{column.name} is not readable")
+            continue
+        problem = _implausible(times)
+        if problem:
+            left_out.append(f"{column.name} {problem}")
+        elif used is None:
+            used = times
+            name = column.name
+            notes += [guess] if guess else []
+        elif abs(np.ptp(times) / np.ptp(used) - 1) > MAX_DIFFERENCE:
+            seconds = f"{np.ptp(times):.4g} s, not {np.ptp(used):.4g}"
+            notes.append(f"column {column.name} lasts {seconds}; it is not used, {name} is")
+    if used is not None:
+        return used, notes
+    if error is not None:
+        raise error
+    if not left_out and fps is None:
+        left_out = [f"{name} ascends, but is not called a time" for name in _ascending(columns)]
+    return None, [f"column {'; column '.join(left_out)}"] if left_out else []
+
+
+def _time_columns(columns: Mapping[str, Sequence[object]]) -> list[_Column]:
+    """Those that are called a time and are not empty, the likeliest first."""
     found = []
-    for place, name in enumerate(names):
+    for name, cells in columns.items():
         words = _words(name)
         unit = next((UNITS_S[word] for word in words if word in UNITS_S and word != "s"), None)
         if unit is None and len(words) > 1 and words[-1] == "s":
             unit = UNITS_S["s"]
         rank = next((rank for rank, word in enumerate(TIME_WORDS) if word in words), None)
         others = [w for w in words if w not in UNITS_S and w not in TIME_WORDS + BESIDE_TIMES]
-        if not others and (unit is not None or rank is not None):
-            found.append((unit is None, len(TIME_WORDS) if rank is None else rank, place, unit))
-    if not found:
-        return None
-    _, _, place, unit = min(found, key=lambda each: each[:3])
-    return place, unit
+        has_cells = any(cell not in (None, "") for cell in cells)
+        if has_cells and (unit is not None or rank is not None):
+            place = len(TIME_WORDS) if rank is None else rank
+            found.append(_Column(name, unit, not others, place))
+    return sorted(found, key=lambda each: (not each.is_plain, each.unit is None, each.rank))
+
+
+def _ascending(columns: Mapping[str, Sequence[object]]) -> list[str]:
+    """Names of columns of numbers that ascend."""
+    found = []
+    for name, cells in columns.items():
+        try:
+            values = numbers("", name, cells)
+        except StgaError:
+            continue
+        if len(values) > 1 and (np.diff(values) > 0).all():
+            found.append(name)
+    return found
 
 
 def _words(name: str) -> list[str]:
-    """Words of a heading such as timestampMs, time (ms) or blendShapes.timeCode."""
-    apart = re.sub(r"(?<=[a-z])(?=[A-Z])", " ", name.rsplit(".", 1)[-1])
-    words = re.findall(r"[^\W\d_]+", apart.lower())
+    """Words of a heading such as timestampMs, unixtime, time (ms) or blendShapes.timeCode."""
+    text = normalize("NFKC", re.split(r"\.(?=\w)", name)[-1])
+    apart = re.sub(r"(?<=[a-z])(?=[A-Z])", " ", text).lower()
+    apart = re.sub(r"(timestamp|timecode|datetime|time)", r" \1 ", apart)
+    words = re.findall(r"[^\W\d_]+", apart)
     return re.sub(r"\btime code\b", "timecode", " ".join(words)).split()
+
+
+def _seconds(
+    where: str, column: _Column, cells: Sequence[object], fps: float | None
+) -> tuple[np.ndarray, str | None]:
+    """(T,) seconds of a column's timecodes or numbers, and what was guessed."""
+    if any(":" in str(cell) for cell in cells):
+        return seconds_of(where, [str(cell) for cell in cells]), None
+    values = numbers(where, column.name, cells)
+    return seconds_of_numbers(f"column {column.name}", values, column.unit, fps)
+
+
+def numbers(where: str, name: str, cells: Sequence[object]) -> np.ndarray:
+    """(T,) of a column. Raises StgaError naming the row for what is no number."""
+    found = np.empty(len(cells))
+    for row, cell in enumerate(cells):
+        try:
+            if isinstance(cell, bool) or not isinstance(cell, (str, int, float)):
+                raise ValueError
+            found[row] = float(cell)
+        except (ValueError, OverflowError):
+            raise StgaError(
+                f"{where}: row {row + 1}: {shorten(name)} is {shorten(cell)}, expected a number"
+            ) from None
+    return found
+
+
+def _implausible(times: np.ndarray) -> str:
+    """Why these are no times of rows, or ""."""
+    if not np.isfinite(times).all():
+        return "is not finite"
+    if len(times) < 2:
+        return ""
+    distinct = np.unique(times)
+    if len(distinct) <= MIN_DISTINCT * len(times):
+        return "repeats its values"
+    rate = 1 / float(np.median(np.diff(distinct)))
+    if not MIN_FPS <= rate <= MAX_FPS:
+        return f"has {rate:.3g} rows a second"
+    steps = np.diff(distinct)
+    is_even = steps.max() < LONG_STEP * steps.min()  # rows in another order
+    if np.mean(np.diff(times) >= 0) < MIN_ASCENDING and not is_even:
+        return "does not ascend"
+    return ""
 
 
 def seconds_of_numbers(
@@ -89,31 +220,63 @@ def seconds_of_numbers(
 def seconds_of(where: str, texts: list[str]) -> np.ndarray:
     """(T,) seconds from the first of timecodes `HH:MM:SS:FF.sub`, over midnight too; the rate of FF
     is found from the numbers. A fraction behind a point is of the second where it has three digits
-    or more, or where that of all rows agrees with FF. Raises StgaError, beginning with `where`, for
-    other text."""
+    or more, or where that of all rows agrees with FF; so are thousandths behind a colon. Raises
+    StgaError, beginning with `where`, for other text."""
     fields = []
-    decimals = []
+    digits = []
+    marks = set()
     for row, text in enumerate(texts):
         found = TIMECODE.fullmatch(text.strip())
         if found is None:
             raise StgaError(
                 f"{where}: row {row + 1}: Timecode is {shorten(text)}, expected HH:MM:SS:FF.sub"
             )
-        hours, minutes, whole, separator, frame, part = found.groups()
-        clock = int(hours), int(minutes), int(whole)
-        fields.append((*clock, int(frame or 0), float(f"0.{part or 0}"), separator == ";"))
-        decimals.append(frame or "0" if part is None and separator in (".", ",", None) else None)
-    hours, minutes, whole, frames, parts, dropping = np.array(fields, np.float64).T
+        hours, minutes, whole, mark, frame, part = found.groups()
+        clock = int(hours or 0), int(minutes), int(whole)
+        fields.append((*clock, int(frame or 0), float(f"0.{part or 0}")))
+        marks.add(mark)
+        if part is None:
+            digits.append(frame or "0")
+    hours, minutes, whole, frames, parts = np.array(fields, np.float64).T
     second = 3600 * hours + 60 * minutes + whole
-    digits = [text for text in decimals if text is not None]
-    if len(digits) == len(decimals) and max(map(len, digits)) >= 3:
-        elapsed = second + np.array([float(f"0.{text}") for text in digits])
-    elif _are_of_clock(frames, parts):
-        elapsed = second + parts
+    fraction = None
+    if len(digits) == len(fields):
+        fraction = _fractions(second, digits, marks <= {".", ",", None})
+    if fraction is None and _are_of_clock(frames, parts):
+        fraction = parts
+    day = DAY_S
+    if fraction is not None:
+        elapsed = second + fraction
     else:
-        elapsed = _seconds_of_frames(second, frames, parts, bool(dropping.any()))
+        day = DROP_DAY_S if ";" in marks else DAY_S
+        elapsed = _seconds_of_frames(second, frames, parts, ";" in marks)
     days = np.concatenate([[0], np.cumsum(np.diff(elapsed) < -DAY_S / 2)])
-    return elapsed + DAY_S * days - elapsed[0]
+    return elapsed + day * days - elapsed[0]
+
+
+def _fractions(second: np.ndarray, digits: list[str], is_decimal: bool) -> np.ndarray | None:
+    """(T,) parts of a second that the digits behind it are; None where they count frames.
+
+    is_decimal: whether they stand behind a point or a comma. Thousandths without leading zeros, 33
+    for 033, are known by times that else descend.
+    """
+    longest = max(map(len, digits))
+    if longest < 3:
+        return None
+    values = np.array([int(text) for text in digits], np.float64)
+    steps = np.diff(values)[np.diff(second) == 0]
+    step = float(np.median(steps)) if len(steps) else 0.0
+    is_short = step <= MAX_FRAME_STEP or len(np.unique(second)) > 2
+    if not is_decimal and values.max() < BASES[-1] and is_short:
+        return None
+    fraction = np.array([float(f"0.{text}") for text in digits])
+    if longest > 3 or _descents(second + fraction) <= _descents(second + values / 1000):
+        return fraction
+    return values / 1000
+
+
+def _descents(times: np.ndarray) -> int:
+    return int((np.diff(times) < 0).sum())
 
 
 def _are_of_clock(frames: np.ndarray, parts: np.ndarray) -> bool:
@@ -131,7 +294,9 @@ def _seconds_of_frames(
     second: np.ndarray, frames: np.ndarray, parts: np.ndarray, is_dropping: bool
 ) -> np.ndarray:
     """Seconds of frame numbers, at the frame rate for which the rows come most evenly."""
-    possible = [base for base in BASES if base > (frames + parts).max()] or [int(frames.max()) + 1]
+    possible = [base for base in BASES if base > (frames + parts).max()] or [
+        10 ** len(str(int(frames.max())))
+    ]
     base = USUAL_BASE if USUAL_BASE in possible else possible[0]
     if len(np.unique(second)) > 1:
         base = min(possible, key=lambda base: _unevenness(second + (frames + parts) / base))

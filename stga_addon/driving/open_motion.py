@@ -4,6 +4,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from os.path import exists
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -16,7 +17,8 @@ from ..files import is_file
 from ..flame.forward import FlameFrame
 from ..flame.parts import flame_model
 from ..flame.sequence import FlameSequence, strengthened, transferred_motion
-from ..options import option
+from ..options import When, option
+from .clocks import MAX_FPS, MIN_FPS
 from .head_map import head_map, person_of
 from .performance import (
     ARKIT_SHAPES,
@@ -30,7 +32,7 @@ from .performance import (
     resampled,
     smoothed,
 )
-from .performance_files import MAX_FPS, MAX_ROWS, MIN_FPS
+from .performance_files import MAX_ROWS
 from .performers import READ_SUFFIXES, is_performance, performer_of, read_performance
 
 PART_FIELDS = {"face": "expr", "jaw": "jaw_pose", "eyes": "eyes_pose"}
@@ -173,6 +175,18 @@ def parsed_gain(text: str) -> tuple[str, float]:
     return name, value
 
 
+def _moves_shapes(value: Any) -> bool:
+    """Whether a command's motion is of ARKit's shapes on its way to the head."""
+    motion = getattr(value, "motion", None)
+    if motion is not None:
+        return is_performance(motion)
+    return getattr(value, "avatar", None) is None or value.output.suffix.lower() != ".npz"
+
+
+ON_AVATAR = When(lambda value: hasattr(value, "motion"), "here, where there is no avatar")
+SHAPES = When(_moves_shapes, "on FLAME parameters, only on a face performance")
+
+
 @dataclass(frozen=True)
 class MotionOptions:
     """What is done to a motion on its way to a head; smoothing (seconds), mirror, gains and
@@ -199,8 +213,9 @@ class MotionOptions:
         MAX_SMOOTHING_S,
         flag="--smooth",
         metavar="SECONDS",
+        needs=(SHAPES,),
     )
-    mirror: bool = option("exchange left and right of a face performance", False)
+    mirror: bool = option("exchange left and right of a face performance", False, needs=(SHAPES,))
     gains: Mapping[str, float] = option(
         "scale a part of a performance (face, jaw, eyes, head) or one shape, such as jawOpen; may "
         "be repeated",
@@ -208,6 +223,7 @@ class MotionOptions:
         flag="--gain",
         metavar="NAME=FACTOR",
         parse=parsed_gain,
+        needs=(SHAPES,),
     )
     stay_trained: float | None = option(
         "lead the motion softly back to the range that the run was trained on, and print how far "
@@ -217,11 +233,13 @@ class MotionOptions:
         1,
         metavar="SHARE",
         bare=1.0,
+        needs=(ON_AVATAR,),
     )
     exchange: tuple[str, ...] = option(
         "exchange left and right of one pair alone, which some senders exchange; may be repeated",
         (),
         choices=EXCHANGEABLE,
+        needs=(SHAPES,),
     )
 
 

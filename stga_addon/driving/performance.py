@@ -3,6 +3,7 @@
 import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
+from difflib import get_close_matches
 
 import numpy as np
 
@@ -27,6 +28,7 @@ COLUMN = {name: column for column, name in enumerate(ARKIT_SHAPES)}
 OPTIONAL = ("tongueOut",)  # Shapes that sources of 51 lack; they stay zero
 PARTS = ("face", "jaw", "eyes")
 MAX_NAMED = 8  # Names that an error lists
+MIN_LIKENESS = 0.8  # Of a mistyped name and the shape that it stands for (`difflib`)
 _KEYS = {name.lower(): name for name in ARKIT_SHAPES}
 _LIKE_A_SHAPE = re.compile("(eye|jaw|mouth|brow|cheek|nose|tongue)(?!yaw|pitch|roll)")
 
@@ -53,26 +55,36 @@ def mirrored_name(name: str) -> str:
     return re.sub("(Left|Right)$", lambda side: "Left" if side[0] == "Right" else "Right", name)
 
 
-def columns_of(where: str, names: Iterable[str]) -> dict[int, int]:
-    """Column of the 52 -> first index in `names`. Raises StgaError, beginning with `where`, with
-    the shapes that are missing, but for those of `OPTIONAL`."""
+def columns_of(where: str, names: Iterable[str]) -> tuple[dict[int, int], list[str]]:
+    """Column of the 52 -> first index in `names`; and a sentence where shapes are missing, but for
+    those of `OPTIONAL`. Raises StgaError, beginning with `where`, without any shape, and where a
+    name stands for a missing one that is mistyped."""
     listed = list(names)
     spelled = [arkit_name(name) for name in listed]
     found = {COLUMN[name]: spelled.index(name) for name in spelled if name is not None}
     missing = [name for name in ARKIT_SHAPES if COLUMN[name] not in found and name not in OPTIONAL]
-    if len(missing) > COUNT // 2:
-        raise StgaError(
-            f"{where}: names {len(found)} of ARKit's {COUNT} blend shapes, expected all but "
-            "tongueOut"
-        )
-    if missing:
-        more = f" and {len(missing) - MAX_NAMED} more" if len(missing) > MAX_NAMED else ""
-        # What stands there instead: mistyped names, most likely.
-        unknown = [name for name, known in zip(listed, spelled, strict=True) if known is None]
-        strange = [shorten(n) for n in unknown if _LIKE_A_SHAPE.match(n.rsplit(".", 1)[-1].lower())]
-        instead = f"; it has {', '.join(strange[:MAX_NAMED])}" if strange else ""
-        raise StgaError(f"{where}: lacks {', '.join(missing[:MAX_NAMED])}{more}{instead}")
-    return found
+    if not found:
+        raise StgaError(f"{where}: names none of ARKit's {COUNT} blend shapes, such as jawOpen")
+    if not missing:
+        return found, []
+    unknown = [name for name, known in zip(listed, spelled, strict=True) if known is None]
+    strange = [name for name in unknown if _LIKE_A_SHAPE.match(_last(name).lower())]
+    lowered = [name.lower() for name in missing]
+    mistyped = [
+        shorten(name)
+        for name in strange
+        if get_close_matches(_last(name).lower(), lowered, 1, MIN_LIKENESS)
+    ]
+    more = f" and {len(missing) - MAX_NAMED} more" if len(missing) > MAX_NAMED else ""
+    lacks = f"lacks {', '.join(missing[:MAX_NAMED])}{more}"
+    if mistyped:
+        raise StgaError(f"{where}: {lacks}; it has {', '.join(mistyped[:MAX_NAMED])}")
+    strange = [f"{shorten(name)} is none of ARKit's" for name in strange[:MAX_NAMED]]
+    return found, ["; ".join([f"{lacks}, which stay 0", *strange])]
+
+
+def _last(name: str) -> str:
+    return name.rsplit(".", 1)[-1]
 
 
 MIRROR = np.array([COLUMN[mirrored_name(name)] for name in ARKIT_SHAPES])

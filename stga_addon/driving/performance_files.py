@@ -2,6 +2,7 @@
 
 import math
 import re
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -10,7 +11,8 @@ import numpy as np
 
 from ..errors import StgaError, shorten
 from ..files import read_json, read_table, read_text
-from .clocks import DEFAULT_FPS, evened, seconds_of, seconds_of_numbers, time_column
+from .clocks import DEFAULT_FPS, MAX_FPS, MIN_FPS, evened, find_times, numbers
+from .head_rotations import find_head, in_radians
 from .performance import COLUMN, COUNT, MAX_WEIGHT, FacePacket, Performance, arkit_name, columns_of
 
 REQUEST = b"iFacialMocap_sahuasouryya9218sauhuiayeta91555dy3719"
@@ -51,14 +53,11 @@ def parse_packet(data: bytes) -> FacePacket | None:
 
 MAX_TEXT_BYTES = 256 << 20
 MAX_ROWS = 1 << 20
-MIN_FPS = 1.0
-MAX_FPS = 1000.0
-HEAD_COLUMNS = ("headyaw", "headpitch", "headroll")
 COUNT_COLUMN = "blendshapecount"
-HALF_TURN = math.pi + 0.01
-WHOLE_TURN = 2 * math.pi + 0.01
-WHOLE_TURN_DEG = 360.0
-"""Of a head's angles: above the second, they are degrees."""
+MAX_OTHERS = 256
+"""Columns of JSON frames, besides shapes, that are looked at."""
+MAX_DEPTH = 4
+"""Levels of dictionaries in a JSON frame that are looked at."""
 MAX_PERCENT = 110.0  # Of weights, of which some are a little above the whole
 FRAME_KEYS = ("frames", "weightMat", "weights")
 RATE_KEYS = ("exportFps", "fps", "FPS", "frameRate", "frame_rate", "framerate", "FrameRate")
@@ -74,7 +73,7 @@ def csv_performance(path: Path) -> Performance:
     if not rows:
         raise StgaError(f"{path}: is empty, expected a row of column names")
     header = [cell.strip() for cell in rows[0]]
-    columns = columns_of(str(path), header)
+    columns, guesses = columns_of(str(path), header)
     plain = {_plain(name): index for index, name in reversed([*enumerate(header)])}
     count = plain.get(COUNT_COLUMN)  # 0 in rows without a face, or they end after it
     body = [
@@ -84,36 +83,15 @@ def csv_performance(path: Path) -> Performance:
     ]
     if not body:
         raise StgaError(f"{path}: has no row with a face")
-
-    def values(index: int) -> np.ndarray:
-        """(T,) of a column."""
-        found = np.empty(len(body))
-        for number, row in enumerate(body):
-            try:
-                found[number] = float(row[index])
-            except ValueError:
-                raise StgaError(
-                    f"{path}: row {number + 1}: {shorten(header[index])} is "
-                    f"{shorten(row[index])}, expected a number"
-                ) from None
-        return found
-
+    cells = [*zip(*body, strict=False)]
     weights = np.zeros((len(body), COUNT))
     for column, index in columns.items():
-        weights[:, column] = values(index)
-    head = np.zeros(3)
-    if all(name in plain for name in HEAD_COLUMNS):
-        head = np.stack([values(plain[name]) for name in HEAD_COLUMNS], axis=1)
-    times = None
-    guess = None
-    if clock := time_column(header):
-        place, unit = clock
-        codes = [row[place] for row in body]
-        if any(":" in code for code in codes):
-            times = seconds_of(str(path), codes)
-        else:
-            times, guess = seconds_of_numbers(f"column {header[place]}", values(place), unit)
-    return _performance(path, times, weights, head, guess=guess)
+        weights[:, column] = numbers(str(path), header[index], cells[index])
+    others: dict[str, Sequence[object]] = {}
+    for index, name in enumerate(header):
+        if index not in columns.values() and index != count:
+            others.setdefault(name, cells[index])
+    return _performance(path, weights, others, guesses)
 
 
 def _plain(name: str) -> str:
@@ -131,11 +109,11 @@ def packet_performance(path: Path) -> Performance:
             f"{path}: has no line of iFacialMocap, such as "
             "jawOpen-12|mouthSmile_L-5|=head#0,0,0,0,0,0|"
         )
-    columns_of(str(path), known[0].names)
+    _, guesses = columns_of(str(path), known[0].names)
     weights = np.stack([packet.weights for packet in known if packet.weights is not None])
     heads = [packet.head for packet in known if packet.head is not None]
-    head = np.array(heads) if len(heads) == len(known) else np.zeros(3)
-    return _performance(path, None, weights, head)
+    head = np.array(heads) if len(heads) == len(known) else None
+    return _performance(path, weights, {}, guesses, head=head)
 
 
 def json_performance(path: Path) -> Performance:
@@ -146,51 +124,41 @@ def json_performance(path: Path) -> Performance:
     if not isinstance(frames, list) or not frames:
         raise StgaError(f"{path}: has no list of frames; expected one of {', '.join(FRAME_KEYS)}")
     names = next((outer[key] for key in NAME_KEYS if isinstance(outer.get(key), list)), None)
-    rows = [_json_weights(path, number, frame, names) for number, frame in enumerate(frames)]
-    listed = list(rows[0])
-    columns = columns_of(str(path), listed)
-    weights = np.zeros((len(rows), COUNT))
-    for column, index in columns.items():
-        name = listed[index]
-        for number, row in enumerate(rows):
-            if name not in row:
-                raise StgaError(f"{path}: frame {number + 1}: lacks {shorten(name)}")
-            weights[number, column] = row[name]
+    rows: list[dict[str, Any]] = []
+    others: dict[str, list[object]] = {}
+    for number, frame in enumerate(frames):
+        where = f"{path}: frame {number + 1}"
+        found = _json_weights(where, frame, names)
+        shapes = {name: value for name, value in found.items() if arkit_name(name)}
+        for name, value in shapes.items():
+            _number(f"{where}: {shorten(name)}", value)
+        if not shapes and isinstance(frame, dict):
+            continue
+        rest = {name: value for name, value in found.items() if name not in shapes}
+        if isinstance(frame, dict):
+            rest |= _flat({key: value for key, value in frame.items() if value is not found})
+        for name, value in rest.items():
+            if name in others or len(others) < MAX_OTHERS:
+                others.setdefault(name, [None] * len(frames))[len(rows)] = value
+        rows.append(found)
     inner = outer.get("metadata")
     about = {**(inner if isinstance(inner, dict) else {}), **outer}
     key = next((key for key in RATE_KEYS if key in about), "")
     fps = _number(f"{path}: {key}", about[key]) if key else None
-    times, guess = _json_times(path, frames, fps)
-    turns = {_plain(name): name for name in rows[0]}
-    head = np.zeros(3)
-    if all(turns.get(name) in row for row in rows for name in HEAD_COLUMNS):
-        head = np.array([[row[turns[name]] for name in HEAD_COLUMNS] for row in rows])
-    return _performance(path, times, weights, head, fps, guess)
+    listed = list(dict.fromkeys(name for row in rows for name in row))
+    columns, guesses = columns_of(str(path), listed)
+    if len(rows) < len(frames):
+        guesses.append(f"{len(frames) - len(rows)} frames without shapes are left out")
+    weights = np.zeros((len(rows), COUNT))
+    for column, index in columns.items():
+        weights[:, column] = [row.get(listed[index], 0.0) for row in rows]
+    kept = {name: values[: len(rows)] for name, values in others.items()}
+    return _performance(path, weights, kept, guesses, fps)
 
 
-def _json_times(
-    path: Path, frames: list[Any], fps: float | None
-) -> tuple[np.ndarray | None, str | None]:
-    """Times of the frames that all say theirs, by the names and units of columns of a table."""
-    if not all(isinstance(frame, dict) for frame in frames):
-        return None, None
-    keys = list(frames[0])
-    clock = time_column(map(str, keys))
-    if clock is None:
-        return None, None
-    key = keys[clock[0]]
-    unit = clock[1]
-    told = [frame.get(key) for frame in frames]
-    if all(isinstance(value, str) and ":" in value for value in told):
-        return seconds_of(str(path), [str(value) for value in told]), None
-    if not all(_is_number(value) for value in told):
-        return None, None
-    return seconds_of_numbers(str(key), np.array(told, np.float64), unit, fps)
-
-
-def _json_weights(path: Path, number: int, frame: Any, names: list[Any] | None) -> dict[str, float]:
-    """Name -> weight of one frame in any of the forms that are read."""
-    where = f"{path}: frame {number + 1}"
+def _json_weights(where: str, frame: Any, names: list[Any] | None) -> dict[str, Any]:
+    """Name -> weight of one frame in any of the forms that are read; the dictionary that is in the
+    frame itself, where it is."""
     found = _first(frame, WEIGHT_KEYS, frame) if isinstance(frame, dict) else frame
     if isinstance(found, list) and found and all(isinstance(entry, dict) for entry in found):
         found = {str(_first(entry, NAMED, None)): _first(entry, SCORED, 0) for entry in found}
@@ -201,11 +169,23 @@ def _json_weights(path: Path, number: int, frame: Any, names: list[Any] | None) 
         found = {str(name): value for name, value in zip(names, found, strict=True)}
     if not isinstance(found, dict):
         raise StgaError(f"{where}: is {shorten(frame)}, expected named weights")
-    return {
-        str(name): _number(f"{where}: {shorten(str(name))}", value)
-        for name, value in found.items()
-        if arkit_name(str(name)) or _is_number(value)
-    }
+    return found
+
+
+def _flat(values: dict[str, Any], prefix: str = "", depth: int = 0) -> dict[str, object]:
+    """Dotted name -> text or number of nested dictionaries; of lists of three or four numbers those
+    with x, y, z, w, of others the word "list"."""
+    found = {}
+    for key, value in values.items():
+        name = f"{prefix}{key}"
+        if isinstance(value, list):
+            is_vector = len(value) in (3, 4) and all(map(_is_number, value))
+            value = dict(zip("xyzw", value, strict=False)) if is_vector else "list"
+        if not isinstance(value, dict):
+            found[name] = value
+        elif depth < MAX_DEPTH:
+            found |= _flat(value, f"{name}.", depth + 1)
+    return found
 
 
 def _first(entry: dict[str, Any], keys: tuple[str, ...], default: Any) -> Any:
@@ -225,15 +205,19 @@ def _is_number(value: Any) -> bool:
 
 def _performance(
     path: Path,
-    times: np.ndarray | None,
     weights: np.ndarray,
-    head: np.ndarray,
+    others: Mapping[str, Sequence[object]],
+    guesses: list[str],
     fps: float | None = None,
-    guess: str | None = None,
+    head: np.ndarray | None = None,
 ) -> Performance:
     """The checked performance in the order of its times; of rows with the same time the first.
-    guess: what was guessed of the times."""
-    guesses = [] if guess is None else [guess]
+
+    others   columns (T,) of what is no shape, in which times and the head's rotation are looked for
+    guesses  what was guessed of the shapes
+    head     yaw, pitch and roll (T, 3) in radians; None: columns hold them, or nothing does
+    """
+    where = str(path)
     if len(weights) > MAX_ROWS:
         raise StgaError(f"{path}: has {len(weights)} rows, expected at most {MAX_ROWS}")
     if MAX_WEIGHT < np.abs(weights).max() <= MAX_PERCENT:
@@ -242,29 +226,31 @@ def _performance(
     if not (np.abs(weights) <= MAX_WEIGHT).all():
         problem = f"holds weights beyond {MAX_WEIGHT:g}, or not finite; expected 0 to 1"
         raise StgaError(f"{path}: {problem}")
-    turn = float(np.abs(head).max())
-    if not turn <= WHOLE_TURN_DEG:
-        problem = "head rotation is beyond a turn, or not finite; expected radians"
-        raise StgaError(f"{path}: {problem}")
-    if turn > HALF_TURN:
-        unit = "degrees" if turn > WHOLE_TURN else "radians"
-        guesses.append(f"the head's angles reach {turn:.4g}; they are read as {unit}")
-        head = np.radians(head) if turn > WHOLE_TURN else head
+    if head is None:
+        head, notes = find_head(where, others)
+        guesses += notes
+        if head is not None:
+            head, notes = in_radians(where, head)
+            guesses += notes
+    times, notes = find_times(where, others, fps)
     if times is None:
         if fps is None:
-            guesses.append(f"says no times; its rows are taken as {DEFAULT_FPS:g} a second")
+            without = f" ({'; '.join(notes)})" if notes else ""
+            taken = f"its rows are taken as {DEFAULT_FPS:g} a second"
+            notes = [f"says no times{without}; {taken}"]
         rate = DEFAULT_FPS if fps is None else fps
         rate = rate if MIN_FPS <= rate <= MAX_FPS else np.nan
         times = np.arange(len(weights)) / rate
     if not np.isfinite(times).all():
         expected = f"expected {MIN_FPS:g} to {MAX_FPS:g} a second"
         raise StgaError(f"{path}: its times or its rate are not usable; {expected}")
+    guesses += notes
     times, first = np.unique(times - times.min(), return_index=True)
     times, rate = evened(times)
     rate = fps or rate
     if not MIN_FPS <= rate <= MAX_FPS or times[-1] * rate > MAX_ROWS:
         expected = f"expected {MIN_FPS:g} to {MAX_FPS:g}"
         raise StgaError(f"{path}: has {rate:.3g} rows a second over {times[-1]:.0f} s, {expected}")
-    head = np.broadcast_to(head, (len(weights), 3))[first]
+    head = np.zeros((len(first), 3)) if head is None else head[first]
     warnings = tuple(f"{path}: {text}" for text in guesses)
     return Performance(times, weights[first], head, rate, warnings)

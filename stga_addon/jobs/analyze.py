@@ -8,11 +8,12 @@ from time import monotonic
 
 from ..capture.open import open_capture
 from ..format import format_duration
-from ..options import like
+from ..options import When, like
 from ..progress import Progress, Report, Say
 from ..render.device import choose_device
 from ..selection import SelectionOptions, select_capture
 from ..training.effect_catalog import EffectDecision
+from ..training.run.folder import RUN
 from ..training.settings import PRESETS, TrainingSettings, make_settings
 from .train import Selected, Train
 
@@ -26,6 +27,17 @@ class _OfCapture:
     principal_point: str = like(Train, "principal_point")
 
 
+def holds_avatar(path: Path) -> bool:
+    """Whether a path is that of a run or an avatar file."""
+    return (path / RUN).exists() or path.suffix == ".npz"
+
+
+CAPTURED = When(
+    lambda value: value.capture is None or not holds_avatar(value.capture),
+    "on {capture}, which is no capture",
+)
+
+
 @dataclass(frozen=True)
 class Analyze(_OfCapture):
     """Show what a capture holds, and which effects training on it would use; or what a run or
@@ -34,8 +46,10 @@ class Analyze(_OfCapture):
     timed: whether presets are timed as well, which takes longer.
     """
 
-    effects: Mapping[str, str] | None = like(TrainingSettings, "effects")
-    device: str = like(Train, "device")
+    flame: Path | None = like(Train, "flame", needs=(CAPTURED,))
+    principal_point: str = like(Train, "principal_point", needs=(CAPTURED,))
+    effects: Mapping[str, str] | None = like(TrainingSettings, "effects", needs=(CAPTURED,))
+    device: str = like(Train, "device", needs=(CAPTURED,))
     timed: bool = False
 
 

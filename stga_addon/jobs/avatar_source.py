@@ -16,7 +16,7 @@ from ..errors import StgaError
 from ..export.ply import READ_FILES
 from ..files import read_json, read_npz, write_json, write_npz
 from ..flame.sequence import motion_of
-from ..options import option
+from ..options import Need, option
 from ..progress import Say, warn
 from ..schema import Arrays, from_json, setting, to_json
 from ..training.run.folder import AVATAR, open_refined, open_run, read_run, with_refined_tracking
@@ -54,17 +54,18 @@ motion          another person's motion, which poses it instead, with `motion_op
 """
 
 
-def motion_field() -> Any:
+def motion_field(*needs: Need) -> Any:
     return option(
         "another person's motion at every timestep of it: FLAME parameters (.npz, or a capture), "
         "or a performance in ARKit's shapes (CSV of Live Link Face or Audio2Face, its take folder, "
         "JSON, iFacialMocap's text)",
         None,
         metavar="FILE",
+        needs=needs,
     )
 
 
-def motion_options_field(*needs: str) -> Any:
+def motion_options_field(*needs: Need) -> Any:
     return option("motion", default_factory=MotionOptions, needs=needs)
 
 

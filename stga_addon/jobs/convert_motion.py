@@ -3,6 +3,7 @@
 import shutil
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -27,7 +28,7 @@ from ..flame.model import EXPRESSION_NAMES, JOINTS
 from ..flame.parts import flame_model
 from ..flame.quaternions import from_axis_angle, from_matrices, to_axis_angle, to_matrices
 from ..flame.sequence import FRAME_FIELDS, FlameSequence, retimed
-from ..options import like, option
+from ..options import When, like, option
 from ..progress import Progress, Report, Say, Written
 from ..tracking.folder import (
     AVATAR_MISFIT,
@@ -52,6 +53,17 @@ CHECKED_TIMESTEPS = 8
 """Spread over the footage, which show whether the avatar is the performer's."""
 
 
+def _writes_parameters(value: Any) -> bool:
+    return value.output.suffix.lower() != SHAPES_SUFFIX
+
+
+def _asks_model(value: Any) -> bool:
+    """Whether a FLAME model is opened that no run names."""
+    if value.avatar is not None:
+        return _writes_parameters(value) and value.head is not None
+    return _writes_parameters(value) or performer_of(value.source) is None
+
+
 @dataclass(frozen=True)
 class ConvertMotion:
     """Convert a face performance (ARKit's 52 shapes) to a FLAME motion, or the other way."""
@@ -64,9 +76,17 @@ class ConvertMotion:
     output: Path = option(
         "ARKit's shapes (.csv) or FLAME parameters (.npz)", flag="--out", metavar="FILE"
     )
-    flame: Path | None = like(Train, "flame", help="FLAME model file (default: the bundled head)")
+    flame: Path | None = like(
+        Train,
+        "flame",
+        help="FLAME model file (default: the bundled head)",
+        needs=(When(_asks_model, "on {source} as {output}, for which no model is asked"),),
+    )
     head: Path | None = option(
-        "capture whose identity a performance moves (default: average)", None, metavar="CAPTURE"
+        "capture whose identity a performance moves (default: average)",
+        None,
+        metavar="CAPTURE",
+        needs=(When(_writes_parameters, "without FLAME parameters (.npz) as --out"),),
     )
     avatar: Path | None = option(
         "run of the performer's avatar, which tracks the footage; where that shows somebody else, "
@@ -82,11 +102,9 @@ class ConvertMotion:
         return self.output.suffix.lower() == SHAPES_SUFFIX
 
     def check(self) -> None:
-        """Raise StgaError for a file name of another format, and an option that needs an avatar."""
+        """Raise StgaError for a file name of another format."""
         if not self.writes_shapes and self.output.suffix.lower() != ".npz":
             raise StgaError(f"{self.output}: expected a name that ends in {SHAPES_SUFFIX} or .npz")
-        if self.options.stay_trained is not None:
-            raise StgaError("--stay-trained: has no effect here, where there is no avatar")
 
 
 def convert_motion(request: ConvertMotion, report: Report, say: Say) -> Written:

@@ -1,8 +1,9 @@
 """Export of an avatar: one frame, a range of frames, or splats with their FLAME motion."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -12,10 +13,12 @@ from ..capture.camera import Camera
 from ..capture.model import Capture
 from ..driving.head_map import page_controls
 from ..driving.open_motion import MotionOptions
+from ..driving.performers import is_performance
 from ..errors import StgaError
 from ..export.formats import (
     FORMATS,
     Content,
+    Format,
     Meshes,
     check_free_space,
     check_suffix,
@@ -23,10 +26,11 @@ from ..export.formats import (
 )
 from ..export.playback import DEFAULT_FPS, MAX_VIEWS, Playback, playback_fps
 from ..export.rig import flame_notice
+from ..files import is_folder
 from ..flame.sequence import FlameSequence
 from ..format import format_bytes, format_name
 from ..light.relight import albedo_avatar
-from ..options import flag_of, like, option
+from ..options import When, like, option
 from ..progress import Report, Say, Written, counted
 from ..selection import SelectionOptions, select_capture
 from ..training.run.folder import AVATAR, SELECTION
@@ -36,6 +40,30 @@ from .train import Train
 RATED = " and ".join(name for name, format in FORMATS.items() if format.has_rate)
 RIGGED = " and ".join(name for name, format in FORMATS.items() if format.has_rig)
 """Names of formats, for help."""
+
+
+def _formats(test: Callable[[Format], bool]) -> When:
+    """The formats that pass a test."""
+    names = [name for name, format in FORMATS.items() if test(format)]
+    otherwise = f"with --format {{file_format}}, only with {', '.join(names)}"
+    return When(lambda value: value.file_format in names, otherwise)
+
+
+def _is_posed(value: Any) -> bool:
+    return FORMATS[value.file_format].source != "frame" or value.timestep is not None
+
+
+POSED = When(_is_posed, "with --format {file_format} without --timestep")
+OPENED = When(
+    lambda value: _is_posed(value) or value.source is None or is_folder(value.source),
+    "with --format {file_format} without --timestep",
+)
+RATE = When(
+    lambda value: (
+        FORMATS[value.file_format].has_rate or (value.motion and is_performance(value.motion))
+    ),
+    f"with --format {{file_format}}, only with {RATED}, or a face performance as --motion",
+)
 
 
 @dataclass(frozen=True)
@@ -52,30 +80,40 @@ class Export:
         flag="--format",
         choices={name: format.description for name, format in FORMATS.items()},
     )
-    capture: Path | None = option("whose frames to bake (default: the run's)", None)
+    capture: Path | None = option(
+        "whose frames to bake (default: the run's)", None, needs=(OPENED,)
+    )
     flame: Path | None = like(
-        Train, "flame", help="FLAME model file of that capture, or of the motion"
+        Train, "flame", help="FLAME model file of that capture, or of the motion", needs=(OPENED,)
     )
     played: avatar_source.Played | None = None
     timestep: int | None = option(
-        "of a format that holds one frame (default: the neutral mesh)", None, 0
+        "of a format that holds one frame (default: the neutral mesh)",
+        None,
+        0,
+        needs=(_formats(lambda format: format.source == "frame"),),
     )
     frames: tuple[int, int] | None = option(
-        "of a format that holds several (default: all)", None, metavar="FIRST:LAST"
+        "of a format that holds several (default: all)",
+        None,
+        metavar="FIRST:LAST",
+        needs=(_formats(lambda format: format.source == "range"),),
     )
     fps: float | None = option(
         f"frames per second of {RATED} (default: the scene's or the capture's, else "
         f"{DEFAULT_FPS:g})",
         None,
         above=0,
+        needs=(RATE,),
     )
     motion_only: bool = option(
         f"{RIGGED}: leave out the blend shapes and skeleton of the FLAME file; the "
         "meshes of the take stay in the page, and FLAME's licence decides who may receive it "
         "either way",
         False,
+        needs=(_formats(lambda format: format.has_rig),),
     )
-    motion: Path | None = avatar_source.motion_field()
+    motion: Path | None = avatar_source.motion_field(POSED)
     motion_options: MotionOptions = avatar_source.motion_options_field("motion")
     albedo: bool = option(
         "leave out the capture's light: colors are the albedo (docs/light.md)", False
@@ -85,22 +123,7 @@ class Export:
     )
 
     def check(self) -> None:
-        """Raise StgaError for another format's file name, and for what the format leaves out."""
-        held = {
-            "timestep": [name for name, format in FORMATS.items() if format.source == "frame"],
-            "frames": [name for name, format in FORMATS.items() if format.source == "range"],
-            "motion_only": [name for name, format in FORMATS.items() if format.has_rig],
-        }
-        chosen = f"--format {self.file_format}"
-        for name, formats in held.items():
-            if getattr(self, name) not in (None, False) and self.file_format not in formats:
-                flag = flag_of(type(self).__dataclass_fields__[name])
-                raise StgaError(
-                    f"{flag} cannot be combined with {chosen}, only with {', '.join(formats)}"
-                )
-        is_frame = self.file_format in held["timestep"]
-        if self.motion is not None and is_frame and self.timestep is None:
-            raise StgaError(f"--motion: has no effect with {chosen} without --timestep")
+        """Raise StgaError for another format's file name."""
         check_suffix(self.output, self.file_format)
 
 

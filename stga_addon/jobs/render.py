@@ -4,6 +4,7 @@ import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
+from typing import Any
 
 import numpy as np
 
@@ -13,6 +14,7 @@ from ..capture.distortion import distortion
 from ..capture.model import View
 from ..capture.transforms import DEFAULT_PRINCIPAL_POINT, read_transforms
 from ..driving.open_motion import MotionOptions
+from ..driving.performers import is_performance
 from ..errors import StgaError
 from ..export.playback import DEFAULT_FPS, playback_fps
 from ..export.splat_files import is_splats, read_splats
@@ -20,7 +22,7 @@ from ..files import replacing
 from ..flame.sequence import sequence_mesh
 from ..light.environment import read_lighting, turned
 from ..light.relight import Relighter
-from ..options import like, option
+from ..options import When, like, option
 from ..progress import Report, Say, Written, counted
 from ..raster.posed_splats import PosedSplats
 from ..render.device import Composer
@@ -31,6 +33,28 @@ from . import avatar_source
 from .train import Train
 
 MAX_TURNTABLE_IMAGES = 100_000
+
+
+def _is_head(value: Any) -> bool:
+    return value.source is None or not is_splats(value.source)
+
+
+HEAD = When(_is_head, "on {source}, which holds splats in the world, bound to no head")
+PLAYED = When(
+    lambda value: (
+        value.video
+        or value.turntable is not None
+        or (value.motion and is_performance(value.motion))
+    ),
+    "without --video, --turntable or a face performance as --motion",
+)
+MESHES = When(
+    lambda value: value.motion is None or value.cameras is None,
+    "with --motion and --cameras, which say what is rendered",
+)
+TIMESTEPS = When(
+    lambda value: value.turntable is None, "with --turntable, which plays all of the motion"
+)
 
 
 @dataclass(frozen=True)
@@ -66,7 +90,10 @@ class Render:
         needs=(("video", "turntable"),),
     )
     fps: float | None = option(
-        f"frames per second of the video (default: the capture's, else {DEFAULT_FPS:g})", None, 0
+        f"frames per second of the video (default: the capture's, else {DEFAULT_FPS:g})",
+        None,
+        0,
+        needs=(PLAYED,),
     )
     seconds: float = option(
         f"least duration of a turntable (default {TURNTABLE_S:g}); shorter motion is repeated to "
@@ -74,15 +101,24 @@ class Render:
         TURNTABLE_S,
         0,
         metavar="S",
+        needs=("turntable",),
     )
     frames: tuple[int, int] | None = option(
-        "timesteps to render (default: all), not of a turntable", None, 0, metavar="FIRST:LAST"
+        "timesteps to render (default: all), not of a turntable",
+        None,
+        0,
+        metavar="FIRST:LAST",
+        needs=(TIMESTEPS,),
     )
-    capture: Path | None = option("whose meshes drive the avatar (default: the run's)", None)
+    capture: Path | None = option(
+        "whose meshes drive the avatar, or cameras see the motion (default: the run's)",
+        None,
+        needs=(HEAD, MESHES),
+    )
     flame: Path | None = like(
-        Train, "flame", help="FLAME model file of that capture, or of the motion"
+        Train, "flame", help="FLAME model file of that capture, or of the motion", needs=(HEAD,)
     )
-    motion: Path | None = avatar_source.motion_field()
+    motion: Path | None = avatar_source.motion_field(HEAD)
     played: avatar_source.Played | None = None
     background: tuple[float, float, float] = option(
         "white (default), black or R,G,B in 0…1", (1.0, 1.0, 1.0), 0, 1
@@ -97,7 +133,10 @@ class Render:
     device: str = like(Train, "device")
     motion_options: MotionOptions = avatar_source.motion_options_field("motion")
     light: Path | None = option(
-        "environment (.hdr) or lights (.toml) that light the avatar", None, metavar="FILE"
+        "environment (.hdr) or lights (.toml) that light the avatar",
+        None,
+        metavar="FILE",
+        needs=(HEAD,),
     )
     light_turn: float = option(
         "turn that light around the head during the video",
@@ -108,7 +147,9 @@ class Render:
         needs=("light", ("video", "turntable")),
     )
     world: bool = option(
-        "put the run's world behind the avatar (train with --effect world=on)", False
+        "put the run's world behind the avatar (train with --effect world=on)",
+        False,
+        needs=(HEAD,),
     )
 
     @property
@@ -122,10 +163,6 @@ class Render:
             raise StgaError(f"{self.output}: a video's name ends in .mp4")
         if self.cameras is None and not self.is_film:
             raise StgaError("--out needs --cameras, which says what to render, or --turntable")
-        if self.frames is not None and self.turntable is not None:
-            raise StgaError(
-                "--frames: has no effect with --turntable, which plays all of the motion"
-            )
 
 
 def render(request: Render, report: Report, say: Say) -> Written:
@@ -257,13 +294,6 @@ def _subject(request: Render, composer: Composer, say: Say) -> _Subject:
     """An avatar with its capture or moved by another person's motion, or world-space splats."""
     source = request.source
     if is_splats(source):
-        for given, why in (
-            (request.motion, "splats are bound to no mesh that a motion could move"),
-            (request.light, "light is not known; --light needs an avatar"),
-            (request.world, "folder is not that of a run, which --world needs"),
-        ):
-            if given:
-                raise StgaError(f"{source}: holds splats in the world, whose {why}")
         from ..render.render import render_layers
 
         splats = read_splats(source, say)
@@ -276,6 +306,7 @@ def _subject(request: Render, composer: Composer, say: Say) -> _Subject:
         )
     if request.motion is not None:
         avatar = read_avatar(avatar_source.avatar_path(source))
+        capture = avatar_source.open_avatar(request)[1] if request.cameras is None else None
         motion = avatar_source.open_avatar_motion(request, avatar, say)
         sequence = motion.sequence
         fps = request.fps or motion.fps or DEFAULT_FPS
@@ -284,6 +315,7 @@ def _subject(request: Render, composer: Composer, say: Say) -> _Subject:
             tuple(sequence.timesteps),
             lambda: _middle(sequence_mesh(sequence, sequence.timesteps[0])),
             fps,
+            () if capture is None else capture.all_views,
         )
     avatar, capture = avatar_source.open_avatar(request)
     if capture is None:

@@ -15,11 +15,11 @@ from stga_addon.training.run.folder import read_run
 REFUSALS = """
 # Options that have no effect, or none there
 $ export {run} --format gltf --frames 0:1 --out {o}
---frames cannot be combined with --format gltf, only with ply-sequence, usd, web
+--frames: has no effect with --format gltf, only with ply-sequence, usd, web
 $ export {run} --format usd --timestep 1 --out {o}
---timestep cannot be combined with --format usd
+--timestep: has no effect with --format usd, only with ply, gltf
 $ export {run} --format ply --motion-only --out {o}
---motion-only cannot be combined with --format ply, only with web
+--motion-only: has no effect with --format ply, only with web
 $ export {run} --format usd --out {o}.usda
 o.usda: expected a name that ends in .usdc or .usdz
 $ export {avatar} --format web --out {o}.txt
@@ -67,17 +67,17 @@ $ train {root} --out {run} --resume --stop-when-flat
 $ train {root} --out {run} --resume --preset final
 --preset: this run began with
 $ refine {none} --region mouth --resume
---region: cannot be combined with --resume, which continues RUN as it began
+--region: has no effect with --resume
 $ refine {none} --frames 1-3 --resume
---frames: cannot be combined with --resume, which continues RUN as it began
+--frames: has no effect with --resume
 $ refine {none} --budget 1m --resume
---budget: cannot be combined with --resume, which continues RUN as it began
+--budget: has no effect with --resume
 $ refine {none} --out anna_2 --resume
---out: cannot be combined with --resume, which continues RUN as it began
+--out: has no effect with --resume
 $ extend {none} --seed 1 --resume
---seed: cannot be combined with --resume, which continues RUN as it began
+--seed: has no effect with --resume
 $ extend {none} smile --resume
-CAPTURE: cannot be combined with --resume, which continues RUN as it began
+CAPTURE: has no effect with --resume
 $ refine {run} --resume
 does not continue another run
 # Captures that are missing, broken, or others
@@ -102,7 +102,7 @@ give the FLAME model file
 $ render {avatar} --cameras {cameras} --motion {root} --flame {model} --out {o}
 was not tracked with FLAME
 $ render {folder}/mesh.ply --cameras {cameras} --motion {folder}/motion.npz --out {o}
-mesh.ply: holds splats in the world
+mesh.ply, which holds splats in the world
 $ benchmark {blind} --out {o}
 has no views to measure with
 $ benchmark {root} --out {o} --only fast

@@ -14,8 +14,17 @@ from packaging.utils import canonicalize_name, parse_wheel_filename
 from refusal import refusal
 
 from stga_addon.development.editions import BARE, SMALL, complete, edition_manifest
-from stga_addon.development.package import ROOT, build_zip, main, read_manifest, wheel_folder
+from stga_addon.development.package import (
+    ROOT,
+    build_zip,
+    main,
+    read_manifest,
+    target_of,
+    wheel_folder,
+)
 from stga_addon.development.wheels import (
+    PLATFORM_TAGS,
+    PYTHONS,
     TARGETS,
     Target,
     check_wheels,
@@ -93,7 +102,13 @@ def test_wheels_of_a_target(target, tmp_path):
         check_wheels([wheel for wheel in wheels if wheel != torch] + [old], target)
 
 
-@pytest.mark.parametrize("target", TARGETS, ids=lambda target: target.name)
+LOCKED = [
+    *TARGETS,
+    *(Target(name, python, ("9.0.0", "")) for name in PLATFORM_TAGS for python in PYTHONS[2:]),
+]
+
+
+@pytest.mark.parametrize("target", LOCKED, ids=lambda target: target.name)
 def test_the_lock_has_what_each_target_needs(target):
     """Catches a target that was forgotten when versions were changed, and two versions at once of
     what training asks for."""
@@ -110,6 +125,19 @@ def test_the_lock_has_what_each_target_needs(target):
             (version,) = versions[canonicalize_name(requirement.name)]
             assert requirement.specifier.contains(version)
     assert all(len(found) == 1 for found in versions.values())
+
+
+@pytest.mark.parametrize("python", ["3.12", "3.14"])
+def test_a_blender_with_another_python(tmp_path, python):
+    """Catches a Python without locked wheels that is refused for cffi, and one that has them."""
+    blender = tmp_path / "blender"
+    blender.write_text(f"#!/bin/sh\necho PYTHON {python.replace('.', ' ')} 5 4\n")
+    blender.chmod(0o755)
+    if python in PYTHONS:
+        assert target_of([str(blender)]).python == python
+        return
+    with refusal("has Python 3.12; wheels are locked for 3.11, 3.13, 3.14$"):
+        target_of([str(blender)])
 
 
 def test_wheels_are_known_by_their_hash(tmp_path, monkeypatch, lock):

@@ -75,7 +75,7 @@ def test_convert_there_and_back(files, tmp_path, capsys):
     assert_allclose(weights[-1, COLUMN["jawOpen"]], 0.9, atol=0.01)
     assert_allclose(weights[-1, COLUMN["jawRight"]], 0.5, atol=0.01)
     weak = f"--flame {flame} --strength 0.5 --out"
-    assert stga("drive", files["take.csv"], weak, tmp_path / "weak.csv") == 0
+    assert stga("drive", files["take.csv"], "--strength 0.5 --out", tmp_path / "weak.csv") == 0
     assert stga("drive", files["take.csv"], weak, tmp_path / "weak.npz") == 0
     assert stga("drive", tmp_path / "weak.npz", weak, tmp_path / "weaker.csv") == 0
     for output, share in (("weak.csv", 0.5), ("weaker.csv", 0.25)):

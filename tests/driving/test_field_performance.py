@@ -8,6 +8,7 @@ import pytest
 from command_line import stga
 from numpy.testing import assert_allclose
 from refusal import refusal
+from scipy.spatial.transform import Rotation
 
 from stga_addon.driving.open_motion import open_motion
 from stga_addon.driving.performance import ARKIT_SHAPES
@@ -60,6 +61,34 @@ CLOCKS = {
     "nanoseconds without a unit": ("t", lambda n: NANOSECONDS + n * 10**7, 100, "nanoseconds"),
     "frame numbers": ("Timecode", lambda n: n + 1, 60, "Timecode counts frames; they are taken as"),
     "every second frame": ("timecode", lambda n: 2 * n, 30, "counts frames"),
+    "seconds of a clock": ("unix_time", lambda n: 1.7e9 + n / 30, 30, None),
+    "of a device": ("device_time", lambda n: 12.5 + n / 24, 24, None),
+    "in one word": ("systemtimems", lambda n: n * 40, 25, None),
+    "a Greek letter": (
+        "time (\N{GREEK SMALL LETTER MU}s)",
+        lambda n: n * 1_000_000 // 30,
+        30,
+        None,
+    ),
+    "the micro sign": ("Time [\N{MICRO SIGN}s]", lambda n: n * 40_000, 25, None),
+    "beside durations": ("frame_time,host ts", lambda n: f".03,{n / 25}", 25, None),
+    "two clocks": ("time,unix_time", lambda n: f"{n / 25},{n / 30}", 25, "unix_time lasts 1.967 s"),
+    "durations alone": ("frame_time", lambda n: 0.03, 60, "frame_time repeats its values"),
+    "falling": ("delta ms", lambda n: 90 - n * n % 19, 60, "delta ms repeats"),
+    "another name": ("frame", lambda n: n, 60, "frame ascends, but is not called a time"),
+    "colon before thousandths": (
+        "Timecode",
+        lambda n: f"10:59:{n // 30:02d}:{n % 30 * 1000 // 30:03d}",
+        30,
+        None,
+    ),
+    "less than a second of them": ("Timecode", lambda n: f"10:59:59:{n * 16:03d}", 62.5, None),
+    "thousandths without zeros": (
+        "Timecode",
+        lambda n: f"10:59:{n // 30:02d}.{n % 30 * 1000 // 30}",
+        30,
+        None,
+    ),
     "none": (None, None, 60, "says no times; its rows are taken as 60 a second"),
     "clock": ("Timecode", lambda n: f"10:59:59.{n * 16:03d}", 62.5, None),
     "clock with a comma": ("time", lambda n: f'"10:59:59,{n * 16:03d}"', 62.5, None),
@@ -100,10 +129,12 @@ def test_a_row_lost_between_frame_numbers(tmp_path):
     assert_allclose(found.times, times - times[0], atol=1e-9)
 
 
-def test_drop_frame_numbers_over_ten_minutes(tmp_path):
-    """Catches numbers 0 and 1 taken as left out in every tenth minute too, which has them."""
-    codes = [f"00:09:59;{n:02d}" for n in range(20, 30)]
-    codes += [f"00:10:00;{n:02d}" for n in range(10)]
+@pytest.mark.parametrize(("before", "after"), [("00:09", "00:10"), ("23:59", "00:00")])
+def test_drop_frame_numbers_over_ten_minutes(tmp_path, before, after):
+    """Catches numbers 0 and 1 taken as left out in every tenth minute too, which has them, and a
+    day of 86,400 s."""
+    codes = [f"{before}:59;{n:02d}" for n in range(20, 30)]
+    codes += [f"{after}:00;{n:02d}" for n in range(10)]
     found = read_performance(write_csv(tmp_path / "take.csv", codes, np.zeros((20, 52))))
     assert_allclose(found.times, np.arange(20) * 1001 / 30000, atol=1e-9)
 
@@ -134,10 +165,66 @@ def test_degrees_and_percent(tmp_path):
         f"{path}: weights reach; they are read as percent",
         f"{path}: the head's angles reach; they are read as degrees",
     ]
-    path = write_rows(tmp_path / "b.csv", "time", lambda n: n / 30, head=(5.5, 0, 0))
+
+
+@pytest.mark.parametrize(
+    ("head", "unit", "sentence"),
+    [
+        ((5.5, 0, 0), 1, "reach 5.5; they are read as radians"),
+        ((2.5, 2, 1), np.pi / 180, "reach 2.5; they are read as degrees"),
+        ((0.1, 0.2, 3), 1, "reach 3; they are read as radians, though no neck turns so far"),
+    ],
+)
+def test_angles_that_no_neck_has(tmp_path, head, unit, sentence):
+    """Catches a neck that turns by 131° for small angles in degrees, and a phone upside down read
+    as degrees."""
+    path = write_rows(tmp_path / "b.csv", "time", lambda n: n / 30, head=head)
     found = read_performance(path)
-    assert found.head[0, 0] == 5.5
-    assert "they are read as radians" in found.warnings[0]
+    assert_allclose(found.head, np.tile(head, (COUNT, 1)) * unit)
+    assert sentence in found.warnings[0]
+
+
+ANGLES = (0.1, 0.2, 0.3)
+TURN = Rotation.from_euler("YXZ", ANGLES).as_quat().tolist()
+
+
+@pytest.mark.parametrize(
+    ("entry", "sentence"),
+    [
+        ({"headRotation": dict(zip(("yaw", "pitch", "roll"), ANGLES, strict=True))}, None),
+        ({"head": {"rotation": {"x": 0.2, "y": 0.1, "z": 0.3}}}, "read as pitch, yaw, roll"),
+        ({"head_rotation": [0.2, 0.1, 0.3]}, "angles about x, y, z"),
+        ({"headRotation": TURN}, "quaternion"),
+        ({"headYaw": 0.1, "headPitch": 0.2, "headRoll": 0.3}, None),
+        ({"headMatrix": [1.0] * 16, "leftEye": {"yaw": 1}}, "headMatrix: not read"),
+    ],
+)
+def test_head_rotations_in_json(tmp_path, entry, sentence):
+    """Catches rotations beside the weights that are dropped without a word, other axes, and an
+    eye's taken for the head's."""
+    frames = [{"blendShapes": {"jawOpen": 0.1}, **entry} for _ in range(COUNT)]
+    (tmp_path / "a.json").write_text(json.dumps({"fps": 30, "frames": frames}))
+    found = read_performance(tmp_path / "a.json")
+    is_read = "headMatrix" not in entry
+    assert_allclose(found.head, np.tile(ANGLES, (COUNT, 1)) * is_read, atol=1e-12)
+    assert [text for text in found.warnings if "lacks" not in text] == [
+        text for text in found.warnings if sentence and sentence in text
+    ]
+    assert len(found.warnings) == 1 + (sentence is not None)
+
+
+@pytest.mark.parametrize("suffix", [".csv", ".json"])
+def test_eight_shapes(tmp_path, suffix):
+    """Catches a table of some shapes that is refused, and shapes that stay still without a word."""
+    rows = [dict(zip(ARKIT_SHAPES[14:22], row, strict=True)) for row in WEIGHTS[:, :8].tolist()]
+    lines = [",".join(rows[0]), *(",".join(map(str, row.values())) for row in rows)]
+    text = "\n".join(lines) if suffix == ".csv" else json.dumps({"fps": 60, "frames": [*rows, {}]})
+    (tmp_path / "a").with_suffix(suffix).write_text(text)
+    found = read_performance((tmp_path / "a").with_suffix(suffix))
+    assert_allclose(found.weights[:, 14:22], WEIGHTS[:, :8])
+    assert found.weights.sum() == pytest.approx(WEIGHTS[:, :8].sum())
+    assert "lacks eyeBlinkLeft" in found.warnings[0]
+    assert "and 35 more, which stay 0" in found.warnings[0]
 
 
 @pytest.mark.parametrize(

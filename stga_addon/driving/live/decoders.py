@@ -164,7 +164,9 @@ def decode_vmc(data: bytes, before: Received) -> tuple[FacePacket | None, Receiv
         return None
     if not any(address.startswith("/VMC/") for address, _ in found):
         return None
-    known = before
+    weights = before.weights.copy()
+    names = set(before.names)
+    known = replace(before, weights=weights)
     packet = None
     for address, values in found:  # of malformed messages nothing is taken
         numbers = [float(value) for value in values if _is_number(value)]
@@ -172,20 +174,19 @@ def decode_vmc(data: bytes, before: Received) -> tuple[FacePacket | None, Receiv
             case "/VMC/Ext/Blend/Val", (str(text), _) if numbers and abs(numbers[0]) <= MAX_WEIGHT:
                 name = arkit_name(text)
                 if name is not None:
-                    weights = known.weights.copy()
                     weights[COLUMN[name]] = numbers[0]
-                    known = replace(known, weights=weights, names=known.names | {name})
+                    names.add(name)
             case "/VMC/Ext/T", (_,) if numbers:
                 known = replace(known, time=numbers[0])
             case "/VMC/Ext/Bone/Pos", (str(text), *rest) if text.lower() == "head":
                 if len(rest) == 7 and all(map(_is_number, rest[3:])):
                     known = replace(known, head=_head(numbers[-4:]) or known.head)
-            case "/VMC/Ext/Blend/Apply", _ if known.names:
+            case "/VMC/Ext/Blend/Apply", _ if names:
                 moves = known.has_clock and known.time != known.applied
                 known = replace(known, applied=known.time, has_clock=moves)
                 time = known.time if moves else None
-                packet = FacePacket(tuple(sorted(known.names)), known.weights, known.head, "", time)
-    return packet, known
+                packet = FacePacket(tuple(sorted(names)), weights.copy(), known.head, "", time)
+    return packet, replace(known, names=frozenset(names))
 
 
 def _is_number(value: Value) -> TypeGuard[int | float]:

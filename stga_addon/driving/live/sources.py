@@ -13,10 +13,10 @@ import numpy as np
 
 from ...errors import StgaError
 from .. import performance_files
-from ..clocks import DEFAULT_FPS
+from ..clocks import DEFAULT_FPS, MAX_FPS
 from ..open_motion import MotionOptions, corrected
 from ..performance import FacePacket, Performance
-from ..performance_files import MAX_FPS, MAX_ROWS
+from ..performance_files import MAX_ROWS
 from .decoders import Received, decode_live_link_face, decode_vmc
 
 Decoded = tuple[FacePacket | None, Any]
@@ -73,8 +73,12 @@ SOURCES = {
 
 
 LOOPBACK = "127.0.0.1"
-MAX_DATAGRAM_BYTES = 1 << 16
-MAX_DATAGRAMS = 256  # Read at once, more than a socket keeps; a flood does not hold Blender up
+MAX_DATAGRAM_BYTES = 1 << 14
+"""Of a frame of a source; more is foreign."""
+MAX_DATAGRAMS = 256
+"""Read at once, more than a socket keeps."""
+MAX_READ_BYTES = 1 << 15
+"""Read at once; the rest waits in the socket, so that decoding a flood does not hold Blender up."""
 REQUEST_INTERVAL_S = 1.0  # At which a phone that is silent is asked again
 
 
@@ -106,12 +110,16 @@ class Receiver:
         self.port = self._socket.getsockname()[1]
 
     def read(self) -> list[tuple[str, bytes]]:
-        """Sender's address and bytes of the datagrams that wait, up to MAX_DATAGRAMS."""
+        """Sender's address and bytes of the datagrams that wait, up to MAX_DATAGRAMS and
+        MAX_READ_BYTES; of those that are too long, a byte more than MAX_DATAGRAM_BYTES."""
         found: list[tuple[str, bytes]] = []
-        with suppress(OSError):  # nothing waits; or Windows: a request did not reach the phone
-            while len(found) < MAX_DATAGRAMS:
-                data, sender = self._socket.recvfrom(MAX_DATAGRAM_BYTES)
+        size = 0
+        # nothing waits; or Windows: a request did not reach the phone, a datagram is too long
+        with suppress(OSError):
+            while len(found) < MAX_DATAGRAMS and size < MAX_READ_BYTES:
+                data, sender = self._socket.recvfrom(MAX_DATAGRAM_BYTES + 1)
                 found.append((sender[0], data))
+                size += len(data) if len(data) <= MAX_DATAGRAM_BYTES else 0
         return found
 
     def ask(self, now: float) -> None:
@@ -148,6 +156,8 @@ RESTART_S = 1.0
 """A clock set back by more is a source that started anew; by less, a packet that came late."""
 PAUSE_S = 2.0  # Longer gaps are pauses of the source, not lost packets
 GAP = 1.5  # Packets farther apart than this many usual steps have lost some between them
+MIN_CLOCK_STEP_S = 1e-4
+"""Between packets by the source's clock; less is the same moment."""
 # Steps of the source's clock, and arrivals, that are remembered
 STEPS = 31
 ARRIVALS = 240
@@ -182,7 +192,9 @@ class Stream:
 
     def receive(self, address: str, data: bytes, now: float) -> FacePacket | None:
         """Take a datagram; its frame, if it is the followed sender's, in order, with a face."""
-        decoded = self.source.decode(data, self._known.get(address))
+        decoded = None
+        if len(data) <= MAX_DATAGRAM_BYTES:
+            decoded = self.source.decode(data, self._known.get(address))
         if decoded is None:
             self.foreign += 1
             return None
@@ -239,7 +251,7 @@ class Stream:
         if time is None:
             return True
         before = self._time
-        if before is not None and before - RESTART_S < time <= before:
+        if before is not None and -RESTART_S < time - before < MIN_CLOCK_STEP_S:
             self.late += 1
             return False
         if before is not None and time < before:

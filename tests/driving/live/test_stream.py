@@ -121,6 +121,51 @@ def test_on_loopback(monkeypatch):
     sender.close()
 
 
+@pytest.mark.parametrize("times", [(5e-324, 1e-300, 1), (1e-30, 2e-5, 1.5), (-1e29, 1e29, 1e29)])
+def test_absurd_times(times):
+    """Catches Drive Live that ends with an OverflowError, or has lost more packets than there
+    are."""
+    stream = Watched(SOURCES["vmc"])
+    for time in (0.0, *times):
+        clock = osc_text("/VMC/Ext/T") + osc_text(",d") + struct.pack(">d", time)
+        stream.receive("a", bundle(clock, blend("jawOpen", 0.5), APPLY), 0.0)
+    assert stream.shown == 0.5
+    assert stream.lost < 20_000
+    stream = Watched(LINK)
+    for frame, part, rate in ((0, 0.0, 60), (0, 1e-45, 2**31 - 1), (60, 0.0, 60)):
+        data = bytearray(jaw(frame, 0.5, rate=rate))
+        at = len(data) - 4 * 61 - 1 - 12
+        data[at : at + 4] = struct.pack(">f", part)
+        stream.receive("a", bytes(data), 0.0)
+    assert stream.lost < 20_000
+
+
+@pytest.mark.parametrize("source", ["vmc", "facial_mocap"])
+def test_a_flood_of_large_datagrams(source):
+    """Catches a timer that stands still while datagrams of 64 kB are decoded, those that fit too,
+    and a phone's next packet that waits behind them."""
+    receiver = Receiver(SOURCES[source], port=wire.free_port(), phone="127.0.0.1")
+    sender = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    one = bundle(*[blend("jawOpen", 0.5)] * 330, APPLY)
+    fitting = one if source == "vmc" else b"|".join([b"jawOpen-50"] * 1400)
+    for data in (fitting * 4, fitting):
+        stream = Watched(SOURCES[source])
+        for _ in range(8):
+            sender.sendto(data[:65_000], ("127.0.0.1", receiver.port))
+        read = []
+        while found := receiver.read():
+            read.append(found)
+            for address, received in found:
+                stream.receive(address, received, 0.0)
+        decoded = [sum(len(data) for _, data in f if len(data) <= 1 << 14) for f in read]
+        assert max(decoded) <= 3 << 14
+        assert sum(map(len, read)) >= 3
+        assert stream.shown == (0.0 if len(data) > 1 << 14 else 0.5)
+        assert (stream.foreign > 0) == (len(data) > 1 << 14)
+    receiver.close()
+    sender.close()
+
+
 def test_the_request_to_a_phone():
     """Catches iFacialMocap that is never asked, or is asked for ever faster."""
     phone = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)

@@ -1,0 +1,98 @@
+"""The head's rotation in a performance: columns by their names, radians or degrees."""
+
+import math
+import re
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from ..errors import StgaError
+from .clocks import numbers
+
+AXES = {"yaw": 0, "pitch": 1, "roll": 2, "y": 0, "x": 1, "z": 2, "w": 3}
+"""How an angle's name ends -> its place in (yaw, pitch, roll), or of the quaternion's real part."""
+_ROTATION = "(?:rotation|rot|quaternion|quat|eulerangles?|euler|angles?|orientation|pose)"
+_NAME = re.compile(f"(?:head|{_ROTATION})*(yaw|pitch|roll)|head{_ROTATION}+([xyzw])")
+_LIKE_A_ROTATION = re.compile(f"head$|head.*({_ROTATION}|matrix|transform|yaw|pitch|roll)")
+NECK_RAD = np.radians([100.0, 80.0, 80.0])
+"""Yaw, pitch and roll that no neck reaches."""
+MAX_OUTLIERS = 0.01
+"""Fraction of rows beyond `NECK_RAD` that tracking errors explain."""
+HALF_TURN_RAD = math.pi + 0.01
+WHOLE_TURN_RAD = 2 * math.pi + 0.01
+WHOLE_TURN_DEG = 360.0
+
+
+def find_head(
+    where: str, columns: Mapping[str, Sequence[object]]
+) -> tuple[np.ndarray | None, list[str]]:
+    """(T, 3) yaw, pitch and roll as the columns hold them, None without any; and a sentence each
+    for what was guessed, and for what is called a head's and is not used.
+
+    columns  name -> texts or numbers (T,) of what is no shape. Angles about x, y and z are pitch,
+             yaw and roll; with w they are a quaternion of a right-handed system with y up, z ahead
+    Raises StgaError, beginning with `where`, for texts that are no numbers.
+    """
+    axes: dict[str, str] = {}
+    others = []
+    for name, cells in columns.items():
+        parts = name.lower().split(".")
+        tails = [_plain("".join(parts[place:])) for place in range(len(parts))]
+        tails = [tail for place, tail in enumerate(tails) if not place or tail.startswith("head")]
+        found = next(filter(None, map(_NAME.fullmatch, tails)), None)
+        if found is not None and not any(cell in (None, "") for cell in cells):
+            axes.setdefault(found[1] or found[2], name)
+        elif any(map(_LIKE_A_ROTATION.match, tails)):
+            others.append(name)
+    named = [axis for axis in ("yaw", "pitch", "roll") if axis in axes]
+    about = [axis for axis in "xyzw" if axis in axes]
+    used = named or (about if {"x", "y", "z"} <= axes.keys() else [])
+    others += [name for axis, name in axes.items() if axis not in used]
+    notes = [f"{', '.join(others)}: not read, as yaw, pitch and roll of all rows"] if others else []
+    if not used:
+        return None, notes
+    values = np.zeros((len(columns[axes[used[0]]]), 4))
+    for name in used:
+        values[:, AXES[name]] = numbers(where, axes[name], columns[axes[name]])
+    if named:
+        return values[:, :3], notes
+    origin = axes["x"].rpartition(".")[0] or axes["x"]
+    if "w" not in axes:
+        notes.append(f"{origin}: angles about x, y, z are read as pitch, yaw, roll")
+        return values[:, :3], notes
+    notes.append(f"{origin}: is read as a quaternion x, y, z, w, with y up")
+    return _of_quaternions(values), notes
+
+
+def _plain(name: str) -> str:
+    return re.sub(r"[^a-z]", "", name.lower())
+
+
+def _of_quaternions(values: np.ndarray) -> np.ndarray:
+    """(T, 3) yaw, pitch, roll of (T, 4) y, x, z, w."""
+    length = np.linalg.norm(values, axis=1, keepdims=True)
+    y, x, z, w = (values / np.maximum(length, 1e-12)).T
+    yaw = np.arctan2(2 * (w * y + x * z), 1 - 2 * (x * x + y * y))
+    pitch = np.arcsin(np.clip(2 * (w * x - y * z), -1, 1))
+    return np.stack([yaw, pitch, np.arctan2(2 * (w * z + x * y), 1 - 2 * (x * x + z * z))], axis=1)
+
+
+def in_radians(where: str, head: np.ndarray) -> tuple[np.ndarray, list[str]]:
+    """The angles (T, 3) in radians, and a sentence where their unit is guessed, or where no neck
+    turns so far. Raises StgaError, beginning with `where`, for angles beyond a turn in degrees."""
+    turn = float(np.abs(head).max())
+    if not turn <= WHOLE_TURN_DEG:
+        problem = "head rotation is beyond a turn, or not finite; expected radians"
+        raise StgaError(f"{where}: {problem}")
+    beyond = np.abs(np.remainder(head + math.pi, 2 * math.pi) - math.pi) > NECK_RAD
+    far = float(np.abs(head[beyond]).max(initial=0))
+    # a camera on its side or upside down turns the roll alone
+    is_degrees = turn > WHOLE_TURN_RAD or beyond[:, :2].any(axis=1).mean() > MAX_OUTLIERS
+    if is_degrees:
+        return np.radians(head), [f"the head's angles reach {turn:.4g}; they are read as degrees"]
+    if turn > HALF_TURN_RAD:
+        return head, [f"the head's angles reach {turn:.4g}; they are read as radians"]
+    if beyond.any():
+        guess = "they are read as radians, though no neck turns so far"
+        return head, [f"the head's angles reach {far:.4g}; {guess}"]
+    return head, []
