@@ -264,13 +264,19 @@ def test_a_long_take_tracks_no_longer_than_it_trains(right):
     assert len(tracked_timesteps(settings, wide, range(90))) == 25
 
 
-def test_timesteps_between_change_as_their_neighbors(lost):
-    """Catches changes that go to the wrong timesteps where a budget allows only some."""
+@pytest.mark.parametrize("astray_m", [0.0, 0.5])
+def test_timesteps_between_change_as_their_neighbors(astray_m, lost):
+    """Catches changes that go to the wrong timesteps where a budget allows only some, and a head
+    that is thrown away at one timestep, and between it and its neighbors."""
     tracking = RefinedTracking(lost[0], "stga")
-    some = tracking.tracked[[0, 3]] + np.array([[1.0], [4.0]])
-    tracking.take(tracked_as((0, 5), some), TIMESTEPS[:-1])
+    some = tracking.tracked[[0, 3]].copy()
+    some[:, 0] += 1, 4
+    some[1, -1] += astray_m
+    kept = tracking.take(tracked_as((0, 5), some), TIMESTEPS[:-1])
     change = tracking.parameters[:, :-3] - tracking.tracked
-    assert_allclose(change[:, 0], [1, 2, 3, 4, 0])
+    assert_allclose(change[:, 0], [1, 2 / 3, 1 / 3, 0, 0] if astray_m else [1, 2, 3, 4, 0])
+    assert_allclose(change[:, -1], 0, atol=1e-12)
+    assert kept == ([5] if astray_m else [])
 
 
 def test_a_change_near_half_a_turn_is_one_of_rotations(lost):
