@@ -443,6 +443,21 @@ def test_tracking_is_undone_where_what_is_left_out_loses(held_out, right, tmp_pa
     assert read_checkpoint(tmp_path / "b").rounds == 2
 
 
+def test_a_timestep_whose_mattes_failed_is_neither_tracked_nor_scored(tmp_path, caplog):
+    """Catches a head that goes where empty masks draw it, by meters, accepted by views that show
+    nobody either."""
+    capture, _ = write_head(tmp_path / "capture")
+    for view in capture.all_views:
+        if view.timestep == 3:
+            Image.new("L", (view.camera.width, view.camera.height)).save(view.mask)
+    train_run(capture, tmp_path / "run", make_run(capture))
+    assert "(timestep 3)" in caplog.text
+    found = read_checkpoint(tmp_path / "run").tracking
+    before = RefinedTracking(capture, "stga").parameters
+    assert_array_equal(found[TIMESTEPS.index(3)], before[TIMESTEPS.index(3)])
+    assert not np.array_equal(found, before)
+
+
 def stop_in_tracking(turn):
     """Stops a training in the middle of its avatar's tracking for the nth time: first of training
     timesteps, then of unseen ones."""
