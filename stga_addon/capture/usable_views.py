@@ -24,12 +24,12 @@ MIN_COVERAGE = 1e-3
 MAX_ONE_COLOR_LEVELS = 4
 """Range of each channel, of 255, in a small image, up to which it is of one color; levels up to
 which it is black."""
-MAX_VIEWS_READ = 256
+MAX_VIEWS_READ = 64
 """Number of views up to which all are read."""
 SMALL_FILE_SHARE = 0.5
 """Fraction of the median file size, below which a file is read among more views than that: what
 shows nothing compresses to little."""
-SAMPLED_VIEWS = 64
+SAMPLED_VIEWS = 24
 """Number of views among more than MAX_VIEWS_READ that are read whatever their files' sizes are."""
 READERS = 4
 """Number of threads that decode images."""

@@ -324,7 +324,7 @@ def test_no_pose_blows_a_splat_up(convention):
         splats, log_scale=np.log(size / unit)[:, None].astype(np.float32) - np.float32([0, 1, 2])
     )
     coefficients = np.zeros((len(FACES), 3, 3), np.float32)
-    coefficients[:, :, 0] = rng.normal(0, 4, (len(FACES), 3))
+    coefficients[:, :, 0] = rng.normal(0, 2, (len(FACES), 3))
     avatar = Avatar(
         splats,
         convention,
@@ -342,9 +342,10 @@ def test_no_pose_blows_a_splat_up(convention):
             growth = (own.frames(posed).scale / plain)[splats.face]
             most[row] = np.maximum(most[row], growth)
     bound = np.maximum(3.0, 0.015 / size)
-    assert (most[0] > 2 * bound).any()
+    assert (most[0] > 1.5 * bound).any()
     assert (most[1] <= bound * 1.001).all()
-    alone = np.bincount(splats.face, minlength=len(FACES)) == 1
-    fits = (most[0] < bound / 50) & alone[splats.face]
+    least = np.full(len(FACES), np.inf)
+    np.minimum.at(least, splats.face, bound)
+    fits = np.abs(coefficients).sum((1, 2)) < np.log(least)  # in any pose
     assert fits.any()
-    assert_allclose(most[1][fits], most[0][fits])
+    assert_array_equal(limited.driven_offsets["strain_scale"][fits], coefficients[fits])
