@@ -180,12 +180,13 @@ class RefinedTracking:
         old = self.parameters
         start = old[at]
         moved = np.concatenate([found.parameters, found.shift], axis=1)
-        meshes = [self.mesh(timestep) for timestep in found.timesteps]
+        meshes = [sequence_mesh(self._person, timestep) for timestep in found.timesteps]
         self.parameters = old.copy()
         self.parameters[at] = moved
         is_far = np.array(
             [
-                np.linalg.norm(np.subtract(self.mesh(timestep), mesh), axis=1).mean() > MAX_MOVE_M
+                np.linalg.norm(sequence_mesh(self._person, timestep) - mesh, axis=1).mean()
+                > MAX_MOVE_M
                 for timestep, mesh in zip(found.timesteps, meshes, strict=True)
             ]
         )
