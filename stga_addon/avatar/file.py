@@ -14,7 +14,16 @@ from ..capture.transforms import DEFAULT_PRINCIPAL_POINT, PRINCIPAL_POINTS
 from ..errors import StgaError, shorten
 from ..files import check_version, converted, npz_outlines, parse_json, read_npz, write_npz
 from .embedding import CONVENTIONS, FaceFrames, face_areas, face_frames
-from .offsets import COLOR, OFFSETS, POSITION, SCALE, SIGNALS, moved_frames, offset_of
+from .offsets import (
+    COLOR,
+    OFFSETS,
+    POSITION,
+    SCALE,
+    SIGNALS,
+    limited_growth,
+    moved_frames,
+    offset_of,
+)
 from .splats import ARRAYS, SH_C0, Splats, sh_color
 from .strain import STRAIN_COMPONENTS, TRAINED_RANGE, StrainBasis, at_rest, strain_basis
 
@@ -164,9 +173,10 @@ class Avatar:
         return self if len(kept) == len(self.driven_offsets) else replace(self, driven_offsets=kept)
 
     @property
-    def without_invisible_offsets(self) -> "Avatar":
+    def with_limited_offsets(self) -> "Avatar":
         """With coefficients of 0 where they do not change a triangle's splats by MIN_COLOR_CHANGE,
-        MIN_SHIFT_M or a share of MIN_SCALE_CHANGE anywhere in `strain_range`."""
+        MIN_SHIFT_M or a share of MIN_SCALE_CHANGE anywhere in `strain_range`, and with smaller ones
+        where they would blow splats up somewhere in it (`limited_growth`)."""
         basis = self._strain
         kept = {}
         if basis is None:
@@ -177,8 +187,15 @@ class Avatar:
         frames = replace(plain, deformation=farthest)
         shift = MIN_SHIFT_M / frames.scale
         least = {COLOR: MIN_COLOR_CHANGE, SCALE: MIN_SCALE_CHANGE, POSITION: shift}
+        size = np.zeros(len(self.faces))
+        largest = np.exp(self.splats.log_scale.max(axis=1))
+        np.maximum.at(size, self.splats.face, largest * plain.scale[self.splats.face])
+        ends = [replace(plain, deformation=basis.range[:, end]) for end in (0, 1)]
         for name, coefficients in self.driven_offsets.items():
             offset = OFFSETS[name]
+            if offset.target == SCALE:
+                signals = np.stack([SIGNALS[offset.signal](basis, end) for end in ends])
+                coefficients = limited_growth(coefficients, signals, size)
             signal = np.abs(SIGNALS[offset.signal](basis, frames))
             change = offset_of(np.abs(coefficients), signal).max(1)
             if not signal.any():  # it does not come from the deformation

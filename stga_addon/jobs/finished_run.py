@@ -157,6 +157,7 @@ def measure_run(
 def evaluate(request: Evaluate, report: Report, say: Say) -> Written:
     """Measure PSNR, SSIM and LPIPS; also with the heads that the avatar has fitted, where it did.
     Raises StgaError."""
+    from ..capture.usable_views import with_usable_views
     from ..training.evaluate.metrics import psnr_recorded, with_fitted_heads
 
     folder = request.run
@@ -166,6 +167,12 @@ def evaluate(request: Evaluate, report: Report, say: Say) -> Written:
     views = capture.views.get(split, ())
     if not views:
         raise StgaError(f"{capture.root}: has no views in the split '{split}'")
+    capture, left_out = with_usable_views(capture)
+    for sentence in left_out:
+        say(f"warning: {sentence}")
+    views = capture.views[split]
+    if not views:
+        raise StgaError(f"{capture.root}: shows nobody in the split '{split}'")
     avatar = read_avatar(folder / AVATAR)
     quality, fitted = measure_run(folder, avatar, capture, split)
     if (folder / WORLD_FILE).is_file():

@@ -35,13 +35,13 @@ CAMERA_ASPECTS = (16 / 9, 4 / 3, 3 / 2)
 """Longer over shorter side of images as cameras record them; others were cropped."""
 ASPECT_TOLERANCE = 0.005
 """Relative difference up to which an image has one of these."""
-CAMERA_SIGMA = 0.5
+CAMERA_SIGMA = 0.35
 """Standard deviation of the logarithm of a camera's focal length about a phone's."""
 CROPPED_SIGMA = 1.2
 """The same where images were cropped, which makes them narrower."""
-DISTANCE_M = 1.1
+DISTANCE_M = 1.2
 """Median distance of a camera from a face, unless a phone is held in the hand."""
-DISTANCE_SIGMA = 0.5
+DISTANCE_SIGMA = 0.4
 """Standard deviation of the distance's logarithm."""
 DATA_WEIGHT = 0.5
 """Weight of the landmarks' likelihood: their errors are not independent."""

@@ -22,6 +22,16 @@ IRIS_SIGMA_M = 0.0005
 """Standard deviation of the middle of an iris, which is seen sharply."""
 MAX_GAZE_RAD = 0.7
 """Up, down or aside; no eye turns farther."""
+CONSTANT_GAZE_SIGMA_RAD = 0.25
+"""Standard deviation of where a person looks all through a take, from straight ahead."""
+EYEBALL_SIGMA_RAD = np.array([0.06, 0.025])
+"""Standard deviation of how far the model's two eyeballs turn alike, up and aside, because they are
+off: both lie too high together, but a face is symmetric, and aside they are off against each
+other."""
+SINGLE_EYEBALL_SIGMA_RAD = np.array([0.06, 0.15])
+"""The same of a single eye, whose errors nothing is compared with."""
+MIN_REMOVED_RAD = 0.1
+"""Constant turn of an eye, not taken for gaze, from which on a warning names it."""
 PARALLEL_QUANTILE = 0.8
 """Of how far a take's left eye looks to the left of the right one, at which both look in parallel:
 eyes converge on what is near, and do not look apart."""
@@ -29,21 +39,25 @@ AXES = 2
 """About which an eye turns: x, by which it looks up and down, and y, aside."""
 
 
-def with_gaze(fit: HeadFit, take: RecordedTake, is_stranger: bool) -> HeadFit:
+def with_gaze(
+    fit: HeadFit, take: RecordedTake, is_stranger: bool
+) -> tuple[HeadFit, tuple[str, ...]]:
     """The fit, its eyes turned so that the foremost points of the eyeballs are where the take's
-    landmarks have the irises; as it is where there are no eyeballs, or no landmarks of irises.
+    landmarks have the irises; as it is where there are no eyeballs, or no landmarks of irises. And
+    warnings, one sentence each.
 
     Beside hundreds of landmarks of skin, two of irises hardly count: eyes would turn by less than
-    half of what they do. is_stranger: the model's eyeballs may be some millimeters off, which would
-    turn each eye all the time: where they converge least, they are said to look in parallel, and in
-    the median where the fit has them. Of a known person, landmarks are corrected (`without_bias`).
+    half of what they do. is_stranger: the model's eyeballs may be some millimeters off, which turns
+    each eye all the time: where they converge least, they are taken to look in parallel. What both
+    do alike is kept as far as it is gaze rather than such an error (`_constant_gaze`); what is
+    removed, a warning says. Landmarks of a known person are corrected (`without_bias`).
     """
     model = fit.head.model
     on_eyeball = (model.weights[model.faces] > EYEBALL_WEIGHT).all(axis=1)[take.places.face]
     irises = {joint: np.flatnonzero(take.reliable & on_eyeball[:, joint]) for joint in EYE_JOINTS}
     seen = {joint: rows for joint, rows in irises.items() if len(rows)}
     if not seen:
-        return fit
+        return fit, ()
     rows = np.concatenate(list(seen.values()))
     first = model.n_expression
     columns = np.concatenate([first + 3 * joint + np.arange(AXES) for joint in seen])
@@ -64,12 +78,16 @@ def with_gaze(fit: HeadFit, take: RecordedTake, is_stranger: bool) -> HeadFit:
 
     stiffness = acceleration_precision(model)[columns] if fit.ordered else None
     turns = solve_in_time(None, terms, start[:, columns], stiffness, ITERATIONS)
+    warnings: tuple[str, ...] = ()
     if is_stranger:
-        usual = np.median(start[:, columns], axis=0).reshape(-1, AXES).mean(axis=0)
-        turns = turns - _rest(turns) + np.tile(usual, len(seen))
+        rest = _rest(turns)
+        removed = rest - np.tile(_constant_gaze(rest), len(seen))
+        turns = turns - removed
+        if np.abs(removed).max() >= MIN_REMOVED_RAD:
+            warnings = (_removal(list(seen), removed),)
     moved = start.copy()
     moved[:, columns] = np.clip(turns, -MAX_GAZE_RAD, MAX_GAZE_RAD)
-    return replace(fit, parameters=dict(zip(timesteps, moved, strict=True)))
+    return replace(fit, parameters=dict(zip(timesteps, moved, strict=True))), warnings
 
 
 def _rest(turns: np.ndarray) -> np.ndarray:
@@ -80,6 +98,28 @@ def _rest(turns: np.ndarray) -> np.ndarray:
         left, right = (turns - rest)[:, 1::AXES].T
         rest[1::AXES] += np.quantile(left - right, PARALLEL_QUANTILE) / 2 * np.array([1, -1])
     return rest
+
+
+def _constant_gaze(rest: np.ndarray) -> np.ndarray:
+    """(2,) the gaze up and aside that is most likely behind `rest` (2 E,) of one or two eyes."""
+    eyes = rest.reshape(-1, AXES)
+    sigma = EYEBALL_SIGMA_RAD if len(eyes) > 1 else SINGLE_EYEBALL_SIGMA_RAD
+    is_gaze = CONSTANT_GAZE_SIGMA_RAD**2 / (CONSTANT_GAZE_SIGMA_RAD**2 + sigma**2)
+    return np.asarray(is_gaze * eyes.mean(axis=0))
+
+
+def _removal(joints: list[int], removed: np.ndarray) -> str:
+    """The sentence about constant turns (2 E,) of the eyes at some joints."""
+    names = ["left" if joint == EYE_JOINTS[0] else "right" for joint in joints]
+    degrees = np.degrees(removed).reshape(-1, AXES)
+    turns = [
+        f"the {name} eye's by {up:+.0f}° down and {aside:+.0f}° to its left"
+        for name, (up, aside) in zip(names, degrees, strict=True)
+    ]
+    return (
+        "gaze: a turn that lasts all through the take is taken for the head model's error and "
+        f"removed: {', '.join(turns)}"
+    )
 
 
 def _observed(

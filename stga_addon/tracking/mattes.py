@@ -8,7 +8,7 @@ the pixel's color lies at; where both colors are alike, the band is a smooth edg
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from scipy.ndimage import binary_fill_holes
 
-from ..capture.model import parts_of
+from ..capture.model import evenly_spread, parts_of
 from ..files import read_json, write_json
 from ..worker.helpers import Step
 from .appearance import box_of, mean_around, reduced
@@ -51,6 +51,22 @@ PLATE_SURE_LEVELS = 40.0
 MAX_HOLE_SHARE = 0.01
 """Area of a hole in the person, of the head's, that is filled: highlights, patterned cloth."""
 
+BAR_FRAMES = 8
+"""Number of frames, spread over the take, in each of which a bar must be of one color."""
+BAR_LEVELS = 12
+"""Largest difference of a pixel's channels from the bar's color, of 255: compression is noisy."""
+MIN_BAR_SHARE = 0.99
+"""Fraction of the pixels of a row, or column, that have the bar's color."""
+MIN_END_SHARE = 0.5
+"""Fraction of the pixels beyond a bar that have another color: a plain backdrop is no bar, because
+most of the row in which hair begins is backdrop as well."""
+BAR_END_PX = 2
+"""Number of rows beyond a bar that compression mixes with it."""
+MAX_BAR_SHARE = 0.4
+"""Fraction of the image's height, or width, up to which a bar is one."""
+
+Sides = tuple[int, int, int, int]
+"""Number of rows above and below, of columns to the left and to the right."""
 HeadPixels = Callable[[int, FootageCamera], np.ndarray]
 """(timestep, camera) -> (H, W) bool: the tracked head's pixels; helping processes take it."""
 
@@ -66,7 +82,8 @@ def with_mattes(
 
     Frames that have one keep it. For the others, mattes are written into the folder of the
     capture's masks and, where an interrupted call with the same `source` wrote them, read from
-    there. A camera's clean plate tells the person from the backdrop, else the network.
+    there. A camera's clean plate tells the person from the backdrop, else the network. Bars of one
+    color at the edges of all frames belong to nobody.
     """
     path = out / MATTES_FILE
     total = len(list(footage.views()))
@@ -74,13 +91,17 @@ def with_mattes(
     continues = path.exists() and read_json(path) == source
     write_json(path, source)
     unseen = list[str]()
+    warnings = list[str]()
     cameras = []
     for number, camera in enumerate(footage.cameras):
         files = {t: out / mask_name(t, number) for t in camera.timesteps}
         kept = {t: file for t, file in files.items() if continues and file.exists()}
         left = [t for t in camera.timesteps if t not in kept]
         parts = [part for part in parts_of(left, PART_TIMESTEPS) if part]
-        work = [(camera, {t: files[t] for t in part}, head_pixels) for part in parts]
+        bars = bars_of(camera)
+        if any(bars):
+            warnings.append(_bar_warning(camera, bars))
+        work = [(camera, bars, {t: files[t] for t in part}, head_pixels) for part in parts]
         done += len(kept)
         found = crew.map(_write_mattes, work, (Stage.MATTES, done, total))
         done += len(left)
@@ -92,24 +113,76 @@ def with_mattes(
     listed = ", ".join(unseen[:6]) + (", …" if len(unseen) > 6 else "")
     warning = f"no person was recognized in {len(unseen)} frames"
     warning += f", whose mattes follow the head alone: {listed}"
-    return replace(footage, cameras=tuple(cameras)), (warning,) if unseen else ()
+    warnings += [warning] if unseen else []
+    return replace(footage, cameras=tuple(cameras)), tuple(warnings)
+
+
+def bars_of(camera: FootageCamera) -> Sides:
+    """Bars of one color at the edges of all frames without a mask, as in letterboxed videos."""
+    images = []
+    for timestep in evenly_spread(camera.timesteps, BAR_FRAMES):
+        if camera.mask(timestep) is None:
+            images.append(camera.image(timestep))
+            if not any(_bars(images[-1:])):
+                return 0, 0, 0, 0
+    return _bars(images)
+
+
+def _bars(images: Sequence[np.ndarray]) -> Sides:
+    """Bars of images (H, W, 3) uint8 of one size."""
+    if not images:
+        return 0, 0, 0, 0
+    frames = np.stack(images).astype(np.int16)
+    across = frames.transpose(0, 2, 1, 3)
+    top, bottom, left, right = (
+        _bar(each) for each in (frames, frames[:, ::-1], across, across[:, ::-1])
+    )
+    return top, bottom, left, right
+
+
+def _bar(frames: np.ndarray) -> int:
+    """Number of the first rows of frames (N, H, W, 3) that a bar covers, its mixed end included."""
+    color = np.median(frames[:, 0], axis=(0, 1))
+    count = frames.shape[1]
+    most = int(MAX_BAR_SHARE * count)
+    shares = (np.abs(frames[:, : most + BAR_END_PX + 1] - color).max(axis=3) <= BAR_LEVELS).mean(2)
+    is_bar = shares.min(axis=0) >= MIN_BAR_SHARE
+    depth = int(np.argmin(is_bar)) if not is_bar.all() else count
+    end = depth + BAR_END_PX
+    if not 0 < depth <= most or 1 - shares[:, min(end, shares.shape[1] - 1)].mean() < MIN_END_SHARE:
+        return 0
+    return end
+
+
+def _bar_warning(camera: FootageCamera, bars: Sides) -> str:
+    names = "above", "below", "on the left", "on the right"
+    listed = ", ".join(
+        f"{size} pixels {name}" for size, name in zip(bars, names, strict=True) if size
+    )
+    return f"{camera.name}: bars of one color belong to nobody and are left out: {listed}"
 
 
 def _write_mattes(
-    camera: FootageCamera, files: dict[int, Path], head_pixels: HeadPixels, step: Step
+    camera: FootageCamera, bars: Sides, files: dict[int, Path], head_pixels: HeadPixels, step: Step
 ) -> dict[int, bool]:
     """Write the mattes of timesteps without a mask; by those, whether a person was recognized."""
+    top, bottom, left, right = bars
+    size = camera.camera.height, camera.camera.width
+    shown = np.s_[top : size[0] - bottom, left : size[1] - right]
     plate = camera.clean_plate()
+    plate = None if plate is None else np.ascontiguousarray(plate[shown])
     network = PersonNetwork()
     recognized = {}
     for timestep, file in files.items():
         if camera.mask(timestep) is None:
-            image = camera.image(timestep)
-            head = head_pixels(timestep, camera)
+            image = np.ascontiguousarray(camera.image(timestep)[shown])
+            head = np.ascontiguousarray(head_pixels(timestep, camera)[shown])
             is_person = network.probability(image) if plate is None else by_plate(image, plate)
             seen = float(np.median(is_person[head])) if head.any() else 1.0
             recognized[timestep] = seen >= MIN_HEAD_PROBABILITY
-            write_png(file, find_matte(image, is_person, head))
+            matte = np.zeros(size, np.uint8)
+            matte[shown] = find_matte(image, is_person, head)
+            write_png(file, matte)
         step()
     return recognized
 

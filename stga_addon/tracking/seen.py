@@ -37,12 +37,14 @@ Misfits = dict[str, dict[int, float]]
 class FittedHead:
     """A head that footage shows, in the capture's world.
 
-    misfits  empty before it is fitted to images, and of takes too short for dense tracking
+    misfits   empty before it is fitted to images, and of takes too short for dense tracking
+    warnings  of the fit, one sentence each
     """
 
     recorded: RecordedFootage
     fit: HeadFit
     misfits: Misfits
+    warnings: tuple[str, ...] = ()
 
     @property
     def errors(self) -> Errors:
@@ -97,8 +99,8 @@ def fit_skin(fitted: FittedHead, crew: Crew) -> FittedHead:
     fitted = _with_images(fitted)
     recorded = fitted.recorded
     fit, misfits = by_images(recorded.opened.head, fitted.fit, recorded.take, crew)
-    fit = with_gaze(fit, recorded.take, is_stranger=True)
-    return _in_world(replace(fitted, fit=fit, misfits=misfits))
+    fit, told = with_gaze(fit, recorded.take, is_stranger=True)
+    return _in_world(replace(fitted, fit=fit, misfits=misfits, warnings=told))
 
 
 def fit_expressions(fitted: FittedHead, person: HeadFit, crew: Crew) -> FittedHead:
@@ -107,7 +109,7 @@ def fit_expressions(fitted: FittedHead, person: HeadFit, crew: Crew) -> FittedHe
     dense = fit_dense(fitted.fit, fitted.recorded.take, crew)
     fit = fitted.fit if dense is None else dense.fit
     fit = replace(fit, shape=person.shape, static_offset=person.static_offset)
-    fit = with_gaze(fit, fitted.recorded.take, is_stranger=False)
+    fit, _ = with_gaze(fit, fitted.recorded.take, is_stranger=False)
     return _in_world(replace(fitted, fit=fit, misfits=_misfits(dense)))
 
 
@@ -228,4 +230,4 @@ def _warnings(fitted: FittedHead) -> tuple[str, ...]:
         "the focal length is a guess, as the head turns too little to tell; "
         "give it if it is known": footage.focal in ("usual", "avatar"),
     }
-    return *footage.warnings, *(text for text, holds in own.items() if holds)
+    return *footage.warnings, *fitted.warnings, *(text for text, holds in own.items() if holds)

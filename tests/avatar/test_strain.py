@@ -278,6 +278,7 @@ def test_only_what_shows_is_kept(name, convention):
     """Catches coefficients taken for invisible by another range, signal or unit than poses have."""
     rng = default_rng(4)
     limits = rng.random((len(FACES), 2, 6)).astype(np.float32) * [[-2], [0.5]]
+    tiny = replace(colored().splats, log_scale=np.full_like(colored().splats.log_scale, -30.0))
     unit = face_frames(NEUTRAL, FACES, NEUTRAL, convention).scale
     shares = []
     divisor = 10 * unit if name == "strain_position" else 1.0
@@ -285,14 +286,14 @@ def test_only_what_shows_is_kept(name, convention):
         sizes = 10**exponent * rng.random(len(FACES)) / divisor
         coefficients = sizes[:, None, None] * rng.normal(0, 0.2, (len(FACES), 3, 3))
         whole = Avatar(
-            colored().splats,
+            tiny,
             convention,
             NEUTRAL.astype(np.float32),
             FACES,
             strain_range=limits.astype(np.float32),
             driven_offsets={name: coefficients.astype(np.float32)},
         )
-        pruned = whole.without_invisible_offsets
+        pruned = whole.with_limited_offsets
         is_kept = pruned.driven_offsets[name].any((1, 2))
         assert_array_equal(
             pruned.driven_offsets[name][is_kept], whole.driven_offsets[name][is_kept]
@@ -309,3 +310,42 @@ def test_only_what_shows_is_kept(name, convention):
             assert (away < np.sqrt(3) * MIN_SHIFT_M * plain.scale / unit).all()
     assert shares[0] < 0.3
     assert shares[-1] == 1
+
+
+@pytest.mark.parametrize("convention", ["stga", "gaussian_avatars"])
+def test_no_pose_blows_a_splat_up(convention):
+    """Catches a disc over half the face: strains that no filmed pose combines, each within its own
+    range, of coefficients that training has left free; and small splats that no longer grow."""
+    rng = default_rng(5)
+    splats = colored().splats
+    unit = face_frames(NEUTRAL, FACES, NEUTRAL, convention).scale[splats.face]
+    size = 10 ** rng.uniform(-5, -2, len(splats))
+    splats = replace(
+        splats, log_scale=np.log(size / unit)[:, None].astype(np.float32) - np.float32([0, 1, 2])
+    )
+    coefficients = np.zeros((len(FACES), 3, 3), np.float32)
+    coefficients[:, :, 0] = rng.normal(0, 2, (len(FACES), 3))
+    avatar = Avatar(
+        splats,
+        convention,
+        NEUTRAL.astype(np.float32),
+        FACES,
+        strain_range=np.tile(np.float32([[-1], [1]]), (len(FACES), 1, 6)),
+        driven_offsets={"strain_scale": coefficients},
+    )
+    limited = avatar.with_limited_offsets
+    most = np.zeros((2, len(splats)))
+    for _ in range(200):
+        posed = NEUTRAL + rng.normal(0, 0.3, NEUTRAL.shape) * np.ptp(NEUTRAL, axis=0)
+        plain = face_frames(posed, FACES, NEUTRAL, convention).scale
+        for row, own in enumerate((avatar, limited)):
+            growth = (own.frames(posed).scale / plain)[splats.face]
+            most[row] = np.maximum(most[row], growth)
+    bound = np.maximum(3.0, 0.015 / size)
+    assert (most[0] > 1.5 * bound).any()
+    assert (most[1] <= bound * 1.001).all()
+    least = np.full(len(FACES), np.inf)
+    np.minimum.at(least, splats.face, bound)
+    fits = np.abs(coefficients).sum((1, 2)) < np.log(least)  # in any pose
+    assert fits.any()
+    assert_array_equal(limited.driven_offsets["strain_scale"][fits], coefficients[fits])

@@ -1,5 +1,7 @@
 """Eyes against those of a posed head whose gaze is known."""
 
+import re
+
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
@@ -49,17 +51,26 @@ def bundled():
 
 
 @pytest.mark.parametrize("count", [1, 3])
-@pytest.mark.parametrize("is_stranger", [True, False])
-def test_eyes_turn_as_irises_are_seen_to(bundled, count, is_stranger):
-    """Catches gaze that landmarks of skin or smoothing hold back, and eyes of a stranger that
-    squint because the model's eyeballs lie elsewhere."""
-    true = gazes()
+@pytest.mark.parametrize(
+    ("is_stranger", "constant", "timesteps"),
+    [
+        (True, (0, 0), TIMESTEPS),
+        (False, (0, 0), TIMESTEPS),
+        (True, (0.0, 0.35), TIMESTEPS),
+        (True, (0.15, -0.35), 1),
+    ],
+    ids=["stranger", "known", "looks aside", "one picture"],
+)
+def test_eyes_turn_as_irises_are_seen_to(bundled, count, is_stranger, constant, timesteps):
+    """Catches gaze that landmarks of skin or smoothing hold back, eyes of a stranger that squint
+    because the model's eyeballs lie elsewhere, and a look aside that lasts, which is dropped."""
+    true = gazes()[:timesteps] * (timesteps > 1) + constant
     on_eyeballs = ON_EYEBALLS_RAD if is_stranger else 0.0
     model = bundled.model
-    parameters = np.zeros((TIMESTEPS, model.n_expression + RIGID_SIZE))
+    parameters = np.zeros((timesteps, model.n_expression + RIGID_SIZE))
     pose = parameters[:, -RIGID_SIZE:]
-    pose[:, 1] = 0.3 * np.sin(np.arange(TIMESTEPS) / 10)
-    eyes = pose[:, POSE_SIZE - 6 : POSE_SIZE].reshape(TIMESTEPS, 2, 3)
+    pose[:, 1] = 0.3 * np.sin(np.arange(timesteps) / 10)
+    eyes = pose[:, POSE_SIZE - 6 : POSE_SIZE].reshape(timesteps, 2, 3)
     eyes[..., :2] = true + on_eyeballs
     fit = HeadFit(bundled, np.zeros(0), dict(enumerate(parameters)), HERE)
     places = pupils_of(model)
@@ -68,11 +79,14 @@ def test_eyes_turn_as_irises_are_seen_to(bundled, count, is_stranger):
     found = {t: seen(rig, own, noise=0.3, seed=t) for t, own in enumerate(points)}
     take = RecordedTake(places, np.ones(2, bool), found)
     eyes[..., :2] = 0.4 * true  # what is left of it beside landmarks of skin
-    turned = np.stack(list(with_gaze(fit, take, is_stranger).parameters.values()))
-    got = turned[:, -RIGID_SIZE:][:, POSE_SIZE - 6 : POSE_SIZE].reshape(TIMESTEPS, 2, 3)[..., :2]
-    if is_stranger:  # which way is straight ahead is not known
-        true = true - np.median(true, axis=0).mean(0)
-        got = got - np.median(got, axis=0).mean(0)
+    gazing, warnings = with_gaze(fit, take, is_stranger)
+    turned = np.stack(list(gazing.parameters.values()))
+    got = turned[:, -RIGID_SIZE:][:, POSE_SIZE - 6 : POSE_SIZE].reshape(timesteps, 2, 3)[..., :2]
     assert_allclose(got, true, atol=0.045)
     others = np.s_[:, : -RIGID_SIZE + POSE_SIZE - 6]
     assert_allclose(turned[others], parameters[others])
+    # the irises' places by which the model differs from the stranger
+    assert len(warnings) == is_stranger
+    named = re.findall(r"([+-]\d+)° to its left", "".join(warnings))
+    off = np.degrees(ON_EYEBALLS_RAD[:, 1]) * is_stranger
+    assert_allclose(np.array(named, int), off[: len(named)], atol=3)

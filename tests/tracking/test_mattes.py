@@ -31,6 +31,13 @@ class Halves:
         return np.repeat(left[None].astype(np.float32), len(image), axis=0)
 
 
+class Everybody:
+    """Takes all that is not as bright as a backdrop for the person."""
+
+    def probability(self, image):
+        return (image.max(axis=2) < 200).astype(np.float32)
+
+
 @pytest.fixture
 def halves(monkeypatch):
     segmenter = Halves()
@@ -111,6 +118,39 @@ def test_clean_plate_of_a_camera(tmp_path, halves):
     write_image(tmp_path / "footage/plates/left.png", size=(7, 5))
     with refusal(r"left\.png: the image has 7 x 5 pixels"):
         made(footage, tmp_path, {"head": "another"})
+
+
+@pytest.mark.parametrize(
+    ("sides", "level"),
+    [((0, 3, 0, 0), 0), ((3, 3, 0, 0), 0), ((0, 0, 4, 4), 255), ((0, 0, 0, 0), 0)],
+    ids=["below", "letterbox", "pillarbox", "none"],
+)
+def test_bars_belong_to_nobody(sides, level, tmp_path, monkeypatch):
+    """Catches a bar of one color that becomes a bib over the chest, and a plain backdrop or cloth
+    that are taken for one."""
+    monkeypatch.setattr(mattes, "PersonNetwork", Everybody)
+    noise = np.random.default_rng(0)
+    top, bottom, left, right = sides
+    is_bar = np.ones((HEIGHT, WIDTH), bool)
+    is_bar[top : HEIGHT - bottom, left : WIDTH - right] = False
+    rows, columns = np.ogrid[:HEIGHT, :WIDTH]
+    person = np.hypot(rows - 14, columns - 12) < 9
+    for number in range(3):
+        pixels = np.full((HEIGHT, WIDTH, 3), 220, np.uint8)
+        pixels[person] = 60, 40, 30
+        pixels[is_bar] = np.clip(level + noise.normal(0, 2, (is_bar.sum(), 3)), 0, 255)
+        path = tmp_path / "footage/left" / f"{number:04d}.png"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        Image.fromarray(pixels).save(path)
+    footage, warnings = made(open_footage(tmp_path / "footage", focal=50.0), tmp_path)
+    for timestep in footage.timesteps:
+        mask = footage.cameras[0].mask(timestep)
+        assert not mask[is_bar].any()
+        assert mask[8:20, 6:18].mean() > 200
+    assert len(warnings) == any(sides)
+    names = ("above", "below", "on the left", "on the right")
+    named = [f"pixels {name}" in "".join(warnings) for name in names]
+    assert named == [size > 0 for size in sides]
 
 
 @pytest.mark.parametrize("suffix", ["png", "jpg"])

@@ -264,13 +264,19 @@ def test_a_long_take_tracks_no_longer_than_it_trains(right):
     assert len(tracked_timesteps(settings, wide, range(90))) == 25
 
 
-def test_timesteps_between_change_as_their_neighbors(lost):
-    """Catches changes that go to the wrong timesteps where a budget allows only some."""
+@pytest.mark.parametrize("astray_m", [0.0, 0.5])
+def test_timesteps_between_change_as_their_neighbors(astray_m, lost):
+    """Catches changes that go to the wrong timesteps where a budget allows only some, and a head
+    that is thrown away at one timestep, and between it and its neighbors."""
     tracking = RefinedTracking(lost[0], "stga")
-    some = tracking.tracked[[0, 3]] + np.array([[1.0], [4.0]])
-    tracking.take(tracked_as((0, 5), some), TIMESTEPS[:-1])
+    some = tracking.tracked[[0, 3]].copy()
+    some[:, 0] += 1, 4
+    some[1, -1] += astray_m
+    kept = tracking.take(tracked_as((0, 5), some), TIMESTEPS[:-1])
     change = tracking.parameters[:, :-3] - tracking.tracked
-    assert_allclose(change[:, 0], [1, 2, 3, 4, 0])
+    assert_allclose(change[:, 0], [1, 2 / 3, 1 / 3, 0, 0] if astray_m else [1, 2, 3, 4, 0])
+    assert_allclose(change[:, -1], 0, atol=1e-12)
+    assert kept == ([5] if astray_m else [])
 
 
 def test_a_change_near_half_a_turn_is_one_of_rotations(lost):
@@ -435,6 +441,21 @@ def test_tracking_is_undone_where_what_is_left_out_loses(held_out, right, tmp_pa
     )
     assert given[1][0] == TIMESTEPS[:-1]
     assert read_checkpoint(tmp_path / "b").rounds == 2
+
+
+def test_a_timestep_whose_mattes_failed_is_neither_tracked_nor_scored(tmp_path, caplog):
+    """Catches a head that goes where empty masks draw it, by meters, accepted by views that show
+    nobody either."""
+    capture, _ = write_head(tmp_path / "capture")
+    for view in capture.all_views:
+        if view.timestep == 3:
+            Image.new("L", (view.camera.width, view.camera.height)).save(view.mask)
+    train_run(capture, tmp_path / "run", make_run(capture))
+    assert "(timestep 3)" in caplog.text
+    found = read_checkpoint(tmp_path / "run").tracking
+    before = RefinedTracking(capture, "stga").parameters
+    assert_array_equal(found[TIMESTEPS.index(3)], before[TIMESTEPS.index(3)])
+    assert not np.array_equal(found, before)
 
 
 def stop_in_tracking(turn):

@@ -10,6 +10,7 @@ import numpy as np
 from ...avatar.offsets import OFFSETS
 from ...capture.camera import Camera
 from ...capture.model import Capture
+from ...capture.usable_views import with_training_views
 from ...errors import StgaError
 from ...flame.parts import PARTS
 from ...flame.sequence import MIN_JOINT_ANGLE_DEG
@@ -341,6 +342,7 @@ def plan_effects(
     """
     if settings.effects is None or not capture.views.get("train"):
         return settings, ()
+    capture, _ = with_training_views(capture)
     facts = CaptureFacts(capture, settings, device)
     choices = settings.effects
     decided = settings
@@ -369,6 +371,7 @@ def add_effects(
 ) -> tuple[TrainingSettings, Plan]:
     """Settings and plan with the effects that may be `added_later` where the capture, of all takes,
     calls for them and the run that is continued went without. A user's choice stays."""
+    capture, _ = with_training_views(capture)
     facts = CaptureFacts(capture, settings)
     plan = {each.effect: each for each in before}
     for effect in EFFECTS.values():

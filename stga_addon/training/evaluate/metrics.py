@@ -249,8 +249,8 @@ def evaluate_avatar(
     perceptual: bool = False,
     matched: bool | None = None,
 ) -> Quality:
-    """Quality of an avatar on all views of a split, read one at a time; matched: whether to apply
-    the exposure of each view, None: where the avatar was trained so."""
+    """Quality of an avatar on all views of a split that show someone, read one at a time; matched:
+    whether to apply the exposure of each view, None: where the avatar was trained so."""
     rows = avatar.settings.get("exposure") or ()
     exposure = None
     backdrop = str(avatar.settings.get("backdrop", "plain"))

@@ -90,6 +90,9 @@ LEAST_GAIN = 1e-3
 the first timestep of another recording is sought: it leads all others."""
 FIRST_STEP = 0.01
 """Length of the first step, as a share of the one down a loss as steep as the points say."""
+MAX_MOVE_M = 0.05
+"""Mean distance of the mesh's vertices by which an avatar may move a tracked head at one timestep:
+2.5 standard deviations of its place. Farther, the image does not show the head that was trained."""
 MISS_LEVELS = 24
 """Mean over the channels, of 255, by which a pixel's color is missed that is not explained."""
 
@@ -167,19 +170,39 @@ class RefinedTracking:
         """The capture with the parameters of now."""
         return with_sequence(capture, replace(self.sequence, frame=self.frame))
 
-    def take(self, found: AvatarTracking, timesteps: Sequence[int]) -> None:
-        """Give timesteps what was found: those left out in between change as their neighbors."""
+    def take(self, found: AvatarTracking, timesteps: Sequence[int]) -> list[int]:
+        """Give timesteps what was found: those left out in between change as their neighbors.
+
+        Returns the timesteps that stay as they were, because their head went farther than tracking
+        can be wrong.
+        """
         rows, at = ([self._row[t] for t in own] for own in (timesteps, found.timesteps))
-        before, shift = np.split(self.parameters[at], [-SHIFT_SIZE], axis=1)
-        parts = change_between(before, found.parameters), found.shift - shift
+        old = self.parameters
+        start = old[at]
+        moved = np.concatenate([found.parameters, found.shift], axis=1)
+        meshes = [sequence_mesh(self._person, timestep) for timestep in found.timesteps]
+        self.parameters = old.copy()
+        self.parameters[at] = moved
+        is_far = np.array(
+            [
+                np.linalg.norm(sequence_mesh(self._person, timestep) - mesh, axis=1).mean()
+                > MAX_MOVE_M
+                for timestep, mesh in zip(found.timesteps, meshes, strict=True)
+            ]
+        )
+        moved[is_far] = start[is_far]
+        before, shift = np.split(start, [-SHIFT_SIZE], axis=1)
+        after, shifted = np.split(moved, [-SHIFT_SIZE], axis=1)
+        parts = change_between(before, after), shifted - shift
         columns = np.concatenate(parts, axis=1).T
         change = np.stack([np.interp(rows, at, column) for column in columns], axis=1)
-        own = self.parameters[rows]
+        own = old[rows]
         by = change[:, :-SHIFT_SIZE]
         added = change[:, -SHIFT_SIZE:]
-        self.parameters = self.parameters.copy()
+        self.parameters = old.copy()
         self.parameters[rows, :-SHIFT_SIZE] = changed_by(own[:, :-SHIFT_SIZE], by)
         self.parameters[rows, -SHIFT_SIZE:] += added
+        return [timestep for timestep, far in zip(found.timesteps, is_far, strict=True) if far]
 
 
 @dataclass(frozen=True)
@@ -217,6 +240,15 @@ def tracked_timesteps(
     views = min(MAX_VIEWS, max(1.0, shown / max(1, len(timesteps))))
     most = int(TRACKED_SHARE * settings.iterations / views)
     return evenly_spread(timesteps, max(MIN_TRACKED_TIMESTEPS, most))
+
+
+def not_moved(timesteps: Sequence[int]) -> str:
+    """The sentence about timesteps that `RefinedTracking.take` has left as they were."""
+    listed = ", ".join(map(str, timesteps))
+    return (
+        f"the head would move by more than {100 * MAX_MOVE_M:.0f} cm at timesteps {listed}, "
+        "which stay as the capture has them; do their images and masks show it?"
+    )
 
 
 def track_by_avatar(

@@ -220,7 +220,7 @@ class Trainer:
             strain_range=strain_range,
             driven_offsets={n: each.average.copy() for n, each in state.driven_offsets.items()},
             filmed_along=along,
-        ).without_invisible_offsets
+        ).with_limited_offsets
 
     def prepare_turns(self) -> None:
         """Find out now what the first turns of changes to the splats would find out once."""

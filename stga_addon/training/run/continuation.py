@@ -106,7 +106,7 @@ def starting_state(
     if kept is not None:
         offsets = {name: offset.average for name, offset in kept.driven_offsets.items()}
         ours = {**vars(avatar.splats), **avatar.driven_offsets}
-        latest = replace(avatar, driven_offsets=offsets).without_invisible_offsets
+        latest = replace(avatar, driven_offsets=offsets).with_limited_offsets
         theirs = {**vars(kept.splats(averaged=True)), **latest.driven_offsets}
         if ours.keys() == theirs.keys() and all(
             array.shape == theirs[name].shape

@@ -14,6 +14,7 @@ from ...capture.images import read_view
 from ...capture.mesh_geometry import Similarity, rasterize
 from ...capture.model import Capture, View, cameras_at_once, evenly_spread, views_by_camera
 from ...capture.open import PARAMETERS, open_capture
+from ...capture.usable_views import with_usable_views
 from ...errors import StgaError
 from ...files import read_json, read_npz, write_json, write_npz
 from ...flame.forward import joint_positions, moved_pose, shaped_vertices
@@ -254,7 +255,7 @@ def _open(
     run: Path, trained_ns: int, root: Path, factor: float, number: int
 ) -> tuple[Avatar, TrainingSettings, Capture]:
     stored = read_run(run)
-    capture = open_capture(root, stored.flame)
+    capture, _ = with_usable_views(open_capture(root, stored.flame))
     return read_avatar(run / AVATAR), stored.settings, capture
 
 

@@ -20,6 +20,7 @@ import numpy as np
 from ...avatar.file import Avatar, read_avatar, write_avatar
 from ...capture.loader import DEFAULT_LIMITS, ViewLoader
 from ...capture.model import Capture, View, evenly_spread, views_by_timestep
+from ...capture.usable_views import with_training_views
 from ...errors import DeviceError, StgaError, shorten
 from ...files import replacing
 from ...progress import Cancelled, Progress, Report, ignore
@@ -36,6 +37,7 @@ from ..optimize.avatar_tracking import (
     AvatarTracking,
     RefinedTracking,
     TrainedAvatar,
+    not_moved,
     read_small,
     track_by_avatar,
     tracked_timesteps,
@@ -142,6 +144,7 @@ def train_run(
             raise StgaError(f"{out}: already holds a run; resume it, or choose another folder")
         has_begun = exists and folders.read_run(out).identity is not None
         run = replace(run, identity=folders.check_identity(out, run, capture))
+        capture = _usable(capture)
         if has_begun and (out / CHECKPOINT).exists():
             session = _resume(capture, out, run, report)
         else:
@@ -161,10 +164,17 @@ def train_more(
     lpips.load_network()
     with folders.locked(out):
         run = replace(run, identity=folders.check_identity(out, run, capture))
-        session = _resume(capture, out, run, report)
+        session = _resume(_usable(capture), out, run, report)
         session.begin_addition(seconds)
         session.complete()
     return out / AVATAR
+
+
+def _usable(capture: Capture) -> Capture:
+    usable, told = with_training_views(capture)
+    for sentence in told:
+        _log.warning("%s", sentence)
+    return usable
 
 
 class _Addition(NamedTuple):
@@ -475,7 +485,8 @@ class _Session:
             found = track_by_avatar(trained, capture, chosen, seconds, stops)
         except Cancelled:
             return None
-        tracking.take(found, changed)
+        if too_far := tracking.take(found, changed):
+            _log.warning("Tracking by the avatar: %s", not_moved(too_far))
         return found
 
     def _evaluate(self) -> None:

@@ -1,0 +1,146 @@
+"""Views that show nobody, because their matte or their image failed: found, and left out."""
+
+import statistics
+from collections.abc import Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from functools import lru_cache
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from ..errors import StgaError
+from .camera import Camera
+from .images import read_view
+from .model import Capture, View, evenly_spread, views_by_camera
+
+COMPARED_HEIGHT_PX = 160
+"""Height of the small images that are looked at."""
+MIN_COVERAGE_SHARE = 0.05
+"""Fraction of its camera's median coverage, up to which a matte counts as empty: specks stay."""
+MIN_COVERAGE = 1e-3
+"""Fraction of the image up to which a matte counts as empty, whatever its camera's others hold."""
+MAX_ONE_COLOR_LEVELS = 4
+"""Range of each channel, of 255, in a small image, up to which it is of one color; levels up to
+which it is black."""
+MAX_VIEWS_READ = 64
+"""Number of views up to which all are read."""
+SMALL_FILE_SHARE = 0.5
+"""Fraction of the median file size, below which a file is read among more views than that: what
+shows nothing compresses to little."""
+SAMPLED_VIEWS = 24
+"""Number of views among more than MAX_VIEWS_READ that are read whatever their files' sizes are."""
+READERS = 4
+"""Number of threads that decode images."""
+NAMED_TIMESTEPS = 12
+"""Largest number of timesteps that a message lists."""
+
+
+class _Content(NamedTuple):
+    """Fraction of the image that the mask covers, None without a mask; whether the image has one
+    color, or is black where the mask covers it."""
+
+    coverage: float | None
+    is_one_color: bool
+
+
+def with_usable_views(capture: Capture) -> tuple[Capture, tuple[str, ...]]:
+    """The capture without views that show nobody, and a sentence for each kind of them.
+
+    A mask, or an image's transparency, that is empty beside the others of its camera, and an image
+    of one color. Raises StgaError where a file cannot be read.
+    """
+    views = capture.all_views
+    empty, plain = _unusable(views)
+    if not (empty or plain):
+        return capture, ()
+    usable = {
+        split: tuple(view for view in own if view.image not in empty | plain)
+        for split, own in capture.views.items()
+    }
+    told = []
+    for files, why in ((empty, "have an empty mask"), (plain - empty, "are of one color")):
+        if files:
+            shown = [view for view in views if view.image in files]
+            count = f"{len(shown)} of {len(views)} images {why}"
+            left_out = "they are left out of training, tracking and scores"
+            told.append(f"{capture.root}: {count} ({_timesteps(shown)}); {left_out}")
+    return replace(capture, views=usable), tuple(told)
+
+
+def with_training_views(capture: Capture) -> tuple[Capture, tuple[str, ...]]:
+    """`with_usable_views`. Raises StgaError where no training view is left."""
+    usable, told = with_usable_views(capture)
+    if capture.views.get("train") and not usable.views["train"]:
+        raise StgaError(
+            f"{capture.root}: shows nobody in its training views, so there is nothing to train on: "
+            "each has an empty mask or an image of one color; expected masks of 255 on the person"
+        )
+    return usable, told
+
+
+def _timesteps(views: Iterable[View]) -> str:
+    numbers = sorted({view.timestep for view in views})
+    listed = ", ".join(map(str, numbers[:NAMED_TIMESTEPS]))
+    more = ", …" if len(numbers) > NAMED_TIMESTEPS else ""
+    return f"timestep{'s' if len(numbers) > 1 else ''} {listed}{more}"
+
+
+def _unusable(views: Sequence[View]) -> tuple[set[Path], set[Path]]:
+    """Images of views with empty masks, and images of one color."""
+    chosen = list(views)
+    if len(views) > MAX_VIEWS_READ:
+        sampled = evenly_spread(views, SAMPLED_VIEWS)
+        certain = {view.image for view in sampled}
+        # otherwise, failures that the sizes of files do not show may be anywhere
+        if not any(_found(sampled)):
+            small = _small_files(views)
+            chosen = [view for view in views if view.image in certain | small]
+    return _found(chosen)
+
+
+def _found(views: Sequence[View]) -> tuple[set[Path], set[Path]]:
+    with ThreadPoolExecutor(READERS) as pool:
+        contents = dict(zip((view.image for view in views), pool.map(_content, views), strict=True))
+    empty = set[Path]()
+    for own in views_by_camera(views).values():
+        known = {view.image: contents[view.image].coverage for view in own}
+        covered = {path: share for path, share in known.items() if share is not None}
+        median = statistics.median([share for share in covered.values() if share] or [0.0])
+        least = max(MIN_COVERAGE, MIN_COVERAGE_SHARE * median)
+        empty |= {path for path, share in covered.items() if share <= least}
+    return empty, {path for path, content in contents.items() if content.is_one_color}
+
+
+def _small_files(views: Sequence[View]) -> set[Path]:
+    """Images of views that are, or whose mask is, small beside the others of its camera."""
+    small = set[Path]()
+    for own in views_by_camera(views).values():
+        for files in ([view.image for view in own], [view.mask for view in own]):
+            sizes = [path.stat().st_size if path and path.is_file() else 0 for path in files]
+            least = SMALL_FILE_SHARE * statistics.median(sizes)
+            pairs = zip(own, sizes, strict=True)
+            small |= {view.image for view, size in pairs if size < least}
+    return small
+
+
+def _content(view: View) -> _Content:
+    files = [path for path in (view.image, view.mask) if path is not None]
+    stamps = tuple((path.stat().st_mtime_ns if path.is_file() else 0) for path in files)
+    return _content_of(view.image, view.mask, view.camera.width, view.camera.height, stamps)
+
+
+@lru_cache(1 << 16)
+def _content_of(
+    image: Path, mask: Path | None, width: int, height: int, stamps: tuple[int, ...]
+) -> _Content:
+    """stamps: times of the files' last changes, so that others are read anew."""
+    camera = Camera(width, height, 1.0, 1.0, 0.0, 0.0, np.eye(4))
+    scale = min(1.0, COMPARED_HEIGHT_PX / height)
+    _, pixels, covered = read_view(View(0, 0, camera, image.name, image, mask), scale)
+    coverage = None if covered is None else float(covered.mean()) / 255
+    masked = pixels[covered > 127] if covered is not None else pixels.reshape(-1, 3)
+    is_plain = np.ptp(pixels.reshape(-1, 3), axis=0).max() <= MAX_ONE_COLOR_LEVELS
+    is_black = len(masked) > 0 and masked.max() <= MAX_ONE_COLOR_LEVELS
+    return _Content(coverage, bool(is_plain or is_black))
