@@ -33,7 +33,7 @@ from ..stga_addon.scene.objects import (
 )
 from ..stga_addon.scene.render import engine, viewport_display
 from ..stga_addon.scene.render.drawn_video import DrawnVideo
-from ..stga_addon.scene.render.scene_splats import SplatCache, visible_layers
+from ..stga_addon.scene.render.scene_splats import SplatCache, all_layers
 from ..stga_addon.scene.render.view_transform import srgb_background
 from ..stga_addon.worker.status import status_writer
 from . import monitor, options
@@ -222,8 +222,8 @@ def _images(
             is_new = frame != before or frame != scene.frame_current
             if is_new:
                 scene.frame_set(frame)
-                cache.light.forget_casters()
-                layers = visible_layers(bpy.context.evaluated_depsgraph_get(), cache)
+                cache.frame_changed()
+                layers = all_layers(bpy.context.evaluated_depsgraph_get(), cache)
             depsgraph = bpy.context.evaluated_depsgraph_get()
             camera = cameras[number] if cameras else scene_camera(depsgraph)
         before = frame
