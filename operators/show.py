@@ -148,6 +148,11 @@ def _own_as_trained(context: Any) -> list[Any]:
     return [thing for thing in own if is_shown_as_trained(thing)]
 
 
+PREVIEW_SAMPLES = 4
+"""EEVEE's samples of a viewport that shows splats as transparent quads: 16, its default, take
+minutes where the processor draws."""
+
+
 class PreviewImages(Edit, bpy.types.Operator):
     """Show all splats as images by EEVEE and Cycles show them: as Blender's own from 5.3 on, before
     through the scene's camera as quads that face it, without one as points"""
@@ -177,12 +182,19 @@ class PreviewImages(Edit, bpy.types.Operator):
         if getattr(space, "type", "") == "VIEW_3D":  # none where a script calls it
             # Material Preview is EEVEE, whatever the scene's engine is.
             space.shading.type = "RENDERED" if splat_object.shows_nodes(scene) else "MATERIAL"
+            self._limit_samples(scene.eevee)
             if mode == QUADS:
                 space.region_3d.view_perspective = "CAMERA"
         if hint := splat_object.view_transform_hint(scene):
             self.warn(hint)
         else:
             self.inform(f"{mode}: {LIMITS[mode]}")
+
+    def _limit_samples(self, eevee: Any) -> None:
+        """Let viewports take few samples; 0 is without end."""
+        if not 0 < eevee.taa_samples <= PREVIEW_SAMPLES:
+            eevee.taa_samples = PREVIEW_SAMPLES
+            self.inform(f"EEVEE takes {PREVIEW_SAMPLES} samples in viewports; renders as before")
 
 
 class StandardView(Edit, bpy.types.Operator):
