@@ -179,10 +179,11 @@ class PreviewImages(Edit, bpy.types.Operator):
         if self.with_engine:
             scene.render.engine = whole_engine(scene)
         splat_object.use_transparent_bounces(scene)
+        if mode == QUADS:
+            self._limit_samples(scene.eevee)
         if getattr(space, "type", "") == "VIEW_3D":  # none where a script calls it
             # Material Preview is EEVEE, whatever the scene's engine is.
             space.shading.type = "RENDERED" if splat_object.shows_nodes(scene) else "MATERIAL"
-            self._limit_samples(scene.eevee)
             if mode == QUADS:
                 space.region_3d.view_perspective = "CAMERA"
         if hint := splat_object.view_transform_hint(scene):
