@@ -151,6 +151,15 @@ class ApplyMotion(Edit, bpy.types.Operator, FileImport):
         ("strip", "NLA Strip", "A strip over the head's own animation, which plays around it"),
         options=ONCE,
     )
+    blend: options.number(
+        "Blend",
+        "Of an NLA strip: frames over which it passes into strips that it overlaps, or into the "
+        "head's own animation, at both ends",
+        default=8.0,
+        min=0.0,
+        soft_max=60.0,
+        options=ONCE,
+    )
     fit_range: options.boolean(
         "Extend Frame Range",
         "Extend the scene's frame range to the end of the motion",
@@ -284,7 +293,7 @@ class ApplyMotion(Edit, bpy.types.Operator, FileImport):
         return name, len(frames)
 
     def _placement(self, name: str, parts: list[str]) -> Placement:
-        return Placement(self.start, name, parts, as_strip=self.place == "strip")
+        return Placement(self.start, name, parts, self.place == "strip", self.blend)
 
     def _options(self) -> MotionOptions:
         gains = {part: getattr(self, f"{part}_gain") for part in PART_OF_SHAPES}

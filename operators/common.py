@@ -27,6 +27,8 @@ from .options import ONCE
 TAB = "STGA"  # of the 3D viewport's sidebar
 MAX_REPORT_CHARACTERS = 90
 """Of what popup and status bar show of a report."""
+UNSAVED = "has not been saved yet"
+"""In messages that saving the file makes void."""
 PARENT_FOLDERS = re.compile(r"(?:[A-Za-z]:)?[\\/](?:[^\\/:;,()]+[\\/])+")
 
 Poll = Callable[[Any, Any], bool]
@@ -366,8 +368,7 @@ def file_path(value: str, what: str) -> Path:
     if not value:
         raise StgaError(f"{what}: no path given")
     if value.startswith("//") and not bpy.data.filepath:
-        problem = "is relative to the .blend file, which has not been saved yet"
-        raise StgaError(f"{what}: {value} {problem}")
+        raise StgaError(f"{what}: {value} is relative to the .blend file, which {UNSAVED}")
     return Path(bpy.path.abspath(value))
 
 

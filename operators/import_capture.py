@@ -67,7 +67,7 @@ class HeadImport(Edit):
         correctives: str = "all",
     ) -> None:
         """Import what `open_capture` reads, and make it the scene's head. set_up_scene: None: where
-        it has no other head. Raises StgaError."""
+        it has no head yet; another import of the same keeps the shot. Raises StgaError."""
         warn = self.warn
         scene = context.scene
         objects = context.view_layer.objects
@@ -82,14 +82,14 @@ class HeadImport(Edit):
         if others and is_new:
             place_beside(head, others)
         if set_up_scene is None:
-            set_up_scene = not others
+            set_up_scene = not heads
         show_progress(0.8)
         cameras = import_cameras(capture, capture_root(capture.root), warn=warn)
         head[tags.FLAME_MODEL] = str(capture.flame_file or "")
         head[tags.PRINCIPAL_POINT] = principal_point
         head[tags.TRACKED] = is_tracked(capture.root)
         scene.stga.head = head
-        if set_up_scene or not others:
+        if set_up_scene or not heads:
             scene.frame_start = capture.timesteps[0]
             scene.frame_end = capture.timesteps[-1]
             scene.frame_set(capture.timesteps[0])

@@ -23,7 +23,7 @@ from ..stga_addon.scene.objects import layers_with, mover_of, remove
 from ..stga_addon.scene.render.viewport_display import is_shown_as_trained
 from ..stga_addon.training.run.folder import has_run
 from . import monitor
-from .common import AtEnd, is_head, register_handlers
+from .common import UNSAVED, AtEnd, is_head, register_handlers
 from .results import HEADS, avatar_of
 from .windows import redraw, show_panel
 
@@ -40,6 +40,9 @@ def _after_save(path: str) -> None:
     _remove_notes()
     if bpy.data.filepath != path:  # a copy was saved
         _rebase(path, bpy.data.filepath)
+    manager = bpy.context.window_manager
+    if bpy.data.filepath and UNSAVED in manager.stga_message:
+        manager.stga_message = ""
 
 
 NOTE = (

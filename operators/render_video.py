@@ -24,10 +24,16 @@ from ..stga_addon.scene import light
 from ..stga_addon.scene.cameras import scene_camera, turntable_cameras
 from ..stga_addon.scene.gpu.context import has_gpu_context
 from ..stga_addon.scene.layers import SceneLayer
-from ..stga_addon.scene.objects import Identity, SceneView, frame_kept, frames_per_second
+from ..stga_addon.scene.objects import (
+    Identity,
+    SceneView,
+    frame_kept,
+    frames_per_second,
+    is_rendering,
+)
 from ..stga_addon.scene.render import engine, viewport_display
 from ..stga_addon.scene.render.drawn_video import DrawnVideo
-from ..stga_addon.scene.render.scene_splats import SplatCache, visible_layers
+from ..stga_addon.scene.render.scene_splats import SplatCache, all_layers
 from ..stga_addon.scene.render.view_transform import srgb_background
 from ..stga_addon.worker.status import status_writer
 from . import monitor, options
@@ -173,7 +179,13 @@ class RenderVideo(Stepwise, bpy.types.Operator, FileExport):
                 monitor.check_now(scene, Kind.VIDEO)
                 yield
                 posed = list[PosedSplats]()
-                for number, (layers, camera, is_new) in enumerate(_images(view, frames, cameras)):
+                images = _images(view, frames, cameras)
+                for number in range(len(frames)):
+                    while is_rendering():  # it sets frames itself, and would get ours
+                        if status.report(Progress(number / len(frames), "Waiting for the render")):
+                            raise Cancelled(f"{output}: cancelled")
+                        yield
+                    layers, camera, is_new = next(images)
                     if drawn is not None:
                         drawn.add(layers, camera)
                     else:
@@ -183,6 +195,8 @@ class RenderVideo(Stepwise, bpy.types.Operator, FileExport):
                     share = (number + 1) / len(frames)
                     if status.report(Progress(share, "Recording", figures=lambda: left)):
                         raise Cancelled(f"{output}: cancelled")
+                    yield
+                while is_rendering():  # Blender has one render at a time
                     yield
                 if drawn is not None:
                     drawn.encode(fps)
@@ -208,8 +222,8 @@ def _images(
             is_new = frame != before or frame != scene.frame_current
             if is_new:
                 scene.frame_set(frame)
-                cache.light.forget_casters()
-                layers = visible_layers(bpy.context.evaluated_depsgraph_get(), cache)
+                cache.frame_changed()
+                layers = all_layers(bpy.context.evaluated_depsgraph_get(), cache)
             depsgraph = bpy.context.evaluated_depsgraph_get()
             camera = cameras[number] if cameras else scene_camera(depsgraph)
         before = frame

@@ -148,6 +148,11 @@ def _own_as_trained(context: Any) -> list[Any]:
     return [thing for thing in own if is_shown_as_trained(thing)]
 
 
+PREVIEW_SAMPLES = 4
+"""EEVEE's samples of a viewport that shows splats as transparent quads: 16, its default, take
+minutes where the processor draws."""
+
+
 class PreviewImages(Edit, bpy.types.Operator):
     """Show all splats as images by EEVEE and Cycles show them: as Blender's own from 5.3 on, before
     through the scene's camera as quads that face it, without one as points"""
@@ -174,6 +179,8 @@ class PreviewImages(Edit, bpy.types.Operator):
         if self.with_engine:
             scene.render.engine = whole_engine(scene)
         splat_object.use_transparent_bounces(scene)
+        if mode == QUADS:
+            self._limit_samples(scene.eevee)
         if getattr(space, "type", "") == "VIEW_3D":  # none where a script calls it
             # Material Preview is EEVEE, whatever the scene's engine is.
             space.shading.type = "RENDERED" if splat_object.shows_nodes(scene) else "MATERIAL"
@@ -183,6 +190,12 @@ class PreviewImages(Edit, bpy.types.Operator):
             self.warn(hint)
         else:
             self.inform(f"{mode}: {LIMITS[mode]}")
+
+    def _limit_samples(self, eevee: Any) -> None:
+        """Let viewports take few samples; 0 is without end."""
+        if not 0 < eevee.taa_samples <= PREVIEW_SAMPLES:
+            eevee.taa_samples = PREVIEW_SAMPLES
+            self.inform(f"EEVEE takes {PREVIEW_SAMPLES} samples in viewports; renders as before")
 
 
 class StandardView(Edit, bpy.types.Operator):

@@ -7,7 +7,7 @@ from typing import Any
 import bpy
 
 from ..operators import monitor
-from ..operators.common import is_head, rig_or_none
+from ..operators.common import UNSAVED, is_head, rig_or_none
 from ..operators.import_capture import OpenDemo
 from ..operators.pose import is_posing
 from ..operators.training_python import has_training_python
@@ -61,10 +61,12 @@ class NextStepPanel(SidebarPanel, bpy.types.Panel):
             layout.operator("stga.import_capture", icon="IMPORT")
             if has_demo:
                 layout.operator("stga.open_demo", icon="USER")
+        elif monitor.state_of(scene, Kind.TRAINING).is_running:
+            appear = "splats appear on the head soon"
+            done = appear if settings.splats is None else "the splats follow as it goes on"
+            draw_text(layout, context, f"Training: {done}. {GO_ON}")
         elif settings.splats is not None:
             _draw_what_to_try(layout, context, settings)
-        elif monitor.state_of(scene, Kind.TRAINING).is_running:
-            draw_text(layout, context, f"Training: splats appear on the head soon. {GO_ON}")
         elif settings.avatar:
             draw_text(layout, context, "Show the trained avatar on the head")
             layout.operator("stga.show_avatar", icon="HIDE_OFF").filepath = settings.avatar
@@ -96,7 +98,7 @@ def _draw_message(layout: Any, context: Any) -> None:
         draw_missing_python(box, context)
     elif "FLAME model" in text:
         draw_preferences(box, "Choose It")
-    elif "not been saved" in text:
+    elif UNSAVED in text:
         box.operator("wm.save_mainfile", text="Save the File", icon="FILE_TICK")
 
 

@@ -1,5 +1,6 @@
 """Differences between Blender 4.2 and 5.3: every version switch of the add-on."""
 
+from collections.abc import Callable
 from contextlib import suppress
 from typing import Any
 
@@ -84,6 +85,62 @@ def push_down_action(owner: Any, extrapolation: str = "HOLD") -> None:
     strip.extrapolation = extrapolation
     if slot is not None:
         strip.action_slot = slot
+
+
+STRIP_FIELDS = (
+    "action_frame_start",
+    "action_frame_end",
+    "scale",
+    "repeat",
+    "frame_start_raw",
+    "frame_end_raw",
+    "blend_type",
+    "extrapolation",
+    "use_auto_blend",
+    "blend_in",
+    "blend_out",
+    "use_reverse",
+    "use_animated_influence",
+    "influence",
+    "mute",
+)
+"""What `keep_strips` keeps of an NLA strip, in an order in which it can be set."""
+
+
+def keep_strips(owner: Any) -> Callable[[Any], None]:
+    """What gives the NLA tracks that `owner` has now to another owner, above the action that it has
+    then; not the strip at the bottom, which its last import was pushed down to."""
+    kept = []
+    animation = owner.animation_data if owner is not None else None
+    for row, track in enumerate(animation.nla_tracks if animation else ()):
+        strips = []
+        for strip in track.strips:
+            if strip.action is None or (row == 0 and strip.action.name.startswith(owner.name)):
+                continue
+            strip.action.use_fake_user = True
+            slot = strip.action_slot.identifier if SLOTTED_ACTIONS and strip.action_slot else None
+            fields = {name: getattr(strip, name) for name in STRIP_FIELDS}
+            strips.append((strip.name, strip.action, slot, fields))
+        if strips:
+            kept.append((track.name, track.mute, strips))
+
+    def give_back(other: Any) -> None:
+        if not kept:
+            return
+        push_down_action(other)
+        tracks = (other.animation_data or other.animation_data_create()).nla_tracks
+        for name, is_muted, strips in kept:
+            track = tracks.new()
+            track.name = name
+            track.mute = is_muted
+            for title, action, slot, fields in strips:
+                strip = track.strips.new(title, int(fields["frame_start_raw"]), action)
+                if slot is not None:
+                    strip.action_slot = action.slots[slot]
+                for field, value in fields.items():
+                    setattr(strip, field, value)
+
+    return give_back
 
 
 def select_bones(rig: Any, names: set[str]) -> None:

@@ -257,17 +257,47 @@ class SceneView:
             yield scene
 
 
+RENDER_INTERVAL_S = 0.2
+"""Between two looks whether Blender still renders."""
+
+
+def is_rendering() -> bool:
+    """Whether Blender renders an image or an animation (F12, Ctrl+F12) beside its interface."""
+    return bool(bpy.app.is_job_running("RENDER"))
+
+
+def after_render(act: Callable[[], None]) -> None:
+    """Call `act` now, or where Blender renders as soon as that has ended."""
+
+    def tick() -> float | None:
+        if is_rendering():
+            return RENDER_INTERVAL_S
+        act()
+        return None
+
+    if tick() is not None:
+        bpy.app.timers.register(tick, first_interval=RENDER_INTERVAL_S, persistent=True)
+
+
 @contextmanager
 def frame_kept(scene: Identity) -> Iterator[None]:
-    """Go back to the scene's frame at the end of the block, unless the scene is gone."""
+    """Go back to the scene's frame after the block, unless the scene is gone. Raises StgaError
+    while Blender renders: another frame would get into the images of an animation."""
     now = scene.get()
+    if is_rendering():
+        problem = "Blender renders, and would get other frames"
+        raise StgaError(f"{now.name}: {problem}; wait until the render has ended, or cancel it")
     frame = now.frame_current
     subframe = now.frame_subframe
+
+    def go_back() -> None:
+        if (found := scene.find()) is not None:
+            found.frame_set(frame, subframe=subframe)
+
     try:
         yield
     finally:
-        if (found := scene.find()) is not None:
-            found.frame_set(frame, subframe=subframe)
+        after_render(go_back)
 
 
 def go_to_frame(frame: int) -> None:

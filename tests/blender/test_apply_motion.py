@@ -81,12 +81,38 @@ def test_refined_tracking_keeps_the_offsets_of_each_frame(tmp_path, place):
     path = str(tmp_path / "tracking.npz")
     ops.apply_motion(filepath=path, start=0, place=place)
     assert np.abs(mesh_at(3) - shown.mesh(3)).max() > 1e-3  # as anybody's motion: without
-    ops.apply_motion(filepath=path, start=0, place=place, own_offsets=True)
+    whole = {"place": place, "own_offsets": True, "blend": 0}
+    ops.apply_motion(filepath=path, start=0, **whole)
     for timestep in own.timesteps:
         assert_allclose(mesh_at(timestep), shown.mesh(timestep), atol=2 * TOLERANCE)
-    ops.apply_motion(filepath=path, start=10, speed=0.5, place=place, own_offsets=True)
+    ops.apply_motion(filepath=path, start=10, speed=0.5, **whole)
     for timestep in own.timesteps:
         assert_allclose(mesh_at(10 + 2 * timestep), shown.mesh(timestep), atol=2 * TOLERANCE)
+
+
+def test_importing_again_keeps_the_shot(scene):
+    """Catches camera, size, frame range or performance strips that another import of the same
+    capture takes away, on either owner, once and twice."""
+    ops.apply_motion(filepath=scene.file, start=12, place="strip")
+    ops.apply_motion(filepath=scene.file, start=30, place="strip", jaw=False)
+    shot = bpy.context.scene
+    camera = bpy.data.objects.new("shot", bpy.data.cameras.new("shot"))
+    shot.collection.objects.link(camera)
+    shot.camera = camera
+    shot.frame_end = 77
+    shot.render.resolution_x = 999
+    head = panel().head
+    head.data.shape_keys.animation_data.nla_tracks[1].strips[0].influence = 0.5
+    times = (0, 1.5, 5, 12, 13.5, 17, 30, 33)
+    before = [mesh_at(time) for time in times]
+    for _ in range(2):
+        ops.import_capture(directory=scene.folder, flame=scene.model_file)
+        assert shot.camera == camera
+        assert (shot.frame_end, shot.render.resolution_x) == (77, 999)
+        for time, expected in zip(times, before, strict=True):
+            assert_allclose(mesh_at(time), expected, atol=TOLERANCE)
+    for owner in (rig_of(panel().head), panel().head.data.shape_keys):
+        assert len(owner.animation_data.nla_tracks) == 3
 
 
 def test_undo(scene):
@@ -94,7 +120,7 @@ def test_undo(scene):
     actions = sorted(bpy.data.actions.keys())
     before = mesh_at(1)
     bpy.ops.ed.undo_push(message="before")
-    ops.apply_motion(filepath=scene.file, start=1, place="strip")
+    ops.apply_motion(filepath=scene.file, start=1, place="strip", blend=0)
     bpy.ops.ed.undo_push(message="after")
     assert np.abs(mesh_at(1) - before).max() > 1e-3
     bpy.ops.ed.undo()

@@ -98,6 +98,27 @@ def test_strips_override_only_their_frames(head, own, other):
         assert owner.animation_data.action is None
 
 
+@pytest.mark.parametrize("second", [12, 8])
+def test_strips_blend_where_they_overlap(head, own, second):
+    """Catches a neck or a slider that snaps where a strip begins or ends over another, and a blend
+    on one of the two owners only."""
+    rig = rig_of(head)
+    smile = head.data.shape_keys.key_blocks["expr_000"]
+    still = own.frame(1)
+    for start, sign in ((1, 1.0), (second, -1.0)):
+        neck = np.array((0.0, sign * 0.3, 0.0))
+        frame = replace(still, neck_pose=neck, expr=np.eye(len(still.expr))[0] * sign)
+        placement = Placement(start, str(start), as_strip=True, blend=5.0)
+        apply_motion(head, [frame] * 16, placement)
+    values = []
+    for time in np.arange(7, second + 10, 0.5):  # the own motion ends at 6
+        at_frame(head, time)
+        bone = rig.evaluated_get(bpy.context.evaluated_depsgraph_get()).pose.bones["neck"]
+        values.append((np.array(bone.matrix_basis.to_euler())[1] / 0.3, smile.value))
+    steps = np.abs(np.diff(values, axis=0)).max(axis=0)
+    assert steps.max() < 0.35, steps  # 2 where it snaps
+
+
 def test_a_strip_keeps_the_animation_below_where_it_is(head, own, other):
     """Fails when keyframes between frames, or outside an action's manual range, are moved or lost
     below a strip."""

@@ -61,6 +61,24 @@ def test_long_errors_are_in_the_panel(extension, head, monkeypatch, sentence):
     assert sentence not in draw(extension, "next_step")
 
 
+def test_next_step_tells_what_is_so_now(extension, head, monkeypatch, tmp_path):
+    """Catches a file that is said not to be saved after it was, and, during a training, advice for
+    after it."""
+    manager = bpy.context.window_manager
+    ops.show_avatar(filepath=write_ball_run(tmp_path / "run") / "avatar.npz")
+    for sentence, stays in (("It has not been saved yet", False), ("Another", True)):
+        manager.stga_message = sentence
+        save(tmp_path / "head.blend")
+        assert (sentence in draw(extension, "next_step")) == stays
+    assert any("Orbit" in text for text in draw(extension, "next_step"))
+    request = extension.operators.monitor.RequestState
+    is_training = property(lambda state: state.kind == "training")
+    monkeypatch.setattr(request, "is_running", is_training)
+    texts = draw(extension, "next_step")
+    assert any("Training: the splats follow" in text for text in texts)
+    assert not any("Orbit" in text for text in texts)
+
+
 def test_the_file_knows_its_run(extension, head, tmp_path):
     """Catches a run lost when an avatar is shown, or the file moved with it or saved elsewhere."""
     settings = panel()

@@ -243,6 +243,63 @@ def test_finished_jobs_end_with_the_add_on(extension, shown, temporary):
     assert not folder.exists()
 
 
+def test_while_blender_renders(extension, shown, monkeypatch):
+    """Catches frames that are set under a running render, by a video, an export or at its end, and
+    an engine that is unregistered meanwhile, which hangs Blender for ever."""
+    scene = bpy.context.scene
+    rendering = [True]
+    waiting = []
+    monkeypatch.setattr(bpy.app.timers, "register", lambda tick, **_: waiting.append(tick))
+    objects = extension.stga_addon.scene.objects
+    monkeypatch.setattr(objects, "is_rendering", lambda: rendering[0])
+    monkeypatch.setattr(extension.operators.render_video, "is_rendering", lambda: rendering[0])
+    with failure("wait until the render has ended"):
+        ops.render_video(filepath=shown / "images", path="scene", format="png")
+    with failure("wait until the render has ended"):
+        ops.export_splats(filepath=shown / "a.ply")
+    assert not (shown / "images").exists()
+    rendering[0] = False
+    recorded = extension.operators.render_video.RenderVideo.record
+    mine = []
+
+    def record(*arguments):
+        for count, _ in enumerate(recorded(*arguments)):
+            rendering[0] = 2 <= count < 6
+            if rendering[0]:
+                scene.frame_set(7)  # as the render does
+            mine.append(scene.frame_current)
+            yield
+
+    monkeypatch.setattr(extension.operators.render_video.RenderVideo, "record", record)
+    ops.render_video(filepath=shown / "images", path="scene", format="png")
+    assert mine == [1, 0, 7, 7, 7, 7, 7, 2]
+    monkeypatch.undo()
+    ops.render_video(filepath=shown / "alone", path="scene", format="png")
+    for path in sorted((shown / "alone").glob("*.png")):
+        assert path.read_bytes() == (shown / "images" / path.name).read_bytes()
+
+
+def test_engine_of_a_running_render(extension, monkeypatch):
+    """Catches an engine that is unregistered or replaced during a render, which hangs Blender for
+    ever, and one that stays afterwards."""
+    engine = extension.stga_addon.scene.render.engine
+    rendering = [True]
+    waiting = []
+    monkeypatch.setattr(bpy.app.timers, "register", lambda tick, **_: waiting.append(tick))
+    monkeypatch.setattr(extension.stga_addon.scene.objects, "is_rendering", lambda: rendering[0])
+    for _ in range(2):
+        extension.unregister()
+        assert engine.SplatsEngine.is_registered
+        extension.register()
+    extension.unregister()
+    assert all(tick() for tick in waiting)
+    rendering[0] = False
+    assert not any(tick() for tick in waiting)
+    assert not engine.SplatsEngine.is_registered
+    extension.register()
+    assert engine.SplatsEngine.is_registered
+
+
 CAMERA = Camera(63, 48, 50.0, 50.0, 31.5, 24.0, np.eye(4))
 
 

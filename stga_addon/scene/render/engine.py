@@ -22,7 +22,7 @@ from ..gpu.packing import View
 from ..gpu.renderer import CompositeTarget, SplatRenderer
 from ..layers import SceneLayer
 from ..light import settings_values
-from ..objects import Warn, log_warning
+from ..objects import Warn, after_render, log_warning
 from .scene_splats import SplatCache, all_layers
 from .view_transform import combined, inverse_view, measure, needs_inverse, scene_background, srgb
 from .viewport_display import ENGINE, display, is_drawn_by_engine, region_view
@@ -236,9 +236,10 @@ def register(
     find_python: Callable[[], str], find_device: Callable[[], str] = lambda: "auto"
 ) -> None:
     """find_python, find_device: as in `RenderClient`."""
-    global _rasterizer
+    global _rasterizer, _is_wanted
     _rasterizer = RenderClient(find_python, find_device)
-    bpy.utils.register_class(SplatsEngine)
+    _is_wanted = True
+    after_render(_settle)
     bpy.app.handlers.render_pre.append(_before_render)
     for panel in _panels_by_engine():
         if "BLENDER_RENDER" in panel.COMPAT_ENGINES or panel.__name__ in SHARED_PANELS:
@@ -246,11 +247,26 @@ def register(
 
 
 def unregister() -> None:
+    global _is_wanted
     for panel in _panels_by_engine():
         panel.COMPAT_ENGINES.discard(ENGINE)
     bpy.app.handlers.render_pre.remove(_before_render)
-    bpy.utils.unregister_class(SplatsEngine)
-    _rasterizer.close()
+    _is_wanted = False
+    after_render(_settle)
+
+
+_is_wanted = False
+
+
+def _settle() -> None:
+    """Register the engine, or end it, as was last asked for. Not while Blender renders: it hangs
+    for ever where the engine of a render is unregistered, or replaced by that of an update."""
+    if _is_wanted and not SplatsEngine.is_registered:
+        bpy.utils.register_class(SplatsEngine)
+    elif not _is_wanted:
+        if SplatsEngine.is_registered:  # else an update has replaced it
+            bpy.utils.unregister_class(SplatsEngine)
+        _rasterizer.close()
 
 
 def _panels_by_engine() -> list[Any]:

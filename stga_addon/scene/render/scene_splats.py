@@ -70,6 +70,11 @@ class SplatCache:
         if uids or any(isinstance(each, bpy.types.Scene) for each in changed):
             self._selections.clear()
 
+    def frame_changed(self) -> None:
+        """Forget what moves by itself: what throws shadows, and native splats of others."""
+        self.light.forget_casters()
+        self._native.clear()
+
     def selection(self, head: Any, timestep: int) -> np.ndarray | None:
         """`frame_selection`, which reads all vertices, as last read."""
         group = frame_group(head, timestep)

@@ -22,6 +22,7 @@ from ...flame.model import JOINTS, FlameModel
 from ...flame.sequence import MIN_JOINT_ANGLE_DEG, FlameSequence, joint_angles
 from .. import arrays, tags
 from ..arrays import Z_UP_TO_Y_UP, add_driver, flat_floats, key_points
+from ..compat import keep_strips
 from ..objects import Warn, capture_root, leave_edit_mode, log_warning, place, remove, reset
 from . import keyframes
 from .keyframes import MAX_SLIDER, key_value_path, location_path, property_path, rotation_path
@@ -32,14 +33,21 @@ def import_head(capture: Capture, warn: Warn = log_warning, correctives: str = "
     timestep. A FLAME capture becomes a rig (see `add_rig`, also for `correctives`); any other gets
     a shape key per timestep, `t00012`, which is 1 at its own frame. Object coordinates are the
     capture's (meters, y up). Regions become boolean face attributes. Importing the same source
-    again replaces the last import; vertex groups and materials stay if the triangles are the same.
+    again replaces the last import; vertex groups and materials stay if the triangles are the same,
+    and the NLA strips of performances.
     `warn` receives one sentence per problem. Raises StgaError where a timestep cannot be read, and
     leaves the scene."""
     sequence = capture.flame
     if sequence is not None:
         frames = sequence.frames()
+        before = next(iter(tags.find(tags.HEAD, capture.root)), None)
+        rig = next(iter(_rigs(before)), None) if before is not None else None
+        give_keys = keep_strips(before.data.shape_keys if before is not None else None)
+        give_bones = keep_strips(rig)
         head = _place_head(capture)
-        add_rig(head, sequence, frames, warn, correctives)
+        rig = add_rig(head, sequence, frames, warn, correctives)
+        give_keys(head.data.shape_keys)
+        give_bones(rig)
         return head
     meshes = [flat_floats(capture.mesh(timestep)) for timestep in capture.timesteps]
     head = _place_head(capture)

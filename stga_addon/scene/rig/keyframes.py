@@ -165,12 +165,14 @@ def check_keyable(owner: Any, bones: Sequence[str] = ()) -> None:
 class Placement(NamedTuple):
     """Where keyframes of a motion go. start: the first frame; name: of the motion, which new
     actions get; parts: of PARTS, those that are replaced; as_strip: into a strip of the NLA editor,
-    with effect only where it lasts, instead of a copy of the action."""
+    with effect only where it lasts, instead of a copy of the action; blend: frames at both of its
+    ends over which it passes into what is below, another strip or the head's own animation."""
 
     start: int
     name: str
     parts: Sequence[str] = tuple(PARTS)
     as_strip: bool = False
+    blend: float = 0.0
 
 
 @contextmanager
@@ -193,6 +195,11 @@ def new_actions(
         owner.animation_data.action.use_fake_user = True
         if placement.as_strip:
             push_down_action(owner, extrapolation="NOTHING")
+            strip = owner.animation_data.nla_tracks[-1].strips[0]
+            # both, also where the motion is too short for the two
+            blend = min(placement.blend, (strip.frame_end - strip.frame_start) / 2)
+            strip.blend_in = blend
+            strip.blend_out = blend
 
 
 def key_tracked_offsets(
