@@ -17,6 +17,7 @@ from ..stga_addon.errors import StgaError
 from ..stga_addon.flame.forward import FlameFrame
 from ..stga_addon.flame.sequence import PARTS, FlameSequence, retimed
 from ..stga_addon.scene import tags
+from ..stga_addon.scene.record import stored_path
 from ..stga_addon.scene.rig import motion as rig_motion
 from ..stga_addon.scene.rig.keyframes import (
     Placement,
@@ -216,7 +217,7 @@ class ApplyMotion(Edit, bpy.types.Operator, FileImport):
         render = context.scene.render
         other = bpy.data.objects.get(self.source)
         if path is not None:
-            model = common.flame_model_path(context, head.get(tags.FLAME_MODEL, ""))
+            model = common.flame_model_path(context, stored_path(head, tags.FLAME_MODEL))
             name = path.stem
             motion = open_capture(path, model).flame_motion()
             for sentence in motion.warnings:

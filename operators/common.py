@@ -18,6 +18,7 @@ from ..stga_addon.flame.sequence import FlameSequence
 from ..stga_addon.progress import Cancelled
 from ..stga_addon.scene import tags
 from ..stga_addon.scene.objects import mover_of
+from ..stga_addon.scene.record import capture_of, stored_path
 from ..stga_addon.scene.rig.head import rig_of
 from ..stga_addon.scene.rig.keyframes import shape_key_names
 from ..stga_addon.schema import alternatives, type_hints
@@ -262,9 +263,9 @@ def rig_or_none(head: Any) -> Any:
 def capture_source(head: Any) -> tuple[Path, Path | None, str]:
     """The capture that a head was imported from, its FLAME model and its convention of principal
     points, as `open_capture` takes them."""
-    model = head.get(tags.FLAME_MODEL)
+    model = stored_path(head, tags.FLAME_MODEL)
     point = tags.PRINCIPAL_POINT
-    capture = Path(head[tags.CAPTURE])
+    capture = capture_of(head)
     return capture, Path(model) if model else None, head.get(point, DEFAULT_PRINCIPAL_POINT)
 
 
@@ -333,8 +334,8 @@ class FileImport(ImportHelper):
         beside = bpy.data.filepath
         head = context.scene.stga.head
         hidden = bpy.utils.resource_path("USER")  # where the demo lies
-        if is_head(head) and not head[tags.CAPTURE].startswith(hidden):
-            beside = head[tags.CAPTURE]
+        if is_head(head) and not str(capture_of(head)).startswith(hidden):
+            beside = str(capture_of(head))
         if beside:  # else Blender proposes the .blend file's own name
             self.filepath = os.path.join(os.path.dirname(beside), "")
         return super().invoke(context, event)

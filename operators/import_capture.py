@@ -35,6 +35,7 @@ from ..stga_addon.scene.objects import (
     show_kind,
     show_progress,
 )
+from ..stga_addon.scene.record import capture_of, store_path
 from ..stga_addon.scene.rig.head import import_head
 from ..stga_addon.tracking.folder import is_tracked
 from ..stga_addon.tracking.footage.sources import VIDEO_SUFFIXES
@@ -76,7 +77,7 @@ class HeadImport(Edit):
         capture = open_capture(source, flame=model, principal_point=principal_point)
         show_progress(0.5)
         heads = [thing for thing in scene.objects if is_head(thing)]
-        others = [each for each in heads if each[tags.CAPTURE] != str(capture.root.resolve())]
+        others = [each for each in heads if capture_of(each) != capture.root.resolve()]
         is_new = len(heads) == len(others)
         head = import_head(capture, warn=warn, correctives=correctives)
         if others and is_new:
@@ -85,7 +86,7 @@ class HeadImport(Edit):
             set_up_scene = not others
         show_progress(0.8)
         cameras = import_cameras(capture, capture_root(capture.root), warn=warn)
-        head[tags.FLAME_MODEL] = str(capture.flame_file or "")
+        store_path(head, tags.FLAME_MODEL, str(capture.flame_file or ""))
         head[tags.PRINCIPAL_POINT] = principal_point
         head[tags.TRACKED] = is_tracked(capture.root)
         scene.stga.head = head

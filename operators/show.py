@@ -1,5 +1,6 @@
 """The Show step: avatars and splats of files, their display, and their light."""
 
+import os
 from contextlib import suppress
 from math import radians
 from typing import Any
@@ -22,7 +23,7 @@ from ..stga_addon.scene.render.scene_splats import forget_frame, relight_frame
 from ..stga_addon.scene.render.viewport_display import ENGINE, is_shown_as_trained
 from . import common, options
 from .common import Action, Edit, FileImport, file_path, head_of, need
-from .opened_files import run_of
+from .opened_files import is_run
 from .options import ONCE
 from .request import idle, start
 from .results import shown_splats
@@ -60,14 +61,14 @@ class ShowAvatar(Edit, bpy.types.Operator, FileImport):
         shown.hide_viewport = False
         if before is not None and context.view_layer.objects.get(shown.name) is shown:
             shown.hide_set(False)
-        shown[tags.AVATAR] = self.filepath
-        shown[tags.RUN] = str(path.resolve().parent)
         settings.splats = shown
         if self.hide_head:
             splat_object.hide_object(head, context.scene)
         show_world(path, head, context.scene)
         settings.avatar = self.filepath
-        settings.run_folder = run_of(self.filepath) or settings.run_folder
+        folder = os.path.dirname(self.filepath)
+        if is_run(folder):
+            settings.run_folder = folder
         if self.hide_head and head.library is not None:
             problem = "is linked, and covers the splats in renders; hide it in its file"
             self.warn(f"{head.name}: {problem}")

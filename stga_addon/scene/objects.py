@@ -13,6 +13,7 @@ import bpy
 from ..errors import StgaError
 from ..format import format_name
 from . import tags
+from .record import rebase_file
 
 # Receives one sentence for the user; operators pass their own report.
 Warn = Callable[[str], None]
@@ -173,9 +174,11 @@ def empty_file() -> None:
 
 def save_file(path: Path) -> None:
     """Save the open file. Raises StgaError where it cannot be written."""
+    file = str(path.resolve())
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        bpy.ops.wm.save_as_mainfile(filepath=str(path.resolve()), compress=True)
+        rebase_file(file)
+        bpy.ops.wm.save_as_mainfile(filepath=file, compress=True)
     except (OSError, RuntimeError) as error:
         raise StgaError(f"{path}: cannot be saved ({error})") from error
 
