@@ -73,6 +73,15 @@ def own_range(head: Any, own: FlameSequence) -> TrainedRange:
     return trained
 
 
+def _performer(settings: Any, name: str) -> Any:
+    """The object of a name that is to perform, the panel's where it has that, rather than the head
+    itself: linked objects may have the name of others."""
+    named = [thing for thing in bpy.data.objects if thing.name == name]
+    if settings.motion_source in named:
+        return settings.motion_source
+    return next((thing for thing in named if thing != settings.head), next(iter(named), None))
+
+
 class ApplyMotion(Edit, bpy.types.Operator, FileImport):
     """Animate this head with the expressions and pose of another person; its earlier animation is
     kept"""
@@ -215,7 +224,7 @@ class ApplyMotion(Edit, bpy.types.Operator, FileImport):
         """Apply a FLAME motion: of the file, read with this head's model, because expressions mean
         the same in both, or of another head. Returns its name and the number of frames."""
         render = context.scene.render
-        other = bpy.data.objects.get(self.source)
+        other = _performer(context.scene.stga, self.source)
         if path is not None:
             model = common.flame_model_path(context, stored_path(head, tags.FLAME_MODEL))
             name = path.stem

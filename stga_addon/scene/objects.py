@@ -24,6 +24,10 @@ AVATAR_SUFFIX = re.compile(r" avatar(?=( \d+)?$)")
 """Of a folder for capture and run of a video (`operators.track.proposed_folder`)."""
 
 
+IMPORTED_AVATAR = re.compile(r"(.+)_avatar(?:_\d+)?")
+"""A folder for the parts of an avatar's file (`operators.import_capture`)."""
+
+
 def capture_root(source: Path) -> Any:
     """The Empty that is the parent of all imported from the folder or file `source`, made where
     missing, in a collection of its own, both called like the source, or as what a "capture" is in,
@@ -35,6 +39,9 @@ def capture_root(source: Path) -> Any:
     name = format_name(source)
     if name == "capture":
         name = AVATAR_SUFFIX.sub("", source.resolve().parent.name) or name
+    elif name == "motion":
+        imported = IMPORTED_AVATAR.fullmatch(source.resolve().parent.name)
+        name = imported[1] if imported else name
     collection = bpy.data.collections.new(name)
     bpy.context.scene.collection.children.link(collection)
     root = bpy.data.objects.new(name, None)
