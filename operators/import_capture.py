@@ -128,14 +128,16 @@ class HeadImport(Edit):
             frame_head(head, middle, [context.window.screen])
         if set_up_scene and cameras:
             configure_scene(scene, capture, middle, warn=warn)
-        for sentence in capture.warnings:
-            if not self.ignored_warning or self.ignored_warning not in sentence:
-                warn(sentence)
+        for sentence in filter(self.is_told, capture.warnings):
+            warn(sentence)
         counted = {"timesteps": capture.timesteps, "triangles": capture.faces, "cameras": cameras}
         self.inform(", ".join(f"{len(all_)} {name}" for name, all_ in counted.items()))
         begin_sliders(head)
         show_panel()
         begin_preparing()
+
+    def is_told(self, warning: str) -> bool:
+        return not self.ignored_warning or self.ignored_warning not in warning
 
 
 class ImportCapture(HeadImport, bpy.types.Operator, FileImport):

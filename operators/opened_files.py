@@ -20,8 +20,6 @@ from ..stga_addon.scene.display.splat_object import (
     get_input,
     hide_covered,
     hide_in_layers,
-    is_enabled_on,
-    keep_evaluated,
     replace_native_splats,
 )
 from ..stga_addon.scene.objects import layers_with, mover_of, remove
@@ -203,10 +201,6 @@ def _after_update(scene: Any, *_: Any) -> None:
         thing = getattr(scene.stga, name)
         if thing is not None and thing.name not in scene.objects and not thing.users_collection:
             setattr(scene.stga, name, None)
-    head = scene.stga.head
-    splats = scene.stga.splats
-    if is_head(head) and head.hide_viewport and not (splats and is_enabled_on(splats, head)):
-        keep_evaluated(head, scene)  # which looks at all objects
 
 
 def register(at_end: AtEnd) -> None:

@@ -13,6 +13,7 @@ import bpy
 from ..errors import StgaError
 from ..format import format_name
 from . import tags
+from .evaluation import kept_evaluated
 from .record import rebase_file
 
 # Receives one sentence for the user; operators pass their own report.
@@ -293,12 +294,15 @@ def show_progress(share: float) -> None:
         bpy.context.window_manager.progress_update(share)
 
 
-def iterate_frames(numbers: Iterable[int]) -> Generator[int, None, None]:
-    """Set each frame in turn, with progress at the mouse pointer; restore the current one last."""
+def iterate_frames(
+    numbers: Iterable[int], things: Iterable[Any] = ()
+) -> Generator[int, None, None]:
+    """Set each frame in turn, with progress at the mouse pointer; restore the current one last.
+    things: objects that are read in each."""
     scene = Identity(bpy.context.scene)
     numbers = list(numbers)
     bpy.context.window_manager.progress_begin(0, 1)
-    with frame_kept(scene):
+    with frame_kept(scene), kept_evaluated(things):
         try:
             for index, number in enumerate(numbers):
                 scene.get().frame_set(number)

@@ -130,11 +130,6 @@ def _follows(splat_object: Any, head: Any) -> bool:
     return False
 
 
-def is_enabled_on(splat_object: Any, head: Any) -> bool:
-    """Whether Blender evaluates the head for the splat object's sake."""
-    return not splat_object.hide_viewport and _follows(splat_object, head)
-
-
 def show_world_splats(splats: Splats, name: str, scene: Any = None) -> Any:
     """Make a splat object of a world-space set, for example a standard 3DGS PLY, in a scene (None:
     the context's); returns it."""
@@ -228,17 +223,6 @@ def hide_object(obj: Any, scene: Any) -> None:
         obj.hide_render = obj.hide_viewport = True
     else:
         hide_in_layers(obj, scene)
-
-
-def keep_evaluated(head: Any, scene: Any) -> None:
-    """Let Blender move a head that `hide_object` has hidden also where no splats of it are enabled
-    any more, for whose sake it evaluates it: shown where they are gone."""
-    if head.library is not None or not head.hide_viewport:
-        return
-    splats = splats_of(head, scene)
-    if all(each.hide_viewport for each in splats):
-        head.hide_viewport = False
-        hide_in_layers(head, scene, bool(splats))
 
 
 def hide_covered(splat_object: Any, scene: Any) -> None:
