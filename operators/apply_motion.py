@@ -26,7 +26,7 @@ from ..stga_addon.scene.rig.keyframes import (
     has_shapes,
 )
 from . import common, options
-from .common import Edit, FileImport, file_path, head_of, is_head, own_motion, rig_or_none
+from .common import Edit, FileImport, file_path, head_of, is_head, own_motion
 from .options import ONCE
 
 LAST_FRAME = 1_048_574
@@ -268,7 +268,7 @@ class ApplyMotion(Edit, bpy.types.Operator, FileImport):
             self.warn(sentence)
         if performance.lost:
             self.warn(f"{path.name}: {performance.lost} rows are missing and were interpolated")
-        rig = rig_or_none(head)
+        rig = common.rig_or_shapes(head)
         if rig is not None and not (self.sliders and has_shapes(head)):
             own = own_motion(head)
             trained = self._trained(head)

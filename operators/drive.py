@@ -337,7 +337,7 @@ class DriveLive(Action, bpy.types.Operator):
                 f"{source.label}: receives from other devices, but online access is off in "
                 f"Blender's preferences (System > Network); allow it, or listen on {LOOPBACK}"
             )
-        pose = LivePose(head, rig_or_none(head))
+        pose = LivePose(head, common.rig_or_shapes(head))
         found = trained = None
         if pose.takes_frames:
             own = own_motion(head)

@@ -45,7 +45,7 @@ from ..stga_addon.scene.objects import (
     iterate_frames,
 )
 from ..stga_addon.scene.render.scene_splats import SplatCache, evaluated_splats, with_heads
-from ..stga_addon.scene.rig.head import has_shape_keys, shape_key_model
+from ..stga_addon.scene.rig.head import find_rig, has_shape_keys, shape_key_model
 from ..stga_addon.scene.rig.motion import sample_motion
 from ..stga_addon.scene.vertex_groups import training_selection
 from ..stga_addon.tracking.head_model import shape_arrays, write_linear_model
@@ -414,7 +414,7 @@ def scene_playback(context: Any, head: Any, frames: range, motion_only: bool) ->
 def exact_motion(head: Any, frames: range, warn: Warn) -> FlameSequence | None:
     """FLAME parameters of what the head plays; None without a rig, or, after saying why, where they
     would not give the scene's meshes."""
-    if common.rig_or_none(head) is None:
+    if find_rig(head) is None:
         return None
     reasons: list[str] = []
     motion = None

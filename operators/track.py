@@ -21,7 +21,7 @@ from ..stga_addon.scene import tags
 from ..stga_addon.scene.cameras import look_away, look_through
 from ..stga_addon.scene.objects import show_kind
 from ..stga_addon.scene.record import capture_of, stored_path
-from ..stga_addon.scene.rig.head import rig_of
+from ..stga_addon.scene.rig.head import usable_rig
 from ..stga_addon.scene.rig.keyframes import key_current_pose
 from ..stga_addon.scene.rig.motion import sample_pose
 from ..stga_addon.tracking.footage.sources import VIDEO_SUFFIXES
@@ -146,7 +146,7 @@ class MarkKey(Edit, bpy.types.Operator):
             del keys[frame]
         else:
             keys[frame] = sample_pose(head, common.own_motion(head).model).parameters
-            key_current_pose(head, rig_of(head), frame)
+            key_current_pose(head, usable_rig(head), frame)
         stored = {str(timestep): keys[timestep].tolist() for timestep in sorted(keys)}
         head[tags.TRACKING_KEYS] = json.dumps(stored)
 

@@ -118,9 +118,10 @@ def _exchange_tree(splat_object: Any, tree: Any) -> None:
             curve.data_path = place + moved
 
 
-def splats_of(head: Any, scene: Any) -> list[Any]:
-    """The splat objects of the scene that follow the head and can be changed: no linked ones."""
-    own = [each for each in scene.objects if tags.CONVENTION in each and each.library is None]
+def splats_of(head: Any, scene: Any, linked: bool = False) -> list[Any]:
+    """The splat objects of the scene that follow the head and can be changed, or are linked."""
+    shown = [each for each in scene.objects if tags.CONVENTION in each]
+    own = [each for each in shown if (each.library is not None) == linked]
     return [each for each in own if _follows(each, head)]
 
 

@@ -21,7 +21,7 @@ from ..arrays import evaluated_vertices, key_points, read_values, write_curves
 from ..evaluation import evaluated, kept_evaluated
 from ..objects import Identity, Warn, iterate_frames, log_warning
 from . import keyframes
-from .head import rig_of
+from .head import rig_of, usable_rig
 from .keyframes import Placement
 
 MESH_TOLERANCE = 1e-4  # metres that the mesh may differ from FLAME's of the sampled parameters
@@ -41,8 +41,8 @@ def apply_motion(
     a head that was given them. Without, both stay zero. Raises StgaError, and changes nothing,
     where the head has no rig, or one that cannot take the motion."""
     parts = placement.parts
-    rig = rig_of(head)
-    keyframes.check_keyable(rig, JOINTS)
+    rig = usable_rig(head)
+    keyframes.check_keyable(rig)
     keyframes.check_keyable(head.data.shape_keys)
     used = np.any([frame.expr != 0 for frame in frames], axis=0)
     sliders = keyframes.expression_keys(head)
