@@ -17,6 +17,7 @@ from ..stga_addon.errors import StgaError
 from ..stga_addon.flame.forward import FlameFrame
 from ..stga_addon.flame.sequence import PARTS, FlameSequence, retimed
 from ..stga_addon.scene import tags
+from ..stga_addon.scene.record import stored_path
 from ..stga_addon.scene.rig import motion as rig_motion
 from ..stga_addon.scene.rig.keyframes import (
     Placement,
@@ -25,7 +26,7 @@ from ..stga_addon.scene.rig.keyframes import (
     has_shapes,
 )
 from . import common, options
-from .common import Edit, FileImport, file_path, head_of, is_head, own_motion, rig_or_none
+from .common import Edit, FileImport, file_path, head_of, is_head, own_motion
 from .options import ONCE
 
 LAST_FRAME = 1_048_574
@@ -70,6 +71,15 @@ def own_range(head: Any, own: FlameSequence) -> TrainedRange:
     trained = open_motion.trained_range([own.frame(timestep) for timestep in own.timesteps])
     rig_motion.store_range(head, trained)
     return trained
+
+
+def _performer(settings: Any, name: str) -> Any:
+    """The object of a name that is to perform, the panel's where it has that, rather than the head
+    itself: linked objects may have the name of others."""
+    named = [thing for thing in bpy.data.objects if thing.name == name]
+    if settings.motion_source in named:
+        return settings.motion_source
+    return next((thing for thing in named if thing != settings.head), next(iter(named), None))
 
 
 class ApplyMotion(Edit, bpy.types.Operator, FileImport):
@@ -223,9 +233,9 @@ class ApplyMotion(Edit, bpy.types.Operator, FileImport):
         """Apply a FLAME motion: of the file, read with this head's model, because expressions mean
         the same in both, or of another head. Returns its name and the number of frames."""
         render = context.scene.render
-        other = bpy.data.objects.get(self.source)
+        other = _performer(context.scene.stga, self.source)
         if path is not None:
-            model = common.flame_model_path(context, head.get(tags.FLAME_MODEL, ""))
+            model = common.flame_model_path(context, stored_path(head, tags.FLAME_MODEL))
             name = path.stem
             motion = open_capture(path, model).flame_motion()
             for sentence in motion.warnings:
@@ -267,7 +277,7 @@ class ApplyMotion(Edit, bpy.types.Operator, FileImport):
             self.warn(sentence)
         if performance.lost:
             self.warn(f"{path.name}: {performance.lost} rows are missing and were interpolated")
-        rig = rig_or_none(head)
+        rig = common.rig_or_shapes(head)
         if rig is not None and not (self.sliders and has_shapes(head)):
             own = own_motion(head)
             trained = self._trained(head)

@@ -98,7 +98,8 @@ def _played(head: Any) -> Played:
     capture has moved, or a FLAME head has no rig."""
     frames = scene_frames(bpy.context.scene)
     meshes = {
-        frame: np.asarray(evaluated_vertices(head), np.float64) for frame in iterate_frames(frames)
+        frame: np.asarray(evaluated_vertices(head), np.float64)
+        for frame in iterate_frames(frames, [head])
     }
     flame = open_capture(*capture_source(head)).flame
     motion = None if flame is None else motion_arrays(sample_motion(head, flame, frames))

@@ -18,7 +18,8 @@ from ..stga_addon.flame.sequence import FlameSequence
 from ..stga_addon.progress import Cancelled
 from ..stga_addon.scene import tags
 from ..stga_addon.scene.objects import mover_of
-from ..stga_addon.scene.rig.head import rig_of
+from ..stga_addon.scene.record import capture_of, stored_path
+from ..stga_addon.scene.rig.head import LINKED, find_rig, usable_rig
 from ..stga_addon.scene.rig.keyframes import shape_key_names
 from ..stga_addon.schema import alternatives, type_hints
 from . import options
@@ -254,19 +255,35 @@ def head_of(context: Any) -> Any:
 
 
 def rig_or_none(head: Any) -> Any:
-    """The FLAME rig of a head; None where it has none, or is no head."""
+    """The FLAME rig of a head that can be posed here; None where there is none."""
     try:
-        return rig_of(head) if is_head(head) else None
+        return usable_rig(head) if is_head(head) else None
     except StgaError:
         return None
+
+
+def rig_problem(head: Any) -> str:
+    """Why a head's FLAME rig cannot be posed here; "" where it can, or there is none."""
+    try:
+        if is_head(head):
+            rig_or_shapes(head)
+    except StgaError as error:
+        return str(error)
+    return ""
+
+
+def rig_or_shapes(head: Any) -> Any:
+    """The FLAME rig of a head; None where it has none, but shape keys. Raises StgaError where the
+    rig cannot be posed here."""
+    return None if find_rig(head) is None else usable_rig(head)
 
 
 def capture_source(head: Any) -> tuple[Path, Path | None, str]:
     """The capture that a head was imported from, its FLAME model and its convention of principal
     points, as `open_capture` takes them."""
-    model = head.get(tags.FLAME_MODEL)
+    model = stored_path(head, tags.FLAME_MODEL)
     point = tags.PRINCIPAL_POINT
-    capture = Path(head[tags.CAPTURE])
+    capture = capture_of(head)
     return capture, Path(model) if model else None, head.get(point, DEFAULT_PRINCIPAL_POINT)
 
 
@@ -300,16 +317,24 @@ def needs_own_head(operator: Any, context: Any) -> bool:
         return False
     head = context.scene.stga.head
     is_own = head.library is None and head.data.library is None
-    remedy = "open that file, or make the head local"
-    return polled(operator, is_own, f"The head is linked from another file: {remedy}")
+    return polled(operator, is_own, f"The head {LINKED}")
 
 
 def needs_rig(operator: Any, context: Any) -> bool:
     """Poll: whether there is a head with a FLAME rig that can be animated."""
-    if not needs_own_head(operator, context):
+    return _needs_rig(operator, context, with_sliders=True)
+
+
+def needs_bones(operator: Any, context: Any) -> bool:
+    """Poll: whether there is a head whose bones can be posed."""
+    return _needs_rig(operator, context, with_sliders=False)
+
+
+def _needs_rig(operator: Any, context: Any, with_sliders: bool) -> bool:
+    if not needs_head(operator, context):
         return False
     try:
-        return rig_of(context.scene.stga.head) is not None
+        return usable_rig(context.scene.stga.head, with_sliders) is not None
     except StgaError as error:
         return polled(operator, False, str(error))
 
@@ -317,7 +342,7 @@ def needs_rig(operator: Any, context: Any) -> bool:
 def needs_rig_or_shapes(operator: Any, context: Any) -> bool:
     """Poll: whether there is a head with a FLAME rig or with shape keys of ARKit's names."""
     head = context.scene.stga.head
-    has_shapes = is_head(head) and shape_key_names(head)
+    has_shapes = is_head(head) and find_rig(head) is None and shape_key_names(head)
     return (needs_own_head if has_shapes else needs_rig)(operator, context)
 
 
@@ -335,8 +360,8 @@ class FileImport(ImportHelper):
         beside = bpy.data.filepath
         head = context.scene.stga.head
         hidden = bpy.utils.resource_path("USER")  # where the demo lies
-        if is_head(head) and not head[tags.CAPTURE].startswith(hidden):
-            beside = head[tags.CAPTURE]
+        if is_head(head) and not str(capture_of(head)).startswith(hidden):
+            beside = str(capture_of(head))
         if beside:  # else Blender proposes the .blend file's own name
             self.filepath = os.path.join(os.path.dirname(beside), "")
         return super().invoke(context, event)

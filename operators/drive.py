@@ -27,6 +27,7 @@ from ..stga_addon.jobs.convert_motion import SHAPES_SUFFIX, ConvertMotion
 from ..stga_addon.jobs.table import Kind
 from ..stga_addon.scene import tags
 from ..stga_addon.scene.objects import Identity, show_progress
+from ..stga_addon.scene.record import capture_of, stored_path
 from ..stga_addon.scene.rig.motion import LivePose, stored_range
 from ..stga_addon.training.run.folder import has_run, read_run
 from . import common, options, timers
@@ -336,7 +337,7 @@ class DriveLive(Action, bpy.types.Operator):
                 f"{source.label}: receives from other devices, but online access is off in "
                 f"Blender's preferences (System > Network); allow it, or listen on {LOOPBACK}"
             )
-        pose = LivePose(head, rig_or_none(head))
+        pose = LivePose(head, common.rig_or_shapes(head))
         found = trained = None
         if pose.takes_frames:
             own = own_motion(head)
@@ -479,7 +480,11 @@ class DriveVideo(Action, bpy.types.Operator, FileImport):
         given = common.given_values(self, ConvertMotion, "avatar")
         suffix = SHAPES_SUFFIX
         is_trained_on = bool(given) and rig_or_none(head) is not None
-        if is_trained_on and read_run(given["avatar"]).capture == Path(head[tags.CAPTURE]):
+        run = Path(bpy.path.abspath(stored_path(head, tags.RUN)))
+        if is_trained_on and (
+            given["avatar"] == run.resolve()
+            or read_run(given["avatar"]).capture == capture_of(head)
+        ):
             # exact, a timestep for each frame
             suffix = ".npz"
             render = context.scene.render

@@ -2,7 +2,7 @@
 head model for tracking."""
 
 import os
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, closing, suppress
 from dataclasses import replace
@@ -36,6 +36,7 @@ from ..stga_addon.scene.arrays import Z_UP_TO_Y_UP, evaluated_vertices
 from ..stga_addon.scene.cameras import export_cameras, scene_camera
 from ..stga_addon.scene.display.splat_nodes import NATIVE
 from ..stga_addon.scene.display.splat_object import check_head, display_mode, later_modifiers
+from ..stga_addon.scene.evaluation import kept_evaluated
 from ..stga_addon.scene.objects import (
     Identity,
     SceneView,
@@ -43,8 +44,8 @@ from ..stga_addon.scene.objects import (
     frames_per_second,
     iterate_frames,
 )
-from ..stga_addon.scene.render.scene_splats import SplatCache, evaluated_splats
-from ..stga_addon.scene.rig.head import has_shape_keys, shape_key_model
+from ..stga_addon.scene.render.scene_splats import SplatCache, evaluated_splats, with_heads
+from ..stga_addon.scene.rig.head import find_rig, has_shape_keys, shape_key_model
 from ..stga_addon.scene.rig.motion import sample_motion
 from ..stga_addon.scene.vertex_groups import training_selection
 from ..stga_addon.tracking.head_model import shape_arrays, write_linear_model
@@ -109,17 +110,20 @@ class SplatExport(Stepwise, FileExport):
         formats.check_suffix(path, self.format)
         return path
 
-    def write_frames(self: Any, context: Any, path: Path, read: Read, write: Write) -> Any:
+    def write_frames(
+        self: Any, context: Any, path: Path, read: Read, write: Write, things: Sequence[Any]
+    ) -> Any:
         """Let `write` take what `read` finds in each frame that the format holds, with its number:
-        in steps where a dialog has been shown."""
+        in steps where a dialog has been shown. things: objects that are read."""
         scene = context.scene
         frames = scene_frames(scene)
         if FORMATS[self.format].source != "range":
             frames = range(scene.frame_current, scene.frame_current + 1)
         if self._is_invoked:
-            steps = self.export(SceneView(context), read, path, frames, write)
+            view = SceneView(context)
+            steps = _keeping(view, things, self.export(view, read, path, frames, write))
             return self.begin(context, steps, STEP_INTERVAL_S)
-        write((frame, read()) for frame in iterate_frames(frames))
+        write((frame, read()) for frame in iterate_frames(frames, things))
         self.inform(f"Exported to {path}")
         return None
 
@@ -161,6 +165,15 @@ class SplatExport(Stepwise, FileExport):
                 raise Cancelled(sentence) from error
         late = "; it was complete when Esc was pressed" if was_named else ""
         self.inform(f"Exported to {path}{late}")
+
+
+def _keeping(view: SceneView, things: Sequence[Any], steps: StepGenerator) -> StepGenerator:
+    """Steps in which Blender evaluates these objects."""
+    known = [Identity(thing) for thing in things if thing is not None]
+    with ExitStack() as kept:
+        with view.shown():
+            kept.enter_context(kept_evaluated(each.get() for each in known))
+        yield from steps
 
 
 class ExportAvatar(SplatExport, bpy.types.Operator):
@@ -229,7 +242,9 @@ class ExportAvatar(SplatExport, bpy.types.Operator):
             formats.export_avatar(path, avatar, self.format, meshes, motion, playback)
 
         owner = Identity(head)
-        return self.write_frames(context, path, lambda: evaluated_vertices(owner.get()), write)
+        return self.write_frames(
+            context, path, lambda: evaluated_vertices(owner.get()), write, [head]
+        )
 
 
 class ExportSplats(SplatExport, bpy.types.Operator):
@@ -280,14 +295,16 @@ class ExportSplats(SplatExport, bpy.types.Operator):
             depsgraph = bpy.context.evaluated_depsgraph_get()
             return evaluated_splats(depsgraph, SplatCache(self.format == "usd"), to_file)
 
+        things = with_heads(context.scene)
         if format.source == "range":
-            content = SimpleNamespace(splats=read(), moving_color=False)
+            with kept_evaluated(things):
+                content = SimpleNamespace(splats=read(), moving_color=False)
             formats.check_free_space(path, format.size(content, count))
 
         def write(frames: Iterable[tuple[int, Splats]]) -> None:
             formats.write_content(path, self.format, WorldContent(frames, playback))
 
-        return self.write_frames(context, path, read, write)
+        return self.write_frames(context, path, read, write, things)
 
 
 class _Writer:
@@ -397,7 +414,7 @@ def scene_playback(context: Any, head: Any, frames: range, motion_only: bool) ->
 def exact_motion(head: Any, frames: range, warn: Warn) -> FlameSequence | None:
     """FLAME parameters of what the head plays; None without a rig, or, after saying why, where they
     would not give the scene's meshes."""
-    if common.rig_or_none(head) is None:
+    if find_rig(head) is None:
         return None
     reasons: list[str] = []
     motion = None

@@ -2,6 +2,9 @@
 the capture of a generated person that the complete edition brings; files dropped into the 3D
 viewport."""
 
+import glob
+import hashlib
+import os
 import shutil
 import zipfile
 from pathlib import Path
@@ -18,9 +21,13 @@ from ..stga_addon.export.skinned_reader import (
     AVATAR_FILE,
     MODEL_FILE,
     MOTION_FILE,
+    SkinnedSplats,
+    read_skinned_splats,
     unpack_skinned_splats,
 )
 from ..stga_addon.export.splat_files import READERS
+from ..stga_addon.files import is_file, read_bytes
+from ..stga_addon.flame.model import MASK_FILE
 from ..stga_addon.flame.sequence import FIELD_ALIASES, FRAME_FIELDS
 from ..stga_addon.scene import tags
 from ..stga_addon.scene.avatar_scene import frame_head, hide_default_cube, place_beside
@@ -35,10 +42,11 @@ from ..stga_addon.scene.objects import (
     show_kind,
     show_progress,
 )
+from ..stga_addon.scene.record import capture_of, store_path
 from ..stga_addon.scene.rig.head import import_head
 from ..stga_addon.tracking.folder import is_tracked
 from ..stga_addon.tracking.footage.sources import VIDEO_SUFFIXES
-from ..stga_addon.training.run.folder import has_run
+from ..stga_addon.training.run.folder import has_run, next_folder
 from . import options
 from .common import Edit, FileImport, call, file_path, flame_model_path, is_head, need, package
 from .kernels import begin_preparing
@@ -51,11 +59,21 @@ FOLDERS_ABOVE_FILE = 3
 DEMO = Path(__file__).parents[1] / "demo_capture"
 """In the complete edition; the others have none."""
 DEMO_MINUTES = 1.0
+USER_AVATARS = "stga_avatars"
+"""Folder among Blender's user files for the parts of avatars from folders that are read-only."""
+SOURCE_FILE = "source.sha256"
+"""Digest of the file that a folder holds the parts of."""
+UNPACKED = (AVATAR_FILE, MODEL_FILE, MOTION_FILE, SOURCE_FILE)
 MOTION_FIELDS = {*FRAME_FIELDS, *FIELD_ALIASES, "pose"}
 
 
 class HeadImport(Edit):
-    """Mixin of operators that import a head."""
+    """Mixin of operators that import a head.
+
+    ignored_warning: of the capture, a word of that which says nothing here
+    """
+
+    ignored_warning = ""
 
     def bring_in(
         self: Any,
@@ -76,7 +94,7 @@ class HeadImport(Edit):
         capture = open_capture(source, flame=model, principal_point=principal_point)
         show_progress(0.5)
         heads = [thing for thing in scene.objects if is_head(thing)]
-        others = [each for each in heads if each[tags.CAPTURE] != str(capture.root.resolve())]
+        others = [each for each in heads if capture_of(each) != capture.root.resolve()]
         is_new = len(heads) == len(others)
         head = import_head(capture, warn=warn, correctives=correctives)
         if others and is_new:
@@ -85,7 +103,7 @@ class HeadImport(Edit):
             set_up_scene = not heads
         show_progress(0.8)
         cameras = import_cameras(capture, capture_root(capture.root), warn=warn)
-        head[tags.FLAME_MODEL] = str(capture.flame_file or "")
+        store_path(head, tags.FLAME_MODEL, str(capture.flame_file or ""))
         head[tags.PRINCIPAL_POINT] = principal_point
         head[tags.TRACKED] = is_tracked(capture.root)
         scene.stga.head = head
@@ -110,13 +128,16 @@ class HeadImport(Edit):
             frame_head(head, middle, [context.window.screen])
         if set_up_scene and cameras:
             configure_scene(scene, capture, middle, warn=warn)
-        for sentence in capture.warnings:
+        for sentence in filter(self.is_told, capture.warnings):
             warn(sentence)
         counted = {"timesteps": capture.timesteps, "triangles": capture.faces, "cameras": cameras}
         self.inform(", ".join(f"{len(all_)} {name}" for name, all_ in counted.items()))
         begin_sliders(head)
         show_panel()
         begin_preparing()
+
+    def is_told(self, warning: str) -> bool:
+        return not self.ignored_warning or self.ignored_warning not in warning
 
 
 class ImportCapture(HeadImport, bpy.types.Operator, FileImport):
@@ -203,21 +224,52 @@ class ImportMeshes(HeadImport, bpy.types.Operator, FileImport):
 
 class ImportAvatar(HeadImport, bpy.types.Operator, FileImport):
     """Import a head with bones, sliders, motion and splats from a file of the export format Skinned
-    glTF; a folder beside it gets its parts"""
+    glTF; a new folder beside it gets its parts"""
 
     bl_label = "Import Avatar"
 
     filter_glob: options.file_filter(".glb")
+    ignored_warning = MASK_FILE  # the file's model is no FLAME model, which masks are made for
 
     def run(self, context: Any) -> set[str]:
         path = file_path(self.filepath, "avatar")
-        folder = path.with_name(f"{path.stem}_avatar")
+        folder, found = _unpacked(path)
         is_first = not any(is_head(thing) for thing in context.scene.objects)
-        found = unpack_skinned_splats(path, folder)
         self.bring_in(context, folder / MOTION_FILE, str(folder / MODEL_FILE))
         if is_first:
             set_frames_per_second(context.scene, found.fps)
         return call(bpy.ops.stga.show_avatar, filepath=str(folder / AVATAR_FILE))
+
+
+def _unpacked(path: Path) -> tuple[Path, SkinnedSplats]:
+    """The folder with the parts of an avatar's file, and what that holds.
+
+    It is the folder of an earlier import of the same file, or a new one: beside the file or, where
+    that cannot be written, among Blender's user files. Raises StgaError.
+    """
+    digest = hashlib.sha256(read_bytes(path)).hexdigest()
+    kept = Path(bpy.utils.user_resource("DATAFILES", path=USER_AVATARS))
+    places = [parent / f"{path.stem}_avatar" for parent in (path.parent, kept)]
+    for place in places:
+        for folder in (place, *place.parent.glob(f"{glob.escape(place.name)}_*")):
+            made = all(is_file(folder / name) for name in UNPACKED)
+            if made and read_bytes(folder / SOURCE_FILE) == digest.encode():
+                return folder, read_skinned_splats(path)
+    for place in places:
+        folder = next_folder(place) if os.path.lexists(place) else place
+        try:
+            folder.mkdir(parents=True)
+        except OSError as error:
+            problem = f"{folder}: cannot be made ({error.strerror or error})"
+            continue
+        try:
+            found = unpack_skinned_splats(path, folder)
+            (folder / SOURCE_FILE).write_text(digest)
+        except BaseException:
+            shutil.rmtree(folder, ignore_errors=True)
+            raise
+        return folder, found
+    raise StgaError(problem)
 
 
 class OpenDemo(HeadImport, bpy.types.Operator):

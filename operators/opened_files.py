@@ -2,6 +2,8 @@
 panel works on."""
 
 import os
+from collections.abc import Iterable
+from contextlib import suppress
 from math import radians
 from pathlib import Path
 from typing import Any
@@ -9,37 +11,40 @@ from typing import Any
 import bpy
 from bpy.app.handlers import persistent
 
+from ..stga_addon.errors import StgaError
 from ..stga_addon.scene import tags
-from ..stga_addon.scene.compat import APPENDED
+from ..stga_addon.scene.compat import APPENDED, SAVE_FAILED, stored_value
+from ..stga_addon.scene.display import splat_nodes
 from ..stga_addon.scene.display.node_builder import Nodes, kept_material
 from ..stga_addon.scene.display.splat_object import (
+    get_input,
     hide_covered,
     hide_in_layers,
-    is_enabled_on,
-    keep_evaluated,
     replace_native_splats,
 )
 from ..stga_addon.scene.objects import layers_with, mover_of, remove
+from ..stga_addon.scene.record import owner_of, rebase, rebase_file, store_path, stored_path
 from ..stga_addon.scene.render.viewport_display import is_shown_as_trained
 from ..stga_addon.training.run.folder import has_run
 from . import monitor
 from .common import UNSAVED, AtEnd, is_head, register_handlers
-from .results import HEADS, avatar_of
+from .results import HEADS, look_for_run
 from .windows import redraw, show_panel
 
 
 @persistent
 def _before_save(path: str) -> None:
-    _rebase(bpy.data.filepath, path)
+    rebase_file(path)
     if not bpy.app.is_job_running("RENDER"):
         _add_notes()
 
 
 @persistent
 def _after_save(path: str) -> None:
+    """Also where saving has failed."""
     _remove_notes()
-    if bpy.data.filepath != path:  # a copy was saved
-        _rebase(path, bpy.data.filepath)
+    if bpy.data.filepath != path:  # a copy was saved, or nothing
+        rebase_file(bpy.data.filepath)
     manager = bpy.context.window_manager
     if bpy.data.filepath and UNSAVED in manager.stga_message:
         manager.stga_message = ""
@@ -79,35 +84,12 @@ def _remove_notes() -> None:
     remove(each for each in bpy.data.objects if each.get(tags.KIND) == tags.NOTE)
 
 
-def _rebase(old: str, new: str) -> None:
-    """Let scenes and splats find their run and avatar from another .blend file."""
-    for settings in [scene.stga for scene in bpy.data.scenes if scene.library is None]:
-        for name in ("run_folder", "avatar"):
-            value = getattr(settings, name)
-            moved = _rebased(value, old, new)
-            if moved != value:
-                setattr(settings, name, moved)
-    for thing in [thing for thing in bpy.data.objects if thing.library is None]:
-        for tag in (tags.AVATAR, tags.RUN_FOLDER):
-            if tag in thing:
-                thing[tag] = _rebased(thing[tag], old, new)
-
-
-def _rebased(value: str, old: str, new: str) -> str:
-    """A path of the .blend file `old` ("": not saved) for `new`: relative where it lies beside that
-    or below, so that all can be moved together; as it is where there is nothing."""
-    place = Path(bpy.path.abspath(value, start=str(Path(old).parent)))
-    beside = Path(new).parent
-    if not value or (value.startswith("//") and not old) or not place.exists():
-        return value
-    is_beside = bool(new) and place.is_relative_to(beside)
-    return f"//{place.relative_to(beside).as_posix()}" if is_beside else str(place)
-
-
 @persistent
 def _after_load(_: Any) -> None:
     monitor.forget_file()
     _remove_notes()
+    rebase_file(bpy.data.filepath, moved_first=True)
+    _read_older(bpy.data.objects)
     _choose_head()
     _say(replace_native_splats(bpy.data.objects))
     monitor.start_timer()
@@ -139,10 +121,32 @@ def _after_append(imported: Any) -> None:
             hide_in_layers(thing, scene)
         elif tags.CONVENTION in thing:
             hide_covered(thing, scene)
-            if tags.AVATAR in thing and thing.library is None and item.source_library is not None:
-                source = bpy.path.abspath(item.source_library.filepath)
-                thing[tags.AVATAR] = _rebased(thing[tags.AVATAR], source, bpy.data.filepath)
+        if item.source_library is not None and not isinstance(thing, bpy.types.Collection):
+            source = bpy.path.abspath(item.source_library.filepath)
+            rebase([thing], bpy.data.filepath, source=source)
+    _read_older(appended)
     _choose_head()
+
+
+def _read_older(things: Iterable[Any]) -> None:
+    """Move run and avatar from where older versions stored them, splats and scene, to the head."""
+    for thing in things:
+        if tags.CONVENTION not in thing or thing.library is not None:
+            continue
+        avatar = thing.pop(tags.AVATAR, "")
+        thing.pop("stga_run", None)
+        with suppress(StgaError):  # it has lost its modifier
+            head = get_input(thing, splat_nodes.HEAD)
+            if avatar and head is not None and head.library is None and tags.AVATAR not in head:
+                store_path(head, tags.AVATAR, avatar)
+    for scene in [scene for scene in bpy.data.scenes if scene.library is None]:
+        owner = owner_of(scene, scene.stga.head)
+        for name, tag in (("run_folder", tags.RUN), ("avatar", tags.AVATAR)):
+            value = stored_value(scene.stga, name)
+            if value:
+                scene.stga.property_unset(name)
+            if value and not owner.get(tag):
+                store_path(owner, tag, value)
 
 
 def _choose_head() -> None:
@@ -157,16 +161,18 @@ def _choose_head() -> None:
             show_panel()
             if settings.splats is None and len(shown) == 1:
                 settings.splats = shown[0]
-                settings.avatar = settings.avatar or avatar_of(shown[0])
-        settings.holds_run = has_run(Path(bpy.path.abspath(settings.run_folder)))
-        if not settings.holds_run:
-            settings.run_folder = run_of(settings.avatar) or settings.run_folder
+        for head in heads:
+            avatar = stored_path(head, tags.AVATAR)
+            folder = os.path.dirname(avatar)
+            known = Path(bpy.path.abspath(stored_path(head, tags.RUN) or "//"))
+            if head.library is None and not has_run(known) and is_run(folder):
+                store_path(head, tags.RUN, folder)
+        look_for_run(settings)
 
 
-def run_of(avatar: str) -> str:
-    """The folder of the run that an avatar's path, which may begin with "//", lies in; or ""."""
-    folder = os.path.dirname(avatar)
-    return folder if has_run(Path(bpy.path.abspath(folder))) else ""
+def is_run(folder: str) -> bool:
+    """Whether a path, which may begin with "//", is the folder of a run."""
+    return bool(folder) and has_run(Path(bpy.path.abspath(folder)))
 
 
 _active: dict[int, int] = {}
@@ -198,14 +204,13 @@ def _after_update(scene: Any, *_: Any) -> None:
         thing = getattr(scene.stga, name)
         if thing is not None and thing.name not in scene.objects and not thing.users_collection:
             setattr(scene.stga, name, None)
-    head = scene.stga.head
-    splats = scene.stga.splats
-    if is_head(head) and head.hide_viewport and not (splats and is_enabled_on(splats, head)):
-        keep_evaluated(head, scene)  # which looks at all objects
 
 
 def register(at_end: AtEnd) -> None:
     handlers = bpy.app.handlers
     files = (handlers.load_post, _after_load), (APPENDED, _after_append)
     saving = (handlers.save_pre, _before_save), (handlers.save_post, _after_save)
-    register_handlers(at_end, *files, *saving, (handlers.depsgraph_update_post, _after_update))
+    failed = (SAVE_FAILED, _after_save)
+    register_handlers(
+        at_end, *files, *saving, failed, (handlers.depsgraph_update_post, _after_update)
+    )

@@ -14,9 +14,9 @@ from ..stga_addon.scene import tags
 from ..stga_addon.scene.compat import select_bones
 from ..stga_addon.scene.objects import Identity, leave_edit_mode, show_kind
 from ..stga_addon.scene.rig import keyframes
-from ..stga_addon.scene.rig.head import rig_of
+from ..stga_addon.scene.rig.head import usable_rig
 from . import common, timers
-from .common import AtEnd, Edit, head_of, need, needs_rig, rig_or_none
+from .common import AtEnd, Edit, head_of, need, needs_bones, needs_rig, rig_or_none
 from .windows import push_undo, redraw
 
 POLL_INTERVAL_S = 0.3
@@ -27,12 +27,12 @@ class PoseHead(Edit, bpy.types.Operator):
     keeps its pose"""
 
     bl_label = "Pose the Head"
-    needs = (needs_rig,)
+    needs = (needs_bones,)
 
     def run(self, context: Any) -> None:
         head = head_of(context)
         objects = context.view_layer.objects
-        rig = rig_of(head)
+        rig = usable_rig(head, with_sliders=False)
         was_posing = is_posing(context, rig)
         leave_edit_mode()
         show_kind(head.parent, tags.RIG, context.view_layer, not was_posing)

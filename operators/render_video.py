@@ -22,6 +22,7 @@ from ..stga_addon.raster.posed_splats import PosedSplats
 from ..stga_addon.render.video import Recorder, check_output
 from ..stga_addon.scene import light
 from ..stga_addon.scene.cameras import scene_camera, turntable_cameras
+from ..stga_addon.scene.evaluation import kept_evaluated
 from ..stga_addon.scene.gpu.context import has_gpu_context
 from ..stga_addon.scene.layers import SceneLayer
 from ..stga_addon.scene.objects import (
@@ -33,7 +34,7 @@ from ..stga_addon.scene.objects import (
 )
 from ..stga_addon.scene.render import engine, viewport_display
 from ..stga_addon.scene.render.drawn_video import DrawnVideo
-from ..stga_addon.scene.render.scene_splats import SplatCache, all_layers
+from ..stga_addon.scene.render.scene_splats import SplatCache, all_layers, with_heads
 from ..stga_addon.scene.render.view_transform import srgb_background
 from ..stga_addon.worker.status import status_writer
 from . import monitor, options
@@ -167,6 +168,7 @@ class RenderVideo(Stepwise, bpy.types.Operator, FileExport):
             kept.callback(shutil.rmtree, folder, ignore_errors=True)
             with ExitStack() as recording:
                 recording.enter_context(frame_kept(view.scene))
+                recording.enter_context(kept_evaluated(with_heads(scene)))
                 status = recording.enter_context(status_writer(folder))
                 recorder = Recorder(folder / RECORDING)
                 recording.callback(recorder.close)

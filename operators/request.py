@@ -22,7 +22,7 @@ from ..stga_addon.worker.status import WorkerState, failure_report
 from . import monitor, options, timers
 from .common import Action, Poll, file_path, need, polled
 from .options import ONCE
-from .results import keep_run_folder
+from .results import look_for_run
 
 
 def start(
@@ -144,7 +144,7 @@ class Dismiss(Action, bpy.types.Operator):
         if not monitor.state_of(context.scene, kind).can_be_dismissed:
             raise StgaError(f"{KINDS[kind].label} is running, or was never asked for in this scene")
         monitor.handle(context.scene, kind, Dismissed())
-        keep_run_folder(context.scene.stga)  # which the request was known to be in
+        look_for_run(context.scene.stga)  # which the request was known to be in
 
 
 class CopyReport(Action, bpy.types.Operator):

@@ -23,6 +23,13 @@ from ..stga_addon.scene.avatar_scene import place_tracked, show_world
 from ..stga_addon.scene.display import splat_nodes, splat_object
 from ..stga_addon.scene.display.splat_attributes import SplatAttributes, avatar_attributes
 from ..stga_addon.scene.objects import Identity, mover_of
+from ..stga_addon.scene.record import (
+    capture_of,
+    displayed_path,
+    owner_of,
+    store_path,
+    stored_path,
+)
 from ..stga_addon.scene.vertex_groups import write_selection
 from ..stga_addon.tracking.folder import is_flame
 from ..stga_addon.training.run.folder import AVATAR, TRACKING, has_run, read_run
@@ -101,8 +108,8 @@ def request_head(scene: Any, state: RequestState) -> Any:
 
 def _head_of_capture(scene: Any, capture: Path) -> Any:
     folder = str(capture.resolve())
-    heads = (thing for thing in scene.objects if is_head(thing) and thing[tags.CAPTURE] == folder)
-    return next(heads, None)
+    heads = (thing for thing in scene.objects if is_head(thing))
+    return next((each for each in heads if str(capture_of(each)) == folder), None)
 
 
 def forget_heads() -> None:
@@ -152,39 +159,51 @@ def shown_splats(scene: Any, head: Any) -> Any:
     return scene.stga.splats if scene.stga.splats in found else next(iter(found), None)
 
 
-def avatar_of(splats: Any) -> str:
-    """Path of the avatar that a splat object shows, as the open file takes it; "" where unknown."""
-    stored = str(splats.get(tags.AVATAR, ""))
-    if splats.library is None or not stored:
-        return stored
-    return str(bpy.path.abspath(stored, library=splats.library))
-
-
 def follow_head(settings: Any) -> None:
-    """Let the panel show the splats of the head that was chosen in it, and name their avatar and
-    their run, or a new one beside that of another head."""
+    """Let the panel show the splats of the head that was chosen in it. A head without a run gets
+    the scene's, or a new one beside that of another head."""
     scene = settings.id_data
     head = settings.head
     shown = shown_splats(scene, head)
-    has_others = any(is_head(thing) and thing != head for thing in scene.objects)
-    if shown is not None:
+    others = [thing for thing in scene.objects if is_head(thing) and thing != head]
+    if shown is not None or (head is not None and others):
         settings.splats = shown
-        settings.avatar = avatar_of(shown) or settings.avatar
-    elif head is not None and has_others:
-        settings.splats = None
-        settings.avatar = ""
-    if head is not None and (tags.RUN_FOLDER in head or has_others):
-        before = settings.run_folder.rstrip("/\\")
-        beside = before.removesuffix(os.path.basename(before))
-        settings.run_folder = head.get(tags.RUN_FOLDER) or f"{beside}{mover_of(head).name}_run"
+    if owner_of(scene, head) == head and tags.RUN not in head:
+        _begin_record(scene, head, others)
+    look_for_run(settings)
 
 
-def keep_run_folder(settings: Any) -> None:
-    """Store the panel's run folder with its head, for when that is chosen again, and whether it
-    holds a run."""
-    settings.holds_run = has_run(Path(bpy.path.abspath(settings.run_folder)))
-    if is_head(settings.head) and settings.head.library is None:
-        settings.head[tags.RUN_FOLDER] = settings.run_folder
+def _begin_record(scene: Any, head: Any, others: list[Any]) -> None:
+    if not others:
+        for tag in {tags.RUN, tags.AVATAR} & set(scene.keys()):
+            store_path(head, tag, head.get(tag) or scene[tag])
+        return
+    runs = (stored_path(each, tags.RUN) for each in others)
+    before = (next(filter(None, runs), "") or DEFAULT_RUN).rstrip("/\\")
+    beside = before.removesuffix(os.path.basename(before))
+    store_path(head, tags.RUN, f"{beside}{mover_of(head).name}_run")
+
+
+DEFAULT_RUN = "//stga_run"
+
+
+def panel_path(settings: Any, tag: str) -> str:
+    """A path of the panel's head (`record`), or of the scene without one, as the panel shows it."""
+    head = settings.head
+    own = stored_path(owner_of(settings.id_data, head), tag)
+    if not own and is_head(head):  # a linked one
+        own = stored_path(head, tag)
+    return displayed_path(own or (DEFAULT_RUN if tag == tags.RUN else ""))
+
+
+def store_panel_path(settings: Any, tag: str, value: str) -> None:
+    store_path(owner_of(settings.id_data, settings.head), tag, value)
+    look_for_run(settings)
+
+
+def look_for_run(settings: Any) -> None:
+    """Note for panels, which read no files, whether the run folder holds a run."""
+    settings.holds_run = has_run(Path(bpy.path.abspath(panel_path(settings, tags.RUN))))
 
 
 def _is_immature(state: RequestState) -> bool:
@@ -199,19 +218,21 @@ def _is_immature(state: RequestState) -> bool:
 
 
 def store_avatar(scene: Any, state: RequestState, path: Path) -> None:
-    """Name the avatar that was trained in the panel, unless that holds another head; and the run
-    that has continued the panel's."""
-    settings = scene.stga
-    head = request_head(scene, state)
-    named = Path(bpy.path.abspath(settings.avatar))
-    if head not in (None, settings.head) or (named.is_file() and _is_immature(state)):
+    """Name the avatar that was trained with its head; and the run that has continued the head's."""
+    head = request_head(scene, state) or scene.stga.head
+    owner = owner_of(scene, head)
+    if Path(_absolute(owner, tags.AVATAR)).is_file() and _is_immature(state):
         return
-    settings.avatar = str(path)
-    keep_run_folder(settings)  # which was empty when the head of a video arrived
+    store_path(owner, tags.AVATAR, str(path))
     with suppress(StgaError):  # the request was removed
         parent = getattr(read_request(state.folder_path), "parent", None)
-        if parent == Path(bpy.path.abspath(settings.run_folder)).resolve():
-            settings.run_folder = str(_run(state))
+        if parent == Path(_absolute(owner, tags.RUN)).resolve():
+            store_path(owner, tags.RUN, str(_run(state)))
+    look_for_run(scene.stga)  # which was empty when the head of a video arrived
+
+
+def _absolute(owner: Any, tag: str) -> str:
+    return str(bpy.path.abspath(stored_path(owner, tag)))
 
 
 def _show_avatar(scene: Any, state: RequestState) -> Answer:
@@ -227,7 +248,8 @@ def _show_avatar(scene: Any, state: RequestState) -> Answer:
         gone = "the head that it was trained for is no longer in the scene"
         raise StgaError(f"{run}: {gone}; choose a head, then Show Avatar")
     shown = shown_splats(scene, head)
-    is_other = shown is not None and shown.get(tags.RUN) != str(run)
+    worn = Path(_absolute(owner_of(scene, head), tags.AVATAR))
+    is_other = shown is not None and worn.is_file() and worn.parent != run
     if is_other and _is_immature(state):
         if not is_result:
             return Shown()
@@ -248,9 +270,8 @@ def _show_avatar(scene: Any, state: RequestState) -> Answer:
         shown = splat_object.show_avatar(avatar, head, name, attributes, shown, scene)
         if is_new:
             splat_object.hide_object(head, scene)
-    shown[tags.RUN] = str(run)
     if is_result:
-        shown[tags.AVATAR] = str(state.loading_path)
+        store_path(owner_of(scene, head), tags.AVATAR, str(state.loading_path))
     if scene.stga.head == head:
         scene.stga.splats = shown
     show_world(run / AVATAR, head, scene)
@@ -265,8 +286,8 @@ def _show_made(scene: Any, state: RequestState) -> Answer:
         imported = Shown() if is_there else _import(scene, state)
         head = _head_of_capture(scene, state.loading_path)
         record_head(scene, state.kind, head)
-        if scene.stga.head == head:
-            scene.stga.run_folder = str(_run(state))
+        store_path(owner_of(scene, head), tags.RUN, str(_run(state)))
+        look_for_run(scene.stga)
         return imported
     answer = _show_avatar(scene, state)
     is_refined = state.loading_path.name == AVATAR and state.files.tracking is not None

@@ -1,5 +1,6 @@
 """The Show step: avatars and splats of files, their display, and their light."""
 
+import os
 from contextlib import suppress
 from math import radians
 from typing import Any
@@ -20,9 +21,10 @@ from ..stga_addon.scene.light import throw_shadow, throws_shadow
 from ..stga_addon.scene.objects import show_progress
 from ..stga_addon.scene.render.scene_splats import forget_frame, relight_frame
 from ..stga_addon.scene.render.viewport_display import ENGINE, is_shown_as_trained
+from ..stga_addon.scene.rig.head import LINKED
 from . import common, options
 from .common import Action, Edit, FileImport, file_path, head_of, need
-from .opened_files import run_of
+from .opened_files import is_run
 from .options import ONCE
 from .request import idle, start
 from .results import shown_splats
@@ -55,19 +57,21 @@ class ShowAvatar(Edit, bpy.types.Operator, FileImport):
         avatar = read_avatar(path)
         show_progress(0.3)
         before = shown_splats(context.scene, head)
+        if before is None and splat_object.splats_of(head, context.scene, linked=True):
+            raise StgaError(f"{head.name}: shows an avatar already, and {LINKED}")
         name = f"{head.name} {path.stem}"
         shown = splat_object.show_avatar(avatar, head, name, replaced=before)
         shown.hide_viewport = False
         if before is not None and context.view_layer.objects.get(shown.name) is shown:
             shown.hide_set(False)
-        shown[tags.AVATAR] = self.filepath
-        shown[tags.RUN] = str(path.resolve().parent)
         settings.splats = shown
         if self.hide_head:
             splat_object.hide_object(head, context.scene)
         show_world(path, head, context.scene)
         settings.avatar = self.filepath
-        settings.run_folder = run_of(self.filepath) or settings.run_folder
+        folder = os.path.dirname(self.filepath)
+        if is_run(folder):
+            settings.run_folder = folder
         if self.hide_head and head.library is not None:
             problem = "is linked, and covers the splats in renders; hide it in its file"
             self.warn(f"{head.name}: {problem}")
@@ -220,6 +224,18 @@ def _needs_splats(operator: Any, context: Any) -> bool:
     return common.polled(operator, head is not None, "Show an avatar first")
 
 
+def _needs_own_splats(operator: Any, context: Any) -> bool:
+    """Poll: whether there are splats that follow a head, and can be changed here, as it can."""
+    if not _needs_splats(operator, context):
+        return False
+    splats = context.scene.stga.splats
+    head = splat_object.get_input(splats, splat_nodes.HEAD)
+    for thing in (splats, splats.data, head):
+        if thing.library is not None:
+            return common.polled(operator, False, f"{thing.name}: {LINKED}")
+    return True
+
+
 class RunAddition(Action):
     """Mixin of operators that start a request about the shown avatar's run."""
 
@@ -237,7 +253,7 @@ class EstimateLight(RunAddition, bpy.types.Operator):
     the avatar"""
 
     request = Relight
-    needs = (idle(Kind.LIGHT), _needs_splats)
+    needs = (idle(Kind.LIGHT), _needs_own_splats)
 
 
 class MakeExact(RunAddition, bpy.types.Operator):
@@ -245,14 +261,14 @@ class MakeExact(RunAddition, bpy.types.Operator):
     seconds; as trained, it stays the same"""
 
     request = MakeExactRequest
-    needs = (idle(Kind.EXACT), _needs_splats)
+    needs = (idle(Kind.EXACT), _needs_own_splats)
 
 
 class RelightFrame(Edit, bpy.types.Operator):
     """Give the splats the colors of the scene's light at this frame, for EEVEE and Cycles; other
     frames keep them"""
 
-    needs = (_needs_splats,)
+    needs = (_needs_own_splats,)
     clear: options.boolean("Clear", "Show recorded colors again", options=ONCE)
 
     def run(self, context: Any) -> None:
@@ -266,7 +282,7 @@ class HeadShadow(Edit, bpy.types.Operator):
     """Let the head's mesh throw shadows onto other objects in EEVEE and Cycles, without being seen;
     again: hide it"""
 
-    needs = (_needs_splats,)
+    needs = (_needs_own_splats,)
 
     def run(self, context: Any) -> None:
         splats = context.scene.stga.splats

@@ -20,7 +20,8 @@ from ..stga_addon.jobs.train import Train
 from ..stga_addon.scene import tags
 from ..stga_addon.scene.cameras import look_away, look_through
 from ..stga_addon.scene.objects import show_kind
-from ..stga_addon.scene.rig.head import rig_of
+from ..stga_addon.scene.record import capture_of, stored_path
+from ..stga_addon.scene.rig.head import usable_rig
 from ..stga_addon.scene.rig.keyframes import key_current_pose
 from ..stga_addon.scene.rig.motion import sample_pose
 from ..stga_addon.tracking.footage.sources import VIDEO_SUFFIXES
@@ -104,7 +105,7 @@ class ViewFootage(Edit, bpy.types.Operator):
         head = head_of(context)
         space = context.space_data
         scene = context.scene
-        cameras = tags.find(tags.CAMERA, Path(head[tags.CAPTURE]))
+        cameras = tags.find(tags.CAMERA, capture_of(head))
         cameras = sorted(cameras, key=lambda camera: camera[tags.CAMERA_INDEX])
         if not cameras:
             raise StgaError("The capture has no cameras in this scene; import it again")
@@ -145,7 +146,7 @@ class MarkKey(Edit, bpy.types.Operator):
             del keys[frame]
         else:
             keys[frame] = sample_pose(head, common.own_motion(head).model).parameters
-            key_current_pose(head, rig_of(head), frame)
+            key_current_pose(head, usable_rig(head), frame)
         stored = {str(timestep): keys[timestep].tolist() for timestep in sorted(keys)}
         head[tags.TRACKING_KEYS] = json.dumps(stored)
 
@@ -165,8 +166,8 @@ class SolveAgain(Action, bpy.types.Operator):
 
     def run(self, context: Any) -> None:
         head = head_of(context)
-        capture = Path(head[tags.CAPTURE])
-        model = Path(head[tags.FLAME_MODEL])
+        capture = capture_of(head)
+        model = Path(stored_path(head, tags.FLAME_MODEL))
         request = jobs.SolveAgain(capture, model, tracking_keys(head))
         if start(context.scene, request, training_python(context)):
             self.inform(f"Tracked {capture}")

@@ -7,7 +7,7 @@ from typing import Any
 import bpy
 
 from ..operators import drive
-from ..operators.common import is_head, rig_or_none
+from ..operators.common import is_head, rig_or_none, rig_problem
 from ..operators.pose import needs_sliders, preparing
 from ..stga_addon.driving.live.sources import LOOPBACK, SOURCES
 from ..stga_addon.driving.performance import ARKIT_SHAPES
@@ -27,6 +27,8 @@ class MotionPanel(SidebarPanel, bpy.types.Panel):
         layout = self.layout
         settings = context.scene.stga
         layout.operator("stga.apply_motion", text="Apply Motion…", icon="IMPORT")
+        if problem := rig_problem(settings.head):
+            draw_text(layout, context, problem, "ERROR")
         row = layout.row(align=True)
         other = settings.motion_source
         row.prop(settings, "motion_source")
@@ -49,6 +51,8 @@ class FacePanel(SidebarPanel, bpy.types.Panel):
             return
         if needs_sliders(head):
             self.layout.operator("stga.add_arkit_controls", icon="ADD")
+            return
+        if rig_or_none(head) is None:
             return
         keys = head.data.shape_keys.key_blocks
         column = self.layout.column(align=True)

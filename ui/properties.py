@@ -8,10 +8,11 @@ import bpy
 from ..operators import options
 from ..operators.common import AtEnd, package, register_classes
 from ..operators.drive import DriveSettings
-from ..operators.results import follow_head, keep_run_folder
+from ..operators.results import follow_head, panel_path, store_panel_path
 from ..operators.track import TrackOptions
 from ..operators.train import ExtendOptions, RefineOptions, TrainOptions, preset_property
 from ..operators.training_python import has_training_python, test
+from ..stga_addon.scene import tags
 from ..stga_addon.worker.training_python import PYTHON_VARIABLE
 from .sidebar import draw_text
 
@@ -38,6 +39,14 @@ def _choose_head(settings: Any, context: Any) -> None:
     settings.selected_frames.clear()  # rows of another head
     settings.effects.clear()
     settings.preset_timing = ""
+
+
+def _of_head(tag: str) -> dict[str, Any]:
+    """A path that is stored with the panel's head."""
+    return {
+        "get": lambda settings: panel_path(settings, tag),
+        "set": lambda settings, value: store_panel_path(settings, tag, value),
+    }
 
 
 def _current_row(settings: Any) -> int:
@@ -129,8 +138,7 @@ class SceneSettings(TrainOptions, bpy.types.PropertyGroup):
         "Run Folder",
         "Folder for the avatar and its checkpoints",
         "DIR_PATH",
-        default="//stga_run",
-        update=lambda settings, context: keep_run_folder(settings),
+        **_of_head(tags.RUN),
     )
     holds_run: _hidden(bpy.props.BoolProperty)  # the run folder, which panels do not look into
     refine: bpy.props.PointerProperty(type=RefineSettings)
@@ -144,7 +152,7 @@ class SceneSettings(TrainOptions, bpy.types.PropertyGroup):
     show_result: options.boolean(
         "Show When Trained", "Show the avatar on the head when training has finished", default=True
     )
-    avatar: options.path("Avatar", "Trained avatar file (.npz)")
+    avatar: options.path("Avatar", "Trained avatar file (.npz)", **_of_head(tags.AVATAR))
     show_figures: options.boolean(
         "Figures", "Show speed, PSNR of held-out views in dB, loss, number of splats and memory"
     )

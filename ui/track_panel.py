@@ -1,6 +1,5 @@
 """The Track step: footage and head model, progress, and correction of what was tracked."""
 
-from pathlib import Path
 from typing import Any
 
 import bpy
@@ -10,6 +9,7 @@ from ..operators.common import is_head
 from ..operators.track import TrackOptions, tracking_keys
 from ..stga_addon.jobs.table import Kind
 from ..stga_addon.scene import tags
+from ..stga_addon.scene.record import capture_of
 from ..stga_addon.tracking.folder import SHEET_FILE
 from .sidebar import ClosedPanel, SidebarPanel, draw_end, draw_running, draw_text, set_options
 from .train_panel import draw_missing_python
@@ -62,7 +62,7 @@ class TrackCheckPanel(SidebarPanel, bpy.types.Panel):
         layout = self.layout
         head = context.scene.stga.head
         sheet = layout.operator("wm.path_open", text="Open Contact Sheet", icon="IMAGE_DATA")
-        sheet.filepath = str(Path(head[tags.CAPTURE]) / SHEET_FILE)
+        sheet.filepath = str(capture_of(head) / SHEET_FILE)
         row = layout.row(align=True)
         row.operator("stga.view_footage", text="", icon="TRIA_LEFT").step = -1
         through = context.space_data.region_3d.view_perspective == "CAMERA"

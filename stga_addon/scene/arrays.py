@@ -7,6 +7,7 @@ import bpy
 import numpy as np
 
 from .compat import action_curves
+from .evaluation import evaluated, kept_evaluated
 
 Z_UP_TO_Y_UP = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
 """From Blender's axes to those of captures: (x, y, z) is (x, z, -y)."""
@@ -41,12 +42,13 @@ def has_triangles(mesh: Any, faces: np.ndarray) -> bool:
 
 def evaluated_vertices(obj: Any) -> np.ndarray:
     """(V, 3) float32 vertices of a mesh object at the current frame, in object space."""
-    evaluated = obj.evaluated_get(bpy.context.evaluated_depsgraph_get())
-    mesh = evaluated.to_mesh()
-    try:
-        return mesh_vertices(mesh)
-    finally:
-        evaluated.to_mesh_clear()
+    with kept_evaluated([obj]):
+        shown = evaluated(obj, bpy.context.evaluated_depsgraph_get())
+        mesh = shown.to_mesh()
+        try:
+            return mesh_vertices(mesh)
+        finally:
+            shown.to_mesh_clear()
 
 
 def triangle_mesh(name: str, vertices: np.ndarray, faces: np.ndarray) -> Any:

@@ -136,7 +136,7 @@ def show_on_head(avatar: Avatar, head: Any, link: str, fps: float) -> Any:
     cameras are hidden. Returns the splats. link: the avatar's file, relative to the .blend file."""
     shown = show_avatar(avatar, head)
     scene = bpy.context.scene
-    shown[tags.AVATAR] = link
+    head[tags.AVATAR] = link
     hide_object(head, scene)
     go_to_frame(head[tags.TIMESTEPS][0])
     set_frames_per_second(scene, fps)

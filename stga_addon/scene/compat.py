@@ -12,6 +12,7 @@ MODIFIER_INPUT_PROPERTIES = bpy.app.version >= (5, 2, 0)
 EEVEE = "BLENDER_EEVEE" if bpy.app.version >= (5, 0, 0) else "BLENDER_EEVEE_NEXT"
 NATIVE_SPLATS = hasattr(bpy.types, "GeometryNodePointsSetType")  # from 5.3 on
 APPENDED: list[Any] = getattr(bpy.app.handlers, "blend_import_post", [])  # from 4.3 on
+SAVE_FAILED: list[Any] = getattr(bpy.app.handlers, "save_post_fail", [])  # from 4.0 on
 REC709 = "Linear Rec.709"
 """The scene-linear color space of new files, and of all before Blender 5.0."""
 # Options of a path property whose value may start with "//"; versions before 4.5 refuse this one.
@@ -20,6 +21,13 @@ PATH_OPTIONS = (
     if "is_path_supports_blend_relative" in bpy.types.Property.bl_rna.properties
     else set()
 )
+
+
+def stored_value(settings: Any, name: str) -> str:
+    """What a file stores of a text property that has become one with functions; "" for nothing."""
+    if hasattr(settings, "bl_system_properties_get"):  # from 5.0 on
+        settings = settings.bl_system_properties_get()
+    return "" if settings is None else str(settings.get(name, ""))
 
 
 def action_curves(owner: Any) -> Any:

@@ -13,6 +13,8 @@ import bpy
 from ..errors import StgaError
 from ..format import format_name
 from . import tags
+from .evaluation import kept_evaluated
+from .record import rebase_file
 
 # Receives one sentence for the user; operators pass their own report.
 Warn = Callable[[str], None]
@@ -21,6 +23,10 @@ log_warning: Warn = logging.getLogger(__name__).warning
 
 AVATAR_SUFFIX = re.compile(r" avatar(?=( \d+)?$)")
 """Of a folder for capture and run of a video (`operators.track.proposed_folder`)."""
+
+
+IMPORTED_AVATAR = re.compile(r"(.+)_avatar(?:_\d+)?")
+"""A folder for the parts of an avatar's file (`operators.import_capture`)."""
 
 
 def capture_root(source: Path) -> Any:
@@ -34,6 +40,9 @@ def capture_root(source: Path) -> Any:
     name = format_name(source)
     if name == "capture":
         name = AVATAR_SUFFIX.sub("", source.resolve().parent.name) or name
+    elif name == "motion":
+        imported = IMPORTED_AVATAR.fullmatch(source.resolve().parent.name)
+        name = imported[1] if imported else name
     collection = bpy.data.collections.new(name)
     bpy.context.scene.collection.children.link(collection)
     root = bpy.data.objects.new(name, None)
@@ -173,9 +182,11 @@ def empty_file() -> None:
 
 def save_file(path: Path) -> None:
     """Save the open file. Raises StgaError where it cannot be written."""
+    file = str(path.resolve())
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        bpy.ops.wm.save_as_mainfile(filepath=str(path.resolve()), compress=True)
+        rebase_file(file)
+        bpy.ops.wm.save_as_mainfile(filepath=file, compress=True)
     except (OSError, RuntimeError) as error:
         raise StgaError(f"{path}: cannot be saved ({error})") from error
 
@@ -313,12 +324,15 @@ def show_progress(share: float) -> None:
         bpy.context.window_manager.progress_update(share)
 
 
-def iterate_frames(numbers: Iterable[int]) -> Generator[int, None, None]:
-    """Set each frame in turn, with progress at the mouse pointer; restore the current one last."""
+def iterate_frames(
+    numbers: Iterable[int], things: Iterable[Any] = ()
+) -> Generator[int, None, None]:
+    """Set each frame in turn, with progress at the mouse pointer; restore the current one last.
+    things: objects that are read in each."""
     scene = Identity(bpy.context.scene)
     numbers = list(numbers)
     bpy.context.window_manager.progress_begin(0, 1)
-    with frame_kept(scene):
+    with frame_kept(scene), kept_evaluated(things):
         try:
             for index, number in enumerate(numbers):
                 scene.get().frame_set(number)

@@ -7,7 +7,7 @@ import bpy
 
 # Custom properties on objects.
 KIND = "stga_kind"  # one of the kinds below
-CAPTURE = "stga_capture"  # the capture's folder (or a motion's file), absolute
+CAPTURE = "stga_capture"  # the capture's folder (or a motion's file); see `record`
 FLAME_MODEL = "stga_flame_model"  # on the head: the file that the capture was opened with, or ""
 PRINCIPAL_POINT = "stga_principal_point"  # on the head: how cx and cy of the capture were read
 TIMESTEPS = "stga_timesteps"  # on the head: ints, ascending
@@ -22,9 +22,9 @@ ANTIALIASED = "stga_antialiased"  # on splats that follow a head: `Avatar.antial
 FILMED = "stga_filmed"  # on splats that follow a head: `avatar.filmed.filmed_sides`
 REVISION = "stga_revision"  # on a splat object's mesh: changes whenever splats are written into it
 RELIT_FRAME = "stga_relit_frame"  # on that mesh: the frame in whose light other engines show it
-AVATAR = "stga_avatar"  # on splats that follow a head: the file of their avatar
-RUN_FOLDER = "stga_run_folder"  # on the head: that of the panel while it works on the head
-RUN = "stga_run"  # on splats that preview or show a training run: the run's folder
+AVATAR = "stga_avatar"  # on the head: the file of the avatar that it wears
+RUN = "stga_run_folder"  # on the head: folder of its run, which may not have begun
+STORED_IN = "stga_stored_in"  # on owners of paths: the .blend file that these were stored in
 WORLD = "stga_world"  # on splats of a run's world: their file
 
 OWN_RESOLUTION = "stga_own_resolution"  # on a scene, while a capture's camera is looked through

@@ -121,7 +121,7 @@ def test_from_a_video_to_splats_on_the_head(extension, tmp_path):
     settings = panel()
     out = tmp_path / "head avatar"
     assert settings.head[tags.CAPTURE] == str(out / "capture")
-    assert settings.splats[tags.RUN] == settings.run_folder == str(out / "run")
+    assert settings.head[tags.RUN] == settings.run_folder == str(out / "run")
     assert (settings.avatar, settings.avatar_shown) == (str(out / "run/avatar.npz"), True)
     assert not settings.head.visible_get()
     with np.load(out / "job/picture.npz") as stored:

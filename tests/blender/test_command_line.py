@@ -159,6 +159,6 @@ def test_an_avatar_from_footage(stga, take, tmp_path, capfd):
     assert stga("avatar", *given, "--out", tmp_path / "out", *more) == 0
     assert capfd.readouterr().out.splitlines()[-1] == f"blender: {tmp_path / 'out/avatar.blend'}"
     open_file(tmp_path / "out/avatar.blend")
-    (splats,) = [thing for thing in bpy.data.objects if thing.get("stga_kind") == "splats"]
-    assert splats["stga_avatar"] == "//run/avatar.npz"
+    (head,) = [thing for thing in bpy.data.objects if thing.get("stga_kind") == "head"]
+    assert head["stga_avatar"] == str(tmp_path / "out/run/avatar.npz")
     assert any("tracking" in action.name for action in bpy.data.actions)  # the refined motion

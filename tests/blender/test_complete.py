@@ -56,7 +56,8 @@ result["next run"] = settings.run_folder
 bpy.ops.stga.test_python()
 bpy.ops.stga.avatar_from_video(filepath=video, folder=str(home / "avatar"), minutes=0.05)
 splats = settings.splats
-result["made"] = [settings.head["stga_capture"], splats["stga_run"], len(splats.data.vertices)]
+head = settings.head
+result["made"] = [head["stga_capture"], head["stga_run_folder"], len(splats.data.vertices)]
 run = sys.modules[module + ".operators.command_line"]._run
 result["codes"] = [
     run(["track", video, "--stop", "3", "--out", str(home / "tracked")]),

@@ -1,5 +1,7 @@
 """Web pages of a FLAME head exported from Blender: sliders, motion and camera."""
 
+from pathlib import Path
+
 import bpy
 import numpy as np
 import pytest
@@ -12,11 +14,13 @@ from stga_addon.avatar.lattice import lattice_splats
 from stga_addon.flame.forward import FlameFrame, flame_forward
 from stga_addon.flame.model import JOINTS
 from stga_addon.flame.sequence import neutral_mesh
+from stga_addon.scene import tags
 from stga_addon.scene.arrays import evaluated_vertices
 from stga_addon.scene.rig.head import rig_of
 
 from .captures import import_small_head, mesh_at
-from .session import ops
+from .session import ops, panel, save
+from .test_operators import write_ball_run
 from .test_splat_object import active_camera
 
 BLENDER_TOLERANCE_M = 2e-4
@@ -129,3 +133,45 @@ def test_an_avatar_comes_back(extension, tmp_path):
     scene.frame_set(round(scene.render.fps / 30))
     corners = evaluated_vertices(head)
     assert np.ptp(corners, axis=0) == pytest.approx(np.ptp(before[1], axis=0)[[0, 2, 1]], abs=2e-3)
+
+
+def test_importing_an_avatar_overwrites_nothing(extension, tmp_path, monkeypatch):
+    """Catches a trained run beside the file that gets its quantized copy, a second head by a second
+    import, a file in a read-only folder that is refused, heads called "motion", a warning of FLAME
+    masks, and a performer of the head's name taken for the head."""
+    demo_head(tmp_path)
+    ops.export_avatar(filepath=tmp_path / "anna.glb", format="skinned-gltf")
+    run = write_ball_run(tmp_path / "anna_avatar")
+    before = {path.name: path.read_bytes() for path in run.iterdir()}
+    bpy.ops.wm.read_homefile(use_empty=True)
+    manager = bpy.context.window_manager
+    for _ in range(2):
+        ops.import_avatar(filepath=tmp_path / "anna.glb")
+        assert "mask" not in manager.stga_message
+    assert {path.name: path.read_bytes() for path in run.iterdir()} == before
+    head = panel().head
+    assert [each.name for each in bpy.data.objects if each.name.endswith("head")] == ["anna head"]
+    assert panel().avatar == str(tmp_path / "anna_avatar_2/avatar.npz")
+    save(tmp_path / "library.blend", copy=True)
+    with bpy.data.libraries.load(str(tmp_path / "library.blend"), link=True) as (_, taken):
+        taken.collections = ["anna"]
+    bpy.context.scene.collection.children.link(taken.collections[0])
+    performer = taken.collections[0].objects[head.name]
+    assert performer != head
+    ops.apply_motion(source=performer.name)
+
+    kept = tmp_path / "user"
+    kept.mkdir()
+    make = Path.mkdir
+
+    def refuse(path, *arguments, **options):
+        if path.parent == tmp_path:
+            raise PermissionError(13, "Permission denied")
+        make(path, *arguments, **options)
+
+    monkeypatch.setattr(Path, "mkdir", refuse)
+    monkeypatch.setattr(bpy.utils, "user_resource", lambda kind, path: str(kept / path))
+    (tmp_path / "anna.glb").rename(tmp_path / "ben.glb")
+    ops.import_avatar(filepath=tmp_path / "ben.glb")
+    assert panel().head.name == "ben head"
+    assert Path(panel().head[tags.CAPTURE]).is_relative_to(kept)

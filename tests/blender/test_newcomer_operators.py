@@ -117,8 +117,10 @@ def test_a_file_made_without_the_panel(extension, head, tmp_path):
     settings = panel()
     name = head.name
     path = str(tmp_path / "demo.blend")
-    settings.splats[tags.AVATAR] = "//run/avatar.npz"
-    for each in ("head", "splats", "avatar", "run_folder"):
+    settings.splats[tags.AVATAR] = "//run/avatar.npz"  # as older versions stored it
+    for each in (tags.AVATAR, tags.RUN):
+        head.pop(each, None)
+    for each in ("head", "splats"):
         settings.property_unset(each)
     reopen(path)
     assert panel().run_folder == "//run"

@@ -118,9 +118,10 @@ def _exchange_tree(splat_object: Any, tree: Any) -> None:
             curve.data_path = place + moved
 
 
-def splats_of(head: Any, scene: Any) -> list[Any]:
-    """The splat objects of the scene that follow the head and can be changed: no linked ones."""
-    own = [each for each in scene.objects if tags.CONVENTION in each and each.library is None]
+def splats_of(head: Any, scene: Any, linked: bool = False) -> list[Any]:
+    """The splat objects of the scene that follow the head and can be changed, or are linked."""
+    shown = [each for each in scene.objects if tags.CONVENTION in each]
+    own = [each for each in shown if (each.library is not None) == linked]
     return [each for each in own if _follows(each, head)]
 
 
@@ -128,11 +129,6 @@ def _follows(splat_object: Any, head: Any) -> bool:
     with suppress(StgaError):  # it has lost its modifier
         return bool(get_input(splat_object, splat_nodes.HEAD) == head)
     return False
-
-
-def is_enabled_on(splat_object: Any, head: Any) -> bool:
-    """Whether Blender evaluates the head for the splat object's sake."""
-    return not splat_object.hide_viewport and _follows(splat_object, head)
 
 
 def show_world_splats(splats: Splats, name: str, scene: Any = None) -> Any:
@@ -228,17 +224,6 @@ def hide_object(obj: Any, scene: Any) -> None:
         obj.hide_render = obj.hide_viewport = True
     else:
         hide_in_layers(obj, scene)
-
-
-def keep_evaluated(head: Any, scene: Any) -> None:
-    """Let Blender move a head that `hide_object` has hidden also where no splats of it are enabled
-    any more, for whose sake it evaluates it: shown where they are gone."""
-    if head.library is not None or not head.hide_viewport:
-        return
-    splats = splats_of(head, scene)
-    if all(each.hide_viewport for each in splats):
-        head.hide_viewport = False
-        hide_in_layers(head, scene, bool(splats))
 
 
 def hide_covered(splat_object: Any, scene: Any) -> None:

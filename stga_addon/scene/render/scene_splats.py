@@ -1,6 +1,7 @@
 """A scene's visible splats, posed, and their relit colors stored for EEVEE and Cycles."""
 
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import replace
 from typing import Any
 
@@ -33,6 +34,7 @@ from ..display.splat_object import (
     stored_avatar,
     stored_light,
 )
+from ..evaluation import evaluated, kept_evaluated, require_moved
 from ..layers import SceneLayer
 from ..light import PosedAvatar, SceneLight, lighting_settings
 from ..vertex_groups import frame_group, frame_selection
@@ -248,10 +250,22 @@ def evaluated_splats(depsgraph: Any, cache: SplatCache, to_file: np.ndarray) -> 
     return joined([at_degree(part, degree) for part in parts])
 
 
+def with_heads(scene: Any) -> list[Any]:
+    """The scene's splat objects and the heads that they follow, for `kept_evaluated`."""
+    shown = [each for each in scene.objects if each.get(tags.KIND) == tags.SPLATS]
+    heads = []
+    for each in shown:
+        with suppress(StgaError):  # it has lost its modifier
+            heads.append(get_input(each, splat_nodes.HEAD))
+    return [*shown, *heads]
+
+
 def _posed_vertices(splat_object: Any, head: Any, faces: np.ndarray, depsgraph: Any) -> np.ndarray:
     """(V, 3) of the evaluated head in the splat object's space. Raises StgaError where the head has
     not as many triangles as `faces`."""
-    posed = head.evaluated_get(depsgraph)
+    modifier = splat_modifier(splat_object.evaluated_get(depsgraph))
+    require_moved(head, modifier, depsgraph)
+    posed = evaluated(head, depsgraph)
     if posed.type != "MESH" or len(posed.data.loops) != faces.size:
         follower = splat_object.name
         reason = f"has other triangles than {follower}, which follows it; check its modifiers"
@@ -332,14 +346,17 @@ def _is_holdout(owner: Any, instance: Any, depsgraph: Any) -> bool:
 def relight_frame(splat_object: Any, scene: Any) -> None:
     """Store the splats' colors in the scene's light at its frame, from its camera. Raises
     StgaError."""
-    depsgraph = bpy.context.evaluated_depsgraph_get()
-    layers = visible_layers(depsgraph, SplatCache(), is_wanted=lambda shown: shown == splat_object)
+    with kept_evaluated(with_heads(scene)):
+        depsgraph = bpy.context.evaluated_depsgraph_get()
+        only = lambda shown: shown == splat_object  # noqa: E731
+        layers = visible_layers(depsgraph, SplatCache(), is_wanted=only)
     if not layers or layers[0].relit is None:
         raise StgaError(
             f"{splat_object.name}: is lit as recorded; choose Scene or Mix in the panel Lighting"
         )
     if scene.camera is None:
         raise StgaError("The scene has no camera, from which highlights are seen")
+    depsgraph = bpy.context.evaluated_depsgraph_get()
     camera = scene.camera.evaluated_get(depsgraph).matrix_world
     eye = layers[0].eye_in_avatar(np.array(camera)[:3, 3])
     relit = layers[0].relit

@@ -68,6 +68,8 @@ def import_head(capture: Capture, warn: Warn = log_warning, correctives: str = "
 def _place_head(capture: Capture) -> Any:
     root = capture_root(capture.root)
     head = next(iter(tags.find(tags.HEAD, capture.root)), None)
+    if head is not None and head.parent is None:
+        raise StgaError(f"{head.name}: {PARENTLESS}, or delete it")
     if head is not None and arrays.has_triangles(head.data, capture.faces):
         # Into the same mesh, which keeps materials, vertex groups and painted attributes.
         reset(head)
@@ -206,16 +208,57 @@ def _add_correctives(
         add_driver(head.data.shape_keys, key_value_path(name), -1, expression, rotation)
 
 
-def rig_of(head: Any) -> Any:
-    """The armature object that moves `head`. Raises StgaError where it has no FLAME rig."""
+def find_rig(head: Any) -> Any:
+    """The armature object that moves `head`; None where it has no FLAME rig."""
     for modifier in head.modifiers:
         rig = modifier.object if modifier.type == "ARMATURE" else None
         if rig is not None and rig.get(tags.KIND) == tags.RIG:
             return rig
-    raise StgaError(
-        f"{head.name}: has no FLAME rig, because it was not imported from FLAME parameters; "
-        "its splats follow whatever moves its mesh (shape keys, modifiers, a mesh cache)"
-    )
+    return None
+
+
+def rig_of(head: Any) -> Any:
+    """The armature object that moves `head`, to read its pose. Raises StgaError where it has no
+    FLAME rig, or one that lacks joints or shape keys."""
+    rig = find_rig(head)
+    if rig is None:
+        raise StgaError(
+            f"{head.name}: has no FLAME rig, because it was not imported from FLAME parameters; "
+            "its splats follow whatever moves its mesh (shape keys, modifiers, a mesh cache)"
+        )
+    missing = [name for name in JOINTS if name not in rig.pose.bones]
+    if missing:
+        names = ", ".join(missing)
+        raise StgaError(f"{rig.name}: has no bone {names}; give renamed bones their names again")
+    if head.data.shape_keys is None:
+        raise StgaError(f"{head.name}: has lost its shape keys; import its capture again")
+    return rig
+
+
+LINKED = "is linked from another file: open that file, or make the head local"
+
+
+def usable_rig(head: Any, with_sliders: bool = True) -> Any:
+    """The armature object of a head that can be posed here. with_sliders: and its shape keys, which
+    a library override cannot change. Raises StgaError that says why not."""
+    if head.library is not None:
+        raise StgaError(f"{head.name}: {LINKED}")
+    if with_sliders and head.data.library is not None:
+        raise StgaError(f"{head.name}: is overridden, but its sliders are in another file: {OWN}")
+    rig = rig_of(head)
+    override = rig.override_library
+    if rig.library is not None or (override is not None and override.is_system_override):
+        raise StgaError(f"{rig.name}: {LINKED}")
+    if head.parent is None:
+        raise StgaError(f"{head.name}: {PARENTLESS}")
+    for name in JOINTS:
+        if rig.pose.bones[name].rotation_mode != "QUATERNION":
+            raise StgaError(f"{rig.name}: the rotation mode of bone {name} must be Quaternion")
+    return rig
+
+
+OWN = "open that file, or make the head's mesh local"
+PARENTLESS = "has no parent; parent it again to the Empty of its capture"
 
 
 def _remove_bone_groups(head: Any, rigs: Sequence[Any]) -> None:

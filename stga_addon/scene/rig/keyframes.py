@@ -153,13 +153,10 @@ def key_values(owner: Any, paths: dict[int, str], at: np.ndarray, values: np.nda
         write_curves(owner, path, at[keyed], values[keyed, column])
 
 
-def check_keyable(owner: Any, bones: Sequence[str] = ()) -> None:
-    """Raise StgaError where keyframes of `owner`, or of these bones, would have no effect."""
+def check_keyable(owner: Any) -> None:
+    """Raise StgaError where keyframes of `owner` would have no effect."""
     if owner.animation_data is not None and owner.animation_data.use_tweak_mode:
         raise StgaError(f"{owner.name}: is in tweak mode in the NLA editor; leave tweak mode first")
-    for name in bones:
-        if owner.pose.bones[name].rotation_mode != "QUATERNION":
-            raise StgaError(f"{owner.name}: the rotation mode of bone {name} must be Quaternion")
 
 
 class Placement(NamedTuple):

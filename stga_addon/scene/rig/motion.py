@@ -18,9 +18,10 @@ from ...flame.model import JOINTS, FlameModel
 from ...flame.quaternions import from_axis_angle, multiply, to_axis_angle
 from ...flame.sequence import FlameSequence
 from ..arrays import evaluated_vertices, key_points, read_values, write_curves
+from ..evaluation import evaluated, kept_evaluated
 from ..objects import Identity, Warn, iterate_frames, log_warning
 from . import keyframes
-from .head import rig_of
+from .head import rig_of, usable_rig
 from .keyframes import Placement
 
 MESH_TOLERANCE = 1e-4  # metres that the mesh may differ from FLAME's of the sampled parameters
@@ -40,8 +41,8 @@ def apply_motion(
     a head that was given them. Without, both stay zero. Raises StgaError, and changes nothing,
     where the head has no rig, or one that cannot take the motion."""
     parts = placement.parts
-    rig = rig_of(head)
-    keyframes.check_keyable(rig, JOINTS)
+    rig = usable_rig(head)
+    keyframes.check_keyable(rig)
     keyframes.check_keyable(head.data.shape_keys)
     used = np.any([frame.expr != 0 for frame in frames], axis=0)
     sliders = keyframes.expression_keys(head)
@@ -86,7 +87,7 @@ def sample_motion(
     frames: list[FlameFrame] = []
     shape = sequence.shape.copy()
     largest_error = 0.0
-    for _ in iterate_frames(numbers):
+    for _ in iterate_frames(numbers, [head, rig_of(head)]):
         frame = sample_pose(head, sequence.model)
         if not frames:
             for name, component in keyframes.slider_components(sequence.model).items():
@@ -107,7 +108,13 @@ def sample_motion(
 
 def sample_pose(head: Any, model: FlameModel) -> FlameFrame:
     """FLAME parameters of the head as posed now, keyed or not. Raises StgaError without a rig."""
-    bones = rig_of(head).evaluated_get(bpy.context.evaluated_depsgraph_get()).pose.bones
+    rig = rig_of(head)
+    with kept_evaluated([rig]):
+        bones = evaluated(rig, bpy.context.evaluated_depsgraph_get()).pose.bones
+        return _sampled(head, bones, model)
+
+
+def _sampled(head: Any, bones: Any, model: FlameModel) -> FlameFrame:
     rotations = {name: bones[name].matrix.to_3x3().normalized() for name in JOINTS}
     vectors = {}
     for name, parent in zip(JOINTS, model.parents.tolist(), strict=True):

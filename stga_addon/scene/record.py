@@ -1,0 +1,116 @@
+"""What a head was made from: capture, FLAME model, run and avatar, stored with the head.
+
+Paths are absolute, or begin with "//" as long as there is nothing. With them is the .blend file
+that they were stored in (`tags.STORED_IN`): where that was moved, they are found as they lay beside
+it. A scene without a head that can be changed stores them itself.
+"""
+
+import os
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import bpy
+
+from . import tags
+
+PATH_TAGS = (tags.CAPTURE, tags.FLAME_MODEL, tags.RUN, tags.AVATAR, tags.WORLD)
+SCENE_PATHS = ("training_run", "tracking_capture", "avatar_folder")
+"""Properties of a scene's settings: what its last requests were about."""
+MAX_FOLDERS_UP = 2
+"""From a .blend file to a folder that holds all of its project."""
+COPIED = "copybuffer.blend"
+"""The file through which Blender copies and pastes."""
+
+
+def owner_of(scene: Any, head: Any) -> Any:
+    """What stores the paths of the scene's head: the scene, where that is None or linked."""
+    is_own = head is not None and head.library is None and head.get(tags.KIND) == tags.HEAD
+    return head if is_own else scene
+
+
+def stored_path(owner: Any, tag: str) -> str:
+    """A path of the head or scene, which may begin with "//" of the open file; "" for none."""
+    value = str(owner.get(tag, ""))
+    if owner.library is None or not value:
+        return value
+    file = bpy.path.abspath(owner.library.filepath)
+    return _found(value, owner.get(tags.STORED_IN, file), file, moved_first=True)
+
+
+def store_path(owner: Any, tag: str, value: str) -> None:
+    owner[tag] = value
+    if tags.STORED_IN not in owner:
+        owner[tags.STORED_IN] = bpy.data.filepath
+
+
+def displayed_path(value: str) -> str:
+    """A path as panels show it: relative to the open file where it lies beside that or below."""
+    if value and not value.startswith("//") and bpy.data.filepath:
+        folder = Path(bpy.data.filepath).parent
+        if Path(value).is_relative_to(folder):
+            return f"//{Path(value).relative_to(folder).as_posix()}"
+    return value
+
+
+def capture_of(head: Any) -> Path:
+    """The folder (or file) that a head was imported from."""
+    return Path(stored_path(head, tags.CAPTURE))
+
+
+def rebase(owners: Iterable[Any], file: str, moved_first: bool = True, source: str = "") -> None:
+    """Store the paths of objects and scenes for the .blend file `file` ("": not saved).
+
+    moved_first: whether a path is looked for beside `file` before where it was, as after loading.
+    source: the file that they were appended from; "": the open one, which may have been moved.
+    """
+    pasted = os.path.basename(source) == COPIED
+    for owner in owners:
+        if owner.library is not None:
+            continue
+        before = owner.get(tags.STORED_IN, source or file)
+        now = (before if pasted else source) or file
+        is_scene = owner.id_type == "SCENE"
+        stored = [tag for tag in PATH_TAGS if tag in owner]
+        for tag in stored:
+            owner[tag] = _found(str(owner[tag]), before, now, moved_first)
+        for name in SCENE_PATHS if is_scene and hasattr(owner, "stga") else ():
+            setattr(owner.stga, name, _found(getattr(owner.stga, name), before, now, moved_first))
+        if stored or is_scene:
+            owner[tags.STORED_IN] = file
+
+
+def rebase_file(file: str, moved_first: bool = False) -> None:
+    """`rebase` all that the open file holds."""
+    rebase([*bpy.data.objects, *bpy.data.scenes], file, moved_first)
+
+
+def _found(value: str, before: str, now: str, moved_first: bool) -> str:
+    """The path where it exists now: as it was, or as it lay beside the file before; else as it
+    is."""
+    if not value:
+        return value
+    places = [_absolute(value, before), *_beside(_absolute(value, before), before, now)]
+    if moved_first:
+        places.reverse()
+    existing = (each for each in places if os.path.isabs(each) and os.path.exists(each))
+    return next(existing, value)
+
+
+def _absolute(value: str, file: str) -> str:
+    if not value.startswith("//") or not file:
+        return value
+    return os.path.normpath(os.path.join(os.path.dirname(file), value[2:]))
+
+
+def _beside(place: str, before: str, now: str) -> list[str]:
+    """Where what lay beside one file, or at most `MAX_FOLDERS_UP` above it, lies beside another."""
+    if not (before and now and os.path.isabs(place)) or before == now:
+        return []
+    try:
+        relative = os.path.relpath(place, os.path.dirname(before))
+    except ValueError:  # on another drive
+        return []
+    if relative.split(os.sep).count(os.pardir) > MAX_FOLDERS_UP:
+        return []
+    return [os.path.normpath(os.path.join(os.path.dirname(now), relative))]

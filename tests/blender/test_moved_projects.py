@@ -1,0 +1,125 @@
+"""Capture, FLAME model, run and avatar of a head, wherever its file is moved, saved or brought."""
+
+import shutil
+from pathlib import Path
+
+import bpy
+import pytest
+from capture.factory import write_flame_capture
+
+from stga_addon.scene import tags
+from stga_addon.scene.record import stored_path
+
+from .session import failure, open_file, ops, panel, save
+from .test_operators import write_ball_run
+
+pytestmark = pytest.mark.usefixtures("extension")
+TAGS = (tags.CAPTURE, tags.FLAME_MODEL, tags.RUN, tags.AVATAR)
+
+
+def make_project(folder, blend="shots/head.blend"):
+    """A project whose .blend file lies beside capture, model and run, or in a folder there."""
+    captured, model = write_flame_capture(folder / "capture")
+    model = model.rename(folder / "flame.npz")
+    ops.import_capture(directory=captured, flame=model)
+    ops.show_avatar(filepath=write_ball_run(folder / "run") / "avatar.npz")
+    (folder / blend).parent.mkdir(exist_ok=True)
+    save(folder / blend)
+    return folder
+
+
+def places(head):
+    return [Path(bpy.path.abspath(stored_path(head, tag))) for tag in TAGS]
+
+
+def expected(folder):
+    return [folder / name for name in ("capture", "flame.npz", "run", "run/avatar.npz")]
+
+
+def try_all(folder):
+    """What reads capture or model ends without an error."""
+    path = next((folder / "capture").rglob("*.npz"))
+    ops.measure_range()
+    ops.select(threshold=0.001)
+    ops.apply_motion(filepath=path)
+    ops.export_avatar(filepath=folder / "pair", format="gaussian-avatars")
+
+
+@pytest.mark.parametrize("blend", ["head.blend", "shots/head.blend"])
+def test_a_project_is_moved_as_a_whole(tmp_path, blend):
+    """Catches "OLD/capture: is not a folder" in Apply Motion, Measure, Select and exports of
+    motion."""
+    old = make_project(tmp_path / "old", blend)
+    shutil.move(old, tmp_path / "new")
+    open_file(tmp_path / "new" / blend)
+    assert places(panel().head) == expected(tmp_path / "new")
+    try_all(tmp_path / "new")
+
+
+@pytest.mark.parametrize("how", ["save as", "copy", "alone"])
+def test_a_file_leaves_its_project(tmp_path, how):
+    """Catches paths that follow a .blend file where nothing was moved with it."""
+    project = make_project(tmp_path / "project")
+    other = tmp_path / "a/b/c/other.blend"
+    other.parent.mkdir(parents=True)
+    if how == "alone":
+        shutil.move(bpy.data.filepath, other)
+    else:
+        save(other, copy=how == "copy")
+    if how == "copy":
+        assert places(panel().head) == expected(project)
+    open_file(other)
+    assert places(panel().head) == expected(project)
+    try_all(project)
+
+
+def test_a_save_that_failed_changes_nothing(tmp_path):
+    """Catches the note for other programs left in the face, and paths of a file that was never
+    written."""
+    project = make_project(tmp_path / "project")
+    names = set(bpy.data.objects.keys())
+    (tmp_path / "taken.blend").mkdir()
+    (tmp_path / "none").write_text("")
+    for refused in (tmp_path / "none/head.blend", tmp_path / "taken.blend"):
+        with failure("."):
+            save(refused)
+        assert set(bpy.data.objects.keys()) == names
+        assert panel().head[tags.STORED_IN] == bpy.data.filepath
+        assert (panel().run_folder, places(panel().head)) == (
+            str(project / "run"),
+            expected(project),
+        )
+
+
+def bring(file, how, name):
+    within = f"{file}/Collection/"
+    operator = bpy.ops.wm.link if how == "link" else bpy.ops.wm.append
+    operator(filepath=within + name, directory=within, filename=name, instance_collections=False)
+
+
+@pytest.mark.parametrize("how", ["append", "link", "paste"])
+@pytest.mark.parametrize("moved", [False, True])
+def test_a_head_is_brought_into_another_file(tmp_path, how, moved):
+    """Catches a capture, model or run lost, or taken from beside the other file."""
+    project = make_project(tmp_path / "project")
+    file = project / "shots/head.blend"
+    if moved:
+        shutil.move(project, tmp_path / "moved")
+        project = tmp_path / "moved"
+        file = project / "shots/head.blend"
+    name = panel().head.users_collection[0].name
+    if how == "paste":  # as Blender does it, whose operators need a window
+        open_file(file)
+        file = tmp_path / "copybuffer.blend"
+        bpy.data.libraries.write(str(file), {panel().head.users_collection[0]})
+    write_ball_run(tmp_path / "film/run")
+    bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
+    save(tmp_path / "film/film.blend")
+    bring(file, how, name)
+    heads = [each for each in bpy.data.objects if each.get(tags.KIND) == tags.HEAD]
+    assert [places(head) for head in heads] == [expected(project)]
+    assert panel().head == heads[0]
+    bpy.ops.wm.save_mainfile()
+    open_file(tmp_path / "film/film.blend")
+    assert places(panel().head) == expected(project)
+    assert Path(bpy.path.abspath(panel().avatar)) == project / "run/avatar.npz"
