@@ -1,5 +1,5 @@
-"""Makes `tracking/networks/landmark_bias.npz`: how far the networks' landmarks lie from those of the
-bundled head, in pictures of it from many directions.
+"""Makes `tracking/networks/landmark_bias.npz`: how far the networks' landmarks lie from those of
+the bundled head, in pictures of it from many directions.
 
 python -m stga_addon.development.landmark_bias
 """

@@ -188,9 +188,8 @@ TRACKING_SHARE = 0.5
 FOCAL_SOURCES = {
     "given": "as given",
     "file": "as the file says",
-    "solved": "solved from the turns of the head",
-    "usual": "a guess, that of a phone",
-    "avatar": "a guess, that of the avatar's camera",
+    "estimated": "estimated from the head's landmarks",
+    "avatar": "that of the avatar's camera",
 }
 """Where a focal length is from (`Footage.focal`) -> what a person reads of it."""
 

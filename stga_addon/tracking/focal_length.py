@@ -1,4 +1,4 @@
-"""Focal length of a single camera, from landmarks of a head and what is likely; and cameras of a rig
+"""Focal length of a single camera, from a head's landmarks and what is likely; and cameras of a rig
 that see the head larger or smaller than the others do."""
 
 from collections.abc import Mapping, Sequence
@@ -9,6 +9,7 @@ import numpy as np
 from ..capture.mesh_geometry import Similarity
 from ..capture.model import evenly_spread
 from ..flame.forward import RIGID_SIZE, TRANSLATION_SIZE
+from ..worker.helpers import Step
 from . import fit as head_fit
 from .fit import HeadFit, RecordedTake, TimestepLandmarks
 from .head_model import HeadModel
@@ -26,7 +27,7 @@ OWN_SIGMA_M = 0.002
 NOISE_SIGMA_M = 0.0006
 """Standard deviation of what a landmark misses the head by beyond that in one timestep."""
 RATIOS = np.geomspace(0.5, 6.0, 7)
-"""Focal lengths that the head is fitted for, relative to a phone's: 104° to 12° over the diagonal."""
+"""Focal lengths that the head is fitted for, relative to a phone's: 104° to 12° of diagonal."""
 FINE_RATIOS = np.geomspace(0.5, 6.0, 400)
 """Focal lengths between which the posterior is read."""
 ROUNDS = 2
@@ -46,8 +47,8 @@ DISTANCE_SIGMA = 0.4
 DATA_WEIGHT = 0.5
 """Weight of the landmarks' likelihood: their errors are not independent."""
 CHOSEN_QUANTILE = 0.6
-"""Of the posterior. A focal length that is too long by half costs little in views from the side, one
-that is too short by half makes another person."""
+"""Quantile of the posterior. A focal length that is too long by half costs little in views from the
+side; one that is too short by half makes another person."""
 INTERVAL = (0.1, 0.9)
 """Quantiles of the posterior that are reported."""
 MAX_SCALE_DIFFERENCE = 0.043  # Of a camera from the median of all; 5 % of focal length show
@@ -77,13 +78,15 @@ class FocalEstimate:
     turn_deg: float
 
 
-def estimated_focal(head: HeadModel, take: RecordedTake) -> FocalEstimate:
+def estimated_focal(
+    head: HeadModel, take: RecordedTake, step: Step = lambda: None
+) -> FocalEstimate:
     """Focal length of the only camera of `take`, whose own is that of a phone
     (`open.usual_focal`).
 
     A quantile of its posterior. The likelihood is that of landmarks of the most differently turned
     timesteps, under the best fit of the head for each focal length; the prior knows the angle of
-    view of phones and the distance at which people are filmed.
+    view of phones and the distance at which people are filmed. step: follows each of RATIOS.
     """
     from scipy.interpolate import CubicSpline
 
@@ -99,7 +102,7 @@ def estimated_focal(head: HeadModel, take: RecordedTake) -> FocalEstimate:
     timesteps, turn_deg = _turned(own_head, own_places, seen)
     views = [seen[t] for t in timesteps]
     camera = views[0].cameras[0]
-    slopes, distances = _fits(own_head, own_places, views)
+    slopes, distances = _fits(own_head, own_places, views, step)
     tried = np.log(RATIOS)
     fine = np.log(FINE_RATIOS)
     cost = DATA_WEIGHT * CubicSpline(tried, slopes).antiderivative()(fine)
@@ -165,7 +168,7 @@ def _observed(
 
 
 def _fits(
-    head: HeadModel, places: SurfacePoints, views: Sequence[TimestepLandmarks]
+    head: HeadModel, places: SurfacePoints, views: Sequence[TimestepLandmarks], step: Step
 ) -> tuple[np.ndarray, np.ndarray]:
     """For each of RATIOS the derivative of the negative log-likelihood by the logarithm of the
     focal length, and the head's median distance in meters."""
@@ -198,6 +201,7 @@ def _fits(
         subject = person(head, shape)
         slopes.append(_slope(subject, places, trials, weighted, frames))
         distances.append(float(np.median(-frames[:, -1])))
+        step()
     return np.array(slopes), np.array(distances)
 
 

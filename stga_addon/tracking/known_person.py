@@ -7,6 +7,7 @@ import numpy as np
 
 from ..capture.camera import Camera
 from ..capture.model import evenly_spread
+from . import landmark_bias
 from .face_networks import FaceNetworks
 from .fit import ROUNDS, HeadFit, RecordedTake, fit_head, posed_mesh
 from .posed_points import PosedPoints, face_size, split
@@ -40,6 +41,8 @@ def without_bias(take: RecordedTake, person: KnownPerson, crew: Crew) -> Recorde
     light.
     """
     networks = FaceNetworks()
+    model = person.fit.head.model
+    neutral = take.places.on(model.v_template, model.faces)
     corrected = take
     some = evenly_spread(sorted(take.landmarks), BIAS_TIMESTEPS)
     for _ in range(BIAS_ROUNDS):
@@ -56,7 +59,8 @@ def without_bias(take: RecordedTake, person: KnownPerson, crew: Crew) -> Recorde
             for name, camera in zip(own.names, cameras, strict=True):
                 faces = networks.detect(person.draw(mesh, camera))
                 if len(faces) == 1:
-                    away = faces[0] - camera.project(head)[0]
+                    found = landmark_bias.without_bias(faces[0], camera, neutral, take.reliable)
+                    away = found - camera.project(head)[0]
                     shares.setdefault(name, []).append(away / face_size(faces[0]))
         bias = {name: np.median(found, axis=0) for name, found in shares.items()}
         moved = {}

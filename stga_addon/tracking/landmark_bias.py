@@ -27,8 +27,7 @@ def without_bias(
 
     neutral (N, 3) meters: their places on the neutral head; reliable (N,) bool: by which the
     direction is found that the camera sees the head from. Beyond the file's directions the nearest
-    one counts. On rendered heads the landmarks are off by 2 mm from the front, 3 mm at 45°, and 4 mm
-    at 45° from above or below.
+    one counts.
     """
     turn, center = _pose(points, camera, neutral, reliable)
     away = camera.position - center

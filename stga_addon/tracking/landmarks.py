@@ -1,12 +1,13 @@
 """Landmarks of every frame: detected, or read from a folder of files."""
 
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
+from ..capture.camera import Camera
 from ..capture.model import parts_of
 from ..errors import StgaError
 from ..files import read_npz, write_npz
@@ -55,12 +56,17 @@ def landmark_file(folder: Path, camera: str) -> Path:
 
 
 def detect_landmarks(
-    footage: Footage, detector: FaceNetworks, folder: Path, crew: Crew
+    footage: Footage,
+    detector: FaceNetworks,
+    unbiased: Callable[[np.ndarray, Camera], np.ndarray],
+    folder: Path,
+    crew: Crew,
 ) -> dict[str, CameraLandmarks]:
     """Landmarks by camera; each camera's are written to `folder`, and read from there where they
     are already.
 
-    detector: can be handed to helping processes. A frame with several faces counts as one without a
+    detector: can be handed to helping processes; unbiased: what it finds (N, 2) in pixels of a
+    camera, moved to where it belongs. A frame with several faces counts as one without a
     face. Raises StgaError for a camera that often sees several.
     """
     total = sum(len(camera.timesteps) for camera in footage.cameras)
@@ -85,7 +91,10 @@ def detect_landmarks(
                 )
             faces = [own[0] if len(own) == 1 else None for own in seen]
             number = next((len(face) for face in faces if face is not None), 0)
-            points = [np.zeros((number, 2)) if face is None else face for face in faces]
+            points = [
+                np.zeros((number, 2)) if face is None else unbiased(face, camera.camera)
+                for face in faces
+            ]
             confidence = np.tile([[float(face is not None)] for face in faces], (1, number))
             timesteps = np.array(camera.timesteps)
             write_camera(path, CameraLandmarks(timesteps, np.stack(points), confidence))

@@ -15,8 +15,9 @@ from . import folder
 from .correspondence import calibrate
 from .face_networks import FaceNetworks
 from .fit import RecordedTake, TimestepLandmarks
-from .focal_length import solved_focal
+from .focal_length import RATIOS, FocalEstimate, estimated_focal
 from .footage.model import Footage, FootageCamera
+from .landmark_bias import without_bias
 from .landmarks import (
     CameraLandmarks,
     check_count,
@@ -42,11 +43,14 @@ class RecordedFootage:
 
     detected  by camera, whether reliable or not
     take      those that the head is fitted to
+    focal     how well the focal length of a single camera without calibration is known; None where
+              it was not estimated
     """
 
     opened: OpenedFootage
     detected: Mapping[str, CameraLandmarks]
     take: RecordedTake
+    focal: FocalEstimate | None = None
 
     @property
     def footage(self) -> Footage:
@@ -81,24 +85,30 @@ def record(opened: OpenedFootage, crew: Crew) -> RecordedFootage:
 
 
 def with_focal(recorded: RecordedFootage, crew: Crew, likely: Camera | None) -> RecordedFootage:
-    """The footage of a single camera of unknown lens with a focal length from the head's turns; of
-    a head that turns too little, that of `likely`, where there is one."""
+    """The footage of a single camera of unknown lens with a focal length that is estimated, or that
+    of `likely` where it is within the estimate's interval."""
     footage = recorded.footage
     if footage.focal != "usual":
         return recorded
-    crew.report(Stage.FOCAL_LENGTH, 0, 1)
+    crew.report(Stage.FOCAL_LENGTH, 0, len(RATIOS))
     (camera,) = footage.cameras
-    pixels = solved_focal(recorded.opened.head, recorded.take)
-    told_by = "solved"
-    if pixels is None and likely is not None:
+    estimate: FocalEstimate = crew.helpers.run(
+        estimated_focal,
+        (recorded.opened.head, recorded.take),
+        lambda steps: crew.report(Stage.FOCAL_LENGTH, steps, len(RATIOS)),
+    )
+    pixels = estimate.pixels
+    source = "estimated"
+    if likely is not None:
         sides = [max(own.width, own.height) for own in (camera.camera, likely)]
-        pixels = likely.fl_x * sides[0] / sides[1]
-        told_by = "avatar"
-    if pixels is None:
-        return recorded
+        known = likely.fl_x * sides[0] / sides[1]
+        if estimate.low <= known <= estimate.high:
+            pixels = known
+            source = "avatar"
     moved = replace(camera, camera=replace(camera.camera, fl_x=pixels, fl_y=pixels))
-    footage = replace(footage, cameras=(moved,), focal=told_by)
-    return _with_timesteps(replace(recorded, opened=replace(recorded.opened, footage=footage)))
+    footage = replace(footage, cameras=(moved,), focal=source)
+    opened = replace(recorded.opened, footage=footage)
+    return _with_timesteps(replace(recorded, opened=opened, focal=estimate))
 
 
 def in_world(recorded: RecordedFootage) -> RecordedFootage:
@@ -126,7 +136,9 @@ def _detected(opened: OpenedFootage, crew: Crew) -> tuple[dict[str, CameraLandma
     take = RecordedTake(places, reliable, {})
     crew.show(partial(picture_of_first_frame, opened.head, footage, detector, take), {})
     try:
-        detected = detect_landmarks(footage, detector, kept, crew)
+        neutral = places.on(model.v_template, model.faces)
+        unbiased = partial(without_bias, neutral=neutral, reliable=reliable)
+        detected = detect_landmarks(footage, detector, unbiased, kept, crew)
         _check_faces(footage, detected)
         _check_share(footage, detected)
     except StgaError:

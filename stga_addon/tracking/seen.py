@@ -14,7 +14,7 @@ from . import fit as head_fit
 from .dense import DenseFit, fit_dense
 from .dense_head import REGIONS
 from .fit import HeadFit, Pictures, RecordedTake, posed_mesh
-from .focal_length import scale_warnings
+from .focal_length import FocalEstimate, scale_warnings
 from .footage.model import Footage, FootageCamera
 from .gaze import with_gaze
 from .head_model import HeadModel
@@ -27,6 +27,8 @@ from .stages import Crew, Stage
 from .surface import fit_surface
 from .torso import FollowedTorso, follow_torso
 
+ENOUGH_TURN_DEG = 30.0
+"""Largest angle between two poses of a head, beyond which turning tells little more of a lens."""
 LONG_TAKE = 50  # From which the fit is worth a helping process: threads slow its small matrices
 
 Misfits = dict[str, dict[int, float]]
@@ -227,7 +229,16 @@ def _warnings(fitted: FittedHead) -> tuple[str, ...]:
         "the cameras' world is kept but for its scale: in meters, the head would be more than "
         f"{head_fit.MAX_HEAD_SCALE - 1:.0%} off people's; positions are multiplied by "
         f"{scale}": is_scaled,
-        "the focal length is a guess, as the head turns too little to tell; "
-        "give it if it is known": footage.focal in ("usual", "avatar"),
     }
-    return *footage.warnings, *fitted.warnings, *(text for text, holds in own.items() if holds)
+    warnings = *footage.warnings, *fitted.warnings
+    warnings += tuple(text for text, holds in own.items() if holds)
+    return warnings if recorded.focal is None else (*warnings, _focal_warning(recorded.focal))
+
+
+def _focal_warning(estimate: FocalEstimate) -> str:
+    """How well the focal length is known, and what would settle it."""
+    turn = "" if estimate.turn_deg > ENOUGH_TURN_DEG else "a head that turns by 30°, "
+    return (
+        f"the focal length is an estimate: {estimate.low:.0f} to {estimate.high:.0f} px with a "
+        f"probability of 80 %; {turn}--focal, or a photo with EXIF data tells more"
+    )

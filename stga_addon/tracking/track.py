@@ -81,7 +81,7 @@ def _stranger(opened: OpenedFootage, crew: Crew) -> SeenHead:
 
 def _known(opened: OpenedFootage, person: KnownPerson, crew: Crew) -> SeenHead:
     """The stages of a person of whom there is an avatar. The only camera has the focal length of
-    the person's, where neither its file nor the head's turns tell."""
+    the person's, where its file does not tell it and the landmarks allow it."""
     recorded = record(opened, crew)
     recorded = in_world(with_focal(recorded, crew, person.camera))
     if opened.options.landmarks is None:
@@ -106,6 +106,8 @@ def _write(head: SeenHead, crew: Crew) -> TrackingReport:
     focal = None
     if head.footage.focal != "calibration":
         focal = head.footage.cameras[0].camera.fl_x
+    estimate = recorded.focal
+    interval = None if estimate is None else [round(estimate.low, 1), round(estimate.high, 1)]
     median = median_px(head.errors)
     pixels = {name: {t: px for t, (px, _) in own.items()} for name, own in head.errors.items()}
     values = {
@@ -118,6 +120,7 @@ def _write(head: SeenHead, crew: Crew) -> TrackingReport:
         "image_misfit": folder.rounded(head.fitted.misfits),
         "focal_length_px": None if focal is None else round(focal, 1),
         "focal_length_from": head.footage.focal,
+        "focal_length_interval_px": interval,
         folder.TORSO_KEY: None if torso.motion is None else to_json(torso.motion),
     }
     write_json(out / folder.REPORT_FILE, values)

@@ -149,8 +149,8 @@ class Footage:
     fps         frames per second of the videos, the average where it varies; None where not known,
                 as for most images. Timesteps are numbers of frames
     focal       where focal lengths are from: "calibration"; of a single camera without one, "given"
-                (in the request), "file" (its EXIF or QuickTime's tags), "usual" (a phone's) or
-                "solved" or "avatar" (by tracking: from the head's turns, or that of its camera)
+                (in the request), "file" (its EXIF or QuickTime's tags), "usual" (a phone's), or by
+                tracking "estimated" (from landmarks) or "avatar" (that of its camera)
     keeps_world  whether the calibration says that the capture is to keep its world
     warnings    one sentence each
     """
