@@ -83,7 +83,7 @@ def _camera(center: np.ndarray, azimuth_deg: float, elevation_deg: float) -> Cam
     direction = np.array([math.sin(turn) * across, math.sin(rise), math.cos(turn) * across])
     focal = DISTANCE_M * FACE_RATIO * PICTURE_SIZE_PX / FACE_HEIGHT_M
     eye = center + DISTANCE_M * direction
-    return look_at(eye, center, PICTURE_SIZE_PX, PICTURE_SIZE_PX, focal)
+    return look_at(eye.tolist(), center.tolist(), PICTURE_SIZE_PX, PICTURE_SIZE_PX, focal)
 
 
 def _filled(found: np.ndarray) -> np.ndarray:

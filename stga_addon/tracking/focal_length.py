@@ -115,7 +115,8 @@ def estimated_focal(
     density = np.exp(cost.min() - cost)
     below = np.cumsum(density) / density.sum()
     quantiles = np.interp((CHOSEN_QUANTILE, *INTERVAL), below, fine)
-    return FocalEstimate(*(camera.fl_x * np.exp(quantiles)).tolist(), turn_deg)
+    chosen, low, high = (camera.fl_x * np.exp(quantiles)).tolist()
+    return FocalEstimate(chosen, low, high, turn_deg)
 
 
 def _with_own_places(head: HeadModel, places: SurfacePoints) -> tuple[HeadModel, SurfacePoints]:

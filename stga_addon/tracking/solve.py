@@ -14,6 +14,8 @@ LANDMARK_SIGMA_M = 0.002
 """Standard deviation of a landmark over people and views; coefficients have a standard deviation of
 1."""
 SCALE_SIGMA = 0.3  # Of the capture's scale, relative: the first guess comes from the average head
+SIZE_SIGMA = 0.02
+"""Standard deviation of the size of a head that one camera sees, relative to the average one's."""
 JOINT_SIGMA_RAD = {
     "root": (3.0, 3.0, 3.0),
     "neck": (0.1, 0.1, 0.1),
@@ -99,7 +101,9 @@ def solve_identity(
     poses (T, 18), or with expressions (T, E + 18). The identity begins at `shape` (I,), else at 0.
 
     The scale of the world is solved as a component: a head `scale` times as large as the model's
-    fits best. Where the world is `metric`, it is 1, and the size of the head is the person's.
+    fits best. Where the world is `metric`, it is 1, and the size of the head is the person's, which
+    a single camera does not see: the head's is then that of the average one, and timesteps count as
+    one, because a detector misses a face in the same way in all of them.
     """
     model = head.model
     known = model.n_identity
@@ -115,10 +119,17 @@ def solve_identity(
     frames = np.pad(start, ((0, 0), (own - start.shape[1], 0)))
     begun = np.zeros(known) if shape is None else shape
     state = np.concatenate([begun, [0.0], frames.ravel()])
+    size = np.zeros(shared)
+    if observations[0].eye is not None:
+        size[:known] = _size_by_identity(head, places) / SIZE_SIGMA
+        share = 1 / len(observations)
+        observations = [replace(one, weight=share * one.weight) for one in observations]
     for _ in range(IDENTITY_ITERATIONS):
         precision, pull = prior_terms(head, state[shared:].reshape(-1, own))
         matrix = np.diag(np.concatenate([np.ones(shared), precision.ravel()]))
         right = np.concatenate([-state[:shared], pull.ravel()])
+        matrix[:shared, :shared] += np.outer(size, size)
+        right[:shared] -= size * (size @ state[:shared])
         for number, observation in enumerate(observations):
             frame = slice(shared + own * number, shared + own * (number + 1))
             rows = np.r_[:shared, frame]
@@ -135,6 +146,18 @@ def solve_identity(
     frames[:, :expressions] /= scale
     frames[:, -TRANSLATION_SIZE:] /= scale
     return Identity(state[:known] / scale, float(scale), frames)
+
+
+def _size_by_identity(head: HeadModel, places: SurfacePoints) -> np.ndarray:
+    """(I,) relative change of the landmarks' extent by identity coefficients."""
+    model = head.model
+    corners = model.faces[places.face]
+    at = places.on(model.v_template, model.faces)
+    moved = np.einsum(
+        "nb,nbci->nci", places.barycentric, model.shapedirs[corners][..., : model.n_identity]
+    )
+    out = at - at.mean(0)
+    return np.einsum("nc,nci->i", out, moved) / (out**2).sum()
 
 
 def solve_take(
