@@ -255,6 +255,9 @@ def fit_head(head: HeadModel, recorded: RecordedTake, step: Step = lambda: None)
         starts = np.stack([rigid_start(at, own) for own in observed])
         # Of one camera's rays, a head shrunk into the camera itself misses all by the least.
         sized = recorded.metric or not several
+        if not several:  # timesteps count as one: a detector misses a face alike in all of them
+            count = len(observed)
+            observed = [replace(own, weight=own.weight / count) for own in observed]
         identity = solve_identity(head, places, observed, starts, sized)
         world = scaled_down(world, identity.scale)
         shape = identity.shape

@@ -49,7 +49,7 @@ DATA_WEIGHT = 0.5
 CHOSEN_QUANTILE = 0.6
 """Quantile of the posterior. A focal length that is too long by half costs little in views from the
 side; one that is too short by half makes another person."""
-INTERVAL = (0.1, 0.9)
+INTERVAL = (0.05, 0.95)
 """Quantiles of the posterior that are reported."""
 MAX_SCALE_DIFFERENCE = 0.043  # Of a camera from the median of all; 5 % of focal length show
 MAX_SIDE_DEG = 60.0
@@ -70,7 +70,7 @@ HERE = Similarity(
 @dataclass(frozen=True)
 class FocalEstimate:
     """Focal length in pixels of a camera without calibration, the ends of the interval that holds
-    it with a probability of 80 %, and the largest angle between two poses of the head."""
+    it with a probability of 90 %, and the largest angle between two poses of the head."""
 
     pixels: float
     low: float

@@ -240,5 +240,5 @@ def _focal_warning(estimate: FocalEstimate) -> str:
     turn = "" if estimate.turn_deg > ENOUGH_TURN_DEG else "a head that turns by 30°, "
     return (
         f"the focal length is an estimate: {estimate.low:.0f} to {estimate.high:.0f} px with a "
-        f"probability of 80 %; {turn}--focal, or a photo with EXIF data tells more"
+        f"probability of 90 %; {turn}--focal, or a photo with EXIF data tells more"
     )

@@ -102,8 +102,7 @@ def solve_identity(
 
     The scale of the world is solved as a component: a head `scale` times as large as the model's
     fits best. Where the world is `metric`, it is 1, and the size of the head is the person's, which
-    a single camera does not see: the head's is then that of the average one, and timesteps count as
-    one, because a detector misses a face in the same way in all of them.
+    a single camera does not see: the head's is then that of the average one.
     """
     model = head.model
     known = model.n_identity
@@ -122,8 +121,6 @@ def solve_identity(
     size = np.zeros(shared)
     if observations[0].eye is not None:
         size[:known] = _size_by_identity(head, places) / SIZE_SIGMA
-        share = 1 / len(observations)
-        observations = [replace(one, weight=share * one.weight) for one in observations]
     for _ in range(IDENTITY_ITERATIONS):
         precision, pull = prior_terms(head, state[shared:].reshape(-1, own))
         matrix = np.diag(np.concatenate([np.ones(shared), precision.ravel()]))
