@@ -183,10 +183,7 @@ class RenderVideo(Stepwise, bpy.types.Operator, FileExport):
                 posed = list[PosedSplats]()
                 images = _images(view, frames, cameras)
                 for number in range(len(frames)):
-                    while is_rendering():  # it sets frames itself, and would get ours
-                        if status.report(Progress(number / len(frames), "Waiting for the render")):
-                            raise Cancelled(f"{output}: cancelled")
-                        yield
+                    yield from _while_rendering(status, number / len(frames), output)
                     layers, camera, is_new = next(images)
                     if drawn is not None:
                         drawn.add(layers, camera)
@@ -210,6 +207,14 @@ class RenderVideo(Stepwise, bpy.types.Operator, FileExport):
                 monitor.check_now(view.scene.get(), Kind.VIDEO)
             if not bpy.app.background:
                 kept.pop_all()
+
+
+def _while_rendering(status: Any, share: float, output: Path) -> StepGenerator:
+    """Wait while Blender renders: it sets frames itself, and would get ours."""
+    while is_rendering():
+        if status.report(Progress(share, "Waiting for the render")):
+            raise Cancelled(f"{output}: cancelled")
+        yield
 
 
 def _images(

@@ -404,8 +404,8 @@ def check_encodable(path: Path) -> None:
         problem = "the working folder was removed; change to one that exists"
         raise StgaError(f"{path}: is not a usable path ({problem})") from error
     try:
-        whole.encode("utf-8")
-    except UnicodeEncodeError as error:
+        os.fsencode(whole).decode("utf-8")  # as the system stores it, whatever the locale
+    except UnicodeDecodeError as error:
         problem = "the name of this file or of a folder above is not UTF-8; rename it"
         raise StgaError(f"{whole}: is not a usable path ({problem})") from error
 

@@ -136,7 +136,7 @@ def toy(toy_root):
 @pytest.fixture(scope="session")
 def take(tmp_path_factory):
     """footage/ of the small head, head.npz and its exact landmarks points/, for tests that only
-    read it; in black, so that landmarks alone are tracked, in a third of the time."""
+    read it; without detail, so that landmarks alone are tracked, in a third of the time."""
     from flame.small_head import small_head
     from tracking.recording import record
 

@@ -27,8 +27,11 @@ def without_bias(
 
     neutral (N, 3) meters: their places on the neutral head; reliable (N,) bool: by which the
     direction is found that the camera sees the head from. Beyond the file's directions the nearest
-    one counts.
+    one counts. Landmarks of another number are another detector's, and stay.
     """
+    table = _table()
+    if table.values.shape[2] != len(points):  # of another detector
+        return points
     turn, center = _pose(points, camera, neutral, reliable)
     away = camera.position - center
     distance = float(np.linalg.norm(away))
@@ -40,7 +43,6 @@ def without_bias(
     # the roll between the upright camera's image and this one: the nearest rotation
     in_image = (camera.world_to_camera[:3, :3] @ turn @ np.stack([right, down], axis=1))[:2]
     left, _, other = np.linalg.svd(in_image)
-    table = _table()
     limits = [(axis[0], axis[-1]) for axis in table.grid]
     at = [np.clip(value, *limit) for value, limit in zip((azimuth, elevation), limits, strict=True)]
     offset = table(at)[0] @ (left @ other).T

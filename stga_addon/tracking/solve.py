@@ -48,6 +48,8 @@ ROUGH_TAKE_ITERATIONS = 2
 CONVERGED_STEP = 1e-3
 """Largest change of a parameter (standard deviations, radians, meters) after which iterations
 stop."""
+MIN_DISTANCE_M = 1e-9
+"""Distance of a landmark from the camera, below which it is the camera: it has no ray."""
 MIN_DEPTH_RATIO = 0.2
 """Depth of a point on the head, in that of its landmark, below which residuals no longer grow: a
 head that a step moved behind the camera comes back."""
@@ -278,7 +280,7 @@ def residuals(
     if observation.eye is None:
         return residual, derivative
     along = observation.position - observation.eye
-    distance = np.maximum(np.linalg.norm(along, axis=1), np.finfo(np.float64).tiny)
+    distance = np.maximum(np.linalg.norm(along, axis=1), MIN_DISTANCE_M)
     direction = along / distance[:, None]
     depth = ((positions - observation.eye) * direction).sum(1)
     depth = np.maximum(depth, MIN_DEPTH_RATIO * distance)

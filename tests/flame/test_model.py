@@ -25,7 +25,7 @@ def _assert_model(path, arrays):
     model = read_flame(path)
     named = {"j_regressor": "J_regressor", "faces": "f"}
     for name in ("v_template", "shapedirs", "posedirs", "j_regressor", "weights", "faces"):
-        np.testing.assert_array_equal(getattr(model, name), arrays[named.get(name, name)])
+        np.testing.assert_allclose(getattr(model, name), arrays[named.get(name, name)], rtol=1e-14)
     assert model.parents.tolist() == [-1, 0, 1, 1, 1]
     assert model.faces.dtype == np.int32
     assert (model.n_identity, model.n_expression) == (9, 3)

@@ -41,9 +41,14 @@ def seen_landmarks(head, places, meshes, camera):
     return np.stack([camera.project(places.on(mesh, head.model.faces))[0] for mesh in meshes])
 
 
-def record(
-    folder, head, picture=lambda mesh, camera: np.zeros((SIZE, SIZE, 3), np.uint8), timesteps=5
-):
+def gray_with_a_lintel(mesh, camera):
+    """Without detail where a head is, so that landmarks alone are tracked."""
+    image = np.full((SIZE, SIZE, 3), 96, np.uint8)
+    image[: SIZE // 8] = 160
+    return image
+
+
+def record(folder, head, picture=gray_with_a_lintel, timesteps=5):
     """Footage, a FLAME file, and exact landmarks of a moving head, none of them at timestep 2;
     returns its meshes. picture(mesh, camera) gives the pixels."""
     cameras = rig()

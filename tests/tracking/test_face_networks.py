@@ -217,5 +217,5 @@ def test_a_known_head_seen_from_above_is_not_tilted(tmp_path, monkeypatch):
             own_deg.append(turn.magnitude() * 180 / np.pi)
         tilts_deg.append(np.median(own_deg))
     assert len(own_deg) == len(heads)
-    assert tilts_deg[0] > 3
-    assert tilts_deg[1] < 0.5 * tilts_deg[0]
+    assert tilts_deg[0] < 1.5  # more than 3 without the bias by direction
+    assert tilts_deg[1] < 1.5

@@ -337,6 +337,10 @@ class Detector:
         return self.faces[int(image[0, 0, 0]) % len(self.faces)]
 
 
+def unmoved(points, camera):
+    return points
+
+
 def test_detection_resumes_camera_by_camera(recorded):
     """Catches a canceled detection that starts from the beginning, or keeps half a camera, and a
     head that jumps between two people."""
@@ -344,10 +348,10 @@ def test_detection_resumes_camera_by_camera(recorded):
     footage = open_footage(folder / "footage")
     detector = Detector([np.ones((3, 2))] * 2)
     with pytest.raises(KeyboardInterrupt):
-        detect_landmarks(footage, detector, folder / "found", Crew(Helpers(1), cancel))
+        detect_landmarks(footage, detector, unmoved, folder / "found", Crew(Helpers(1), cancel))
     assert len(list((folder / "found").iterdir())) == 2
     detector.calls = 0
-    found = detect_landmarks(footage, detector, folder / "found", Crew(Helpers(1)))
+    found = detect_landmarks(footage, detector, unmoved, folder / "found", Crew(Helpers(1)))
     assert detector.calls == 15
     # the same face twice is one face
     assert all(camera.confidence.all() for camera in found.values())
@@ -356,7 +360,7 @@ def test_detection_resumes_camera_by_camera(recorded):
     assert_array_equal(written.points, 1)
     two = np.array([[0.0, 0.0], [9.0, 9.0]])
     with refusal(r"camera cam0 sees 5 of 5 frames with two faces, the first at timestep 0"):
-        detect_landmarks(footage, Detector([two, two + 30]), folder, Crew(Helpers(1)))
+        detect_landmarks(footage, Detector([two, two + 30]), unmoved, folder, Crew(Helpers(1)))
 
 
 def cancel(stage, done, total):

@@ -268,7 +268,8 @@ def _remove_bone_groups(head: Any, rigs: Sequence[Any]) -> None:
 
 
 def _rigs(head: Any) -> list[Any]:
-    return [child for child in head.parent.children if child.get(tags.KIND) == tags.RIG]
+    children = head.parent.children if head.parent is not None else ()
+    return [child for child in children if child.get(tags.KIND) == tags.RIG]
 
 
 def _place_armature(
