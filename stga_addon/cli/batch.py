@@ -94,7 +94,7 @@ def run_batch_command(options: Namespace, head: object = None) -> None:
         with hold_batch(plan.out):
             batch = Batch(plan)
             for job in batch.unfinished:
-                prepare(job, batch.entries[job.name].digest, 0.0)
+                prepare(job, batch.entries[job.name].digest)
                 command = ["env", f"PYTHONPATH={PACKAGES_FOLDER}", *job_command(job)]
                 waits = [name for name in job.after if not batch.entries[name].state.is_over]
                 print(shlex.join(command) + (f"  # after {' '.join(waits)}" if waits else ""))
@@ -140,32 +140,28 @@ def with_threads(plan: Plan, threads: int) -> Plan:
 
 def print_plan(plan: Plan) -> None:
     """Print the jobs, and how long they are expected to take."""
-    from ..jobs.batch.report import plan_lines
-    from ..jobs.batch.run import Batch, set_forecasts
+    from ..jobs.batch.run import Batch
+    from ..jobs.batch.table import plan_lines
 
-    batch = Batch(plan)
-    set_forecasts(batch)
-    print("\n".join(plan_lines(batch, processors())))
+    print("\n".join(plan_lines(Batch(plan), processors())))
 
 
 def carry_out_plan(plan: Plan, engine_name: str = "local", address: str = "") -> None:
-    """Carry out what is not finished, with table and report. Raises StgaError where a job failed,
+    """Carry out what is not finished, with a table. Raises StgaError where a job failed,
     KeyboardInterrupt after Ctrl-C when the running jobs have stopped."""
     from ..jobs.batch.engines import make_engine
     from ..jobs.batch.folder import hold_batch
-    from ..jobs.batch.report import LiveTable, summary_line, write_report
-    from ..jobs.batch.run import Batch, BatchRun, set_forecasts
+    from ..jobs.batch.run import Batch, BatchRun
+    from ..jobs.batch.table import LiveTable, ended_lines
 
     with hold_batch(plan.out) as lease:
         batch = Batch(plan)
         engine = make_engine(engine_name, address)
-        set_forecasts(batch)
         table = LiveTable(sys.stderr, shutil.get_terminal_size().columns)
         try:
             BatchRun(batch, engine, lease, table, table.say).run()
         finally:
-            path = write_report(batch)
-            print(f"{summary_line(batch)}\nreport: {path}")
+            print("\n".join(ended_lines(batch)))
     failures = batch.failures
     if failures:
         raise StgaError(

@@ -16,12 +16,11 @@ from refusal import refusal
 
 from stga_addon.errors import StgaError
 from stga_addon.jobs.batch import engines
-from stga_addon.jobs.batch import run as batch_run
 from stga_addon.jobs.batch.engines import LocalEngine
 from stga_addon.jobs.batch.folder import LOCK, hold_batch, is_done, prepare, read_record
 from stga_addon.jobs.batch.plan import Ended, Job, Resources, make_plan
-from stga_addon.jobs.batch.report import write_report
 from stga_addon.jobs.batch.run import MAX_RETRIES, Batch, JobState
+from stga_addon.jobs.batch.table import ended_lines
 from stga_addon.jobs.blender import RenderBlend
 from stga_addon.jobs.convert_motion import ConvertMotion
 from stga_addon.progress import Progress
@@ -178,31 +177,9 @@ def test_waiting_in_a_queue_is_no_work(tmp_path, monkeypatch):
     assert record.seconds == entry.seconds == work_s
 
 
-def test_the_pace_of_this_machine_is_measured_once(tmp_path, monkeypatch):
-    """Catches a plan of 200 trainings whose forecast takes 200 calibrations, and one time that is
-    given to all of them whatever their iterations are."""
-    (tmp_path / "capture").mkdir()
-    iterations = {"standard": 1900, "draft": 500, "own": 40}
-    train = {"request": "train", "capture": "capture"}
-    jobs = {name: {**train, "settings": {"preset": name}} for name in ("standard", "draft")}
-    jobs["own"] = {**train, "settings": {"iterations": 40}}
-    batch = Batch(make_plan({"out": "runs", "job": jobs}, tmp_path, "plan"))
-    measured = []
-
-    def pace(job, request, iterations):
-        measured.append(job.name)
-        return 0.5
-
-    monkeypatch.setattr(batch_run, "pace", pace)
-    batch_run.set_forecasts(batch)
-    assert len(measured) == 1
-    found = {name: entry.forecast_s for name, entry in batch.entries.items()}
-    assert found == {name: 0.5 * count for name, count in iterations.items()}
-
-
-def test_the_report_shows_the_avatar_that_is_kept(tmp_path):
-    """Catches figures of an earlier state for a continuation, which keeps its latest, and heads
-    fitted to held-out images in a column that is not called so."""
+def test_the_table_shows_the_avatar_that_is_kept(tmp_path):
+    """Catches figures of an earlier state for a continuation, which keeps its latest, those of
+    heads fitted to held-out images, and a failure whose reason nobody sees."""
     lines = [(25.0, 0.1, {}), (24.0, 0.2, {"psnr_fitted_heads": 27.25})]
     for name, strategy in (("whole", "global"), ("refined", "refine")):
         folder = tmp_path / "runs" / name
@@ -214,19 +191,20 @@ def test_the_report_shows_the_avatar_that_is_kept(tmp_path):
             line |= {"evaluation_s": 0.1, "wall_s": 1.0, "psnr": psnr, "ssim": 0.9}
             append_metrics(folder, {**line, "detail_difference": detail, **more})
     train = {"request": "train", "capture": "capture", "settings": {"iterations": 2}}
-    jobs = dict.fromkeys(("whole", "refined"), train)
+    jobs = dict.fromkeys(("whole", "refined", "bad"), train)
     (tmp_path / "capture").mkdir()
     batch = Batch(make_plan({"out": "runs", "job": jobs}, tmp_path, "plan"))
     for entry in batch.entries.values():
         entry.state = JobState.FINISHED
-    text = write_report(batch).read_text()
-    cells = text.split("<tr>")
-    rows = {name: next(row for row in cells if f"<td>{name}</td>" in row) for name in jobs}
-    assert "25.00" in rows["whole"]
-    assert "24.00" in rows["refined"]
-    assert "25.00" not in rows["refined"]
-    assert all("27.25" in row for row in rows.values())
-    assert "PSNR, heads fitted" in text
+    (tmp_path / "runs/bad").mkdir()
+    batch.entries["bad"].state = JobState.FAILED
+    batch.entries["bad"].error = "capture: is empty"
+    lines = ended_lines(batch)
+    rows = {line.split()[0]: line.split() for line in lines[1:4]}
+    assert rows["whole"] == ["whole", "Train", "finished", "25.00", "dB", "10"]
+    assert rows["refined"] == ["refined", "Train", "finished", "24.00", "dB", "11"]
+    assert rows["bad"] == ["bad", "Train", "failed"]
+    assert lines[-2:] == ["bad: capture: is empty", "2 of 3 jobs finished, 1 failed"]
 
 
 def test_ctrl_c_leaves_the_rest(tmp_path):
@@ -278,11 +256,15 @@ def test_a_job_that_an_engine_refuses_fails_alone(tmp_path):
 
 
 def test_a_damaged_record_is_no_result(tmp_path):
-    """Catches a traceback, or a job that counts as finished, where its record is cut off."""
+    """Catches a traceback, or a job that counts as finished, where its record is cut off; and one
+    that an earlier version finished and that is done again."""
     plan = empty_jobs(tmp_path, 1)
     carry_out(plan, SimulatedEngine())
     record = tmp_path / "runs/look-00000/job/job.json"
     digest = json.loads(record.read_text())["digest"]
+    assert is_done(plan.jobs[0], digest)
+    earlier = {**json.loads(record.read_text()), "forecast_s": 4.5}
+    record.write_text(json.dumps(earlier))
     assert is_done(plan.jobs[0], digest)
     record.write_text(record.read_text()[:20])
     assert not is_done(plan.jobs[0], digest)
@@ -323,7 +305,7 @@ def test_a_killed_worker_is_told_from_a_mistake(tmp_path, monkeypatch, windows, 
     python.write_text(f"#!/bin/sh\n{ending}\n")
     python.chmod(0o755)
     (job,) = empty_jobs(tmp_path, 1).jobs
-    prepare(job, "digest", 0.0)
+    prepare(job, "digest")
     engine = LocalEngine(1, 1.0, str(python))
     engine.submit(job)
     while not (ended := engine.ended()):

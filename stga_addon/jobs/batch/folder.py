@@ -1,7 +1,7 @@
 """Folders of a batch, which one process holds, and of a job: what it holds from earlier starts, how
 it is prepared, and the digest that tells whether it has to be done again.
 
-job.json   beside the request: the job's identity, how long it was expected to take, and took
+job.json   beside the request: the job's identity, and how long it took
 """
 
 import hashlib
@@ -106,13 +106,11 @@ class JobRecord:
     """Content of job.json.
 
     digest    of `job_digests`
-    forecast_s, seconds   how long the job was expected to take, and all its workers worked; 0:
-                          unknown
+    seconds   that all its workers worked
     machine   that carried it out last
     """
 
     digest: str
-    forecast_s: float = setting(0.0, 0)
     seconds: float = setting(0.0, 0)
     machine: str = ""
 
@@ -126,7 +124,9 @@ def read_record(job: Job) -> JobRecord | None:
     """None where the job was never prepared, or by another version."""
     with suppress(StgaError):
         path = job.request_folder / JOB_FILE
-        return from_json(JobRecord, read_document(path, "job", FORMAT, VERSION))
+        values = read_document(path, "job", FORMAT, VERSION)
+        values.pop("forecast_s", None)  # of batches begun by an earlier version
+        return from_json(JobRecord, values)
     return None
 
 
@@ -146,7 +146,7 @@ def is_running(job: Job, digest: str) -> bool:
     return _is_record_of(job, digest) and is_locked(job.request_folder / LOCK_FILE)
 
 
-def prepare(job: Job, digest: str, forecast_s: float) -> Path | None:
+def prepare(job: Job, digest: str) -> Path | None:
     """Make the job's folder ready for a worker, which continues what an earlier one began; returns
     where another request's files were moved. Raises StgaError for a running worker, and files of
     others."""
@@ -168,7 +168,7 @@ def prepare(job: Job, digest: str, forecast_s: float) -> Path | None:
             raise StgaError(
                 f"{job.folder}: holds files that no job of a batch wrote; choose another 'out'"
             )
-        write_record(job, JobRecord(digest, forecast_s))
+        write_record(job, JobRecord(digest))
     if record is None or not has_request(job.request_folder):
         write_request(job.request_folder, job.request)
     else:

@@ -21,7 +21,7 @@ from ...worker.training_python import find_training_python
 from ..perform import request_folder, worker_arguments
 from ..table import JOBS, Request
 from ..track import MakeAvatar
-from ..train import Resume
+from ..train import Resume, Train
 
 MAX_THREADS = 1024
 
@@ -70,6 +70,15 @@ class Job:
     @property
     def request_folder(self) -> Path:
         return request_folder(self.folder)
+
+    @property
+    def forecast_s(self) -> float | None:
+        """Seconds that the plan or a training's budget gives it; None: unknown."""
+        if self.minutes is not None:
+            return 60 * self.minutes
+        request = self.request
+        budget = request.settings if isinstance(request, Train) else request
+        return getattr(budget, "seconds", None)
 
     @property
     def is_written(self) -> bool:

@@ -4,15 +4,11 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
-from importlib.util import find_spec
-from statistics import median
 
 from filelock import SoftFileLease
 
 from ...errors import StgaError
-from ...training.settings import PRESETS
 from ...worker.status import WorkerState, WorkerStatus, read_status, request_cancel
-from ..train import Extend, Refine, Train
 from .folder import is_done, is_running, job_digests, prepare, read_record, write_record
 from .plan import Engine, Job, Plan
 
@@ -49,7 +45,6 @@ class Entry:
 
     status      the worker's latest; error: why it failed, or was not started
     seconds     that its ended workers have worked
-    forecast_s  how long it was expected to take; 0: unknown
     """
 
     job: Job
@@ -59,7 +54,6 @@ class Entry:
     error: str = ""
     machine: str = ""
     seconds: float = 0.0
-    forecast_s: float = 0.0
     retries: int = 0
 
     @property
@@ -70,7 +64,8 @@ class Entry:
         spent = self.status.seconds if self.state == JobState.RUNNING else 0.0
         if self.state == JobState.RUNNING and self.status.progress > 0.05:
             return spent * (1 / self.status.progress - 1)
-        return max(self.forecast_s - spent, 0.0) if self.forecast_s else None
+        forecast_s = self.job.forecast_s
+        return None if forecast_s is None else max(forecast_s - spent, 0.0)
 
 
 class Batch:
@@ -88,7 +83,6 @@ class Batch:
                 entry.state = JobState.KEPT
                 entry.status = read_status(entry.job.request_folder) or entry.status
                 entry.seconds = record.seconds
-                entry.forecast_s = record.forecast_s
                 entry.machine = record.machine or entry.status.machine
 
     @property
@@ -199,7 +193,7 @@ class BatchRun:
                 misses += 1
                 continue
             try:
-                moved = prepare(entry.job, entry.digest, entry.forecast_s)
+                moved = prepare(entry.job, entry.digest)
                 if moved is not None:
                     self._say(f"{name}: has changed; what it wrote before is in {moved}")
                 self._engine.submit(entry.job)
@@ -256,78 +250,3 @@ class BatchRun:
 
 _LOST = (WorkerState.LOST, WorkerState.NONE)  # killed, or gone before it began
 _OUTCOMES = {WorkerState.FINISHED: JobState.FINISHED, WorkerState.CANCELLED: JobState.CANCELLED}
-
-
-# Forecasts
-
-
-def set_forecasts(batch: Batch) -> None:
-    """Set how long the jobs that are not finished are expected to take, where that is known.
-
-    Finished jobs of the same kind of request correct the forecast, and stand in where there is
-    none. What a training of so many iterations takes is measured on this machine (`pace`), once for
-    all.
-    """
-    # what is to be done first, so that its pace is measured
-    entries = sorted(batch.entries.values(), key=lambda entry: entry.state.is_done)
-    paces: list[float] = []
-    stated = {entry.job.name: _stated(entry.job, paces) for entry in entries}
-    taken: dict[type, list[tuple[float, float | None]]] = {}
-    for entry in entries:
-        if entry.state.is_done and entry.seconds:
-            alike = taken.setdefault(type(entry.job.request), [])
-            alike.append((entry.seconds, stated[entry.job.name]))
-    for entry in entries:
-        if entry.state.is_over:
-            continue
-        alike = taken.get(type(entry.job.request), [])
-        expected = stated[entry.job.name]
-        factors = [seconds / before for seconds, before in alike if before]
-        if expected is not None:
-            entry.forecast_s = expected * median(factors) if factors else expected
-        elif alike:
-            entry.forecast_s = median(seconds for seconds, _ in alike)
-
-
-def _stated(job: Job, paces: list[float]) -> float | None:
-    """Seconds by the plan, a training's budget, or its iterations and their `paces`."""
-    request = job.request
-    if job.minutes is not None:
-        return 60 * job.minutes
-    if isinstance(request, Refine | Extend):
-        return request.seconds
-    if not isinstance(request, Train):
-        return None
-    if request.settings.seconds is not None:
-        return request.settings.seconds
-    # A capture of very many views takes more than its preset's own number.
-    iterations = request.settings.iterations or PRESETS[str(request.settings.preset)].iterations
-    measured = None if paces else pace(job, request, iterations)
-    if measured is not None:
-        paces.append(measured)
-    return paces[0] * iterations if paces else None
-
-
-def pace(job: Job, request: Train, iterations: int) -> float | None:
-    """Measured seconds per iteration of a training here; None where it cannot be trained yet."""
-    if find_spec("torch") is None or find_spec("numba") is None or not request.capture.is_dir():
-        return None
-    from ...capture.open import open_capture
-    from ...raster.cpu.threads import set_threads, threads
-    from ...render.device import choose_device
-    from ...training.effects.plan import plan_effects
-    from ...training.preset_timing import seconds_per_iteration
-
-    before = threads()
-    set_threads(job.resources.threads or before)
-    try:
-        device, _ = choose_device(request.device)
-        capture = open_capture(request.capture, request.flame, request.principal_point)
-        if not capture.views.get("train"):
-            return None
-        settings, _ = plan_effects(capture, request.settings, device)
-        return seconds_per_iteration(capture, settings, iterations, device=device)
-    except StgaError:  # the job itself will say so
-        return None
-    finally:
-        set_threads(before)
