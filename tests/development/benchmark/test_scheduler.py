@@ -187,7 +187,6 @@ def test_slices_are_jobs_of_a_batch(toy_root, tmp_path, capsys, monkeypatch):
     assert "| draft" in printed
     runs = [read_run(tmp_path / f"out/benchmark-seed{seed}/draft") for seed in (0, 1)]
     assert [run.settings.seed for run in runs] == [0, 1]
-    assert "benchmark-seed1" in (tmp_path / "out/report.html").read_text()
     monkeypatch.setattr(InProcessEngine, "submit", lambda *_: pytest.fail("it trains again"))
     assert main(command) == 0
-    assert capsys.readouterr().out.endswith(printed.partition("report.html\n")[2])
+    assert capsys.readouterr().out.endswith(printed[printed.index("toy0, 1 s") :])
