@@ -200,7 +200,7 @@ TURN = Rotation.from_euler("YXZ", ANGLES).as_quat().tolist()
     ],
 )
 def test_head_rotations_in_json(tmp_path, entry, sentence):
-    """Catches rotations beside the weights that are dropped without a word, other axes, and an
+    """Catches rotations beside the weights that are dropped silently, other axes, and an
     eye's taken for the head's."""
     frames = [{"blendShapes": {"jawOpen": 0.1}, **entry} for _ in range(COUNT)]
     (tmp_path / "a.json").write_text(json.dumps({"fps": 30, "frames": frames}))
@@ -215,7 +215,7 @@ def test_head_rotations_in_json(tmp_path, entry, sentence):
 
 @pytest.mark.parametrize("suffix", [".csv", ".json"])
 def test_eight_shapes(tmp_path, suffix):
-    """Catches a table of some shapes that is refused, and shapes that stay still without a word."""
+    """Catches a table of some shapes that is refused, and shapes that stay still silently."""
     rows = [dict(zip(ARKIT_SHAPES[14:22], row, strict=True)) for row in WEIGHTS[:, :8].tolist()]
     lines = [",".join(rows[0]), *(",".join(map(str, row.values())) for row in rows)]
     text = "\n".join(lines) if suffix == ".csv" else json.dumps({"fps": 60, "frames": [*rows, {}]})
