@@ -185,13 +185,6 @@ MAX_MISFIT = 0.5
 """Median share of the head's pixels, beyond which the avatar is another person's."""
 TRACKING_SHARE = 0.5
 """Of the progress, before an avatar tracks or is trained."""
-FOCAL_SOURCES = {
-    "given": "as given",
-    "file": "as the file says",
-    "estimated": "estimated from the head's landmarks",
-    "avatar": "that of the avatar's camera",
-}
-"""Where a focal length is from (`Footage.focal`) -> what a person reads of it."""
 
 
 def refuse_tracked(request: Track) -> None:
@@ -280,8 +273,8 @@ def _written(
     out: Path, found: "TrackingReport", report: Report, told: Sequence[str] = ()
 ) -> Written:
     lines = [f"warning: {warning}" for warning in found.warnings]
-    if found.focal_px is not None:
-        lines.append(f"focal length: {found.focal_px:.0f} px, {FOCAL_SOURCES[found.focal]}")
+    if found.focal_length is not None:
+        lines.append(f"focal length: {found.focal_length.description}")
     if found.torso is not None:
         lines.append(f"torso: {found.torso.description}")
     error = f"{found.median_px:.2f} px (median)"

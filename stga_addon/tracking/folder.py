@@ -27,6 +27,21 @@ LOCK_FILE = "tracking.lock"
 SPLIT_FILES = ("transforms_train.json", "transforms_val.json", "transforms_test.json")
 MOTIONS = {"head": "turns with the head", "still": "keeps its direction", "own": "turns on its own"}
 TORSO_KEY = "torso"  # Of the report; null where the motion could not be told
+FOCAL_KEYS = {
+    "pixels": "focal_length_px",
+    "source": "focal_length_from",
+    "interval_px": "focal_length_interval_px",
+}
+"""Fields of `FocalLength` -> their keys in the report."""
+FOCAL_SOURCES = {
+    "given": "as given",
+    "file": "as the file says",
+    "usual": "that of a phone",
+    "estimated": "estimated from the head's landmarks",
+    "avatar": "that of the avatar's camera",
+}
+"""Where the focal length of a camera without calibration is from (`Footage.focal`), and what a
+person reads of it."""
 POINTS_FILE = "torso_points.npz"
 AVATAR_MISFIT = "avatar"
 """Beside the regions of the face in the report's `image_misfit`: what the avatar that tracked does
@@ -143,6 +158,40 @@ def read_torso_motion(capture: Path) -> TorsoMotion | None:
         # of a capture that was tracked before there were any
         found = {"shift_mm": 0.0, "bend_mm": 0.0, **found}
     return from_json(TorsoMotion, found, f"{path}: {TORSO_KEY}")
+
+
+@dataclass(frozen=True)
+class FocalLength:
+    """Of a single camera without calibration, in pixels.
+
+    source       which of FOCAL_SOURCES it is from
+    interval_px  the interval that holds it with a probability of 90 %; None where it was not
+                 estimated
+    """
+
+    pixels: float = setting(above=0)
+    source: str = setting(choices=FOCAL_SOURCES)
+    interval_px: tuple[float, float] | None = setting(None, above=0)
+
+    @property
+    def description(self) -> str:
+        text = f"{self.pixels:.0f} px, {FOCAL_SOURCES[self.source]}"
+        if self.interval_px is None:
+            return text
+        low, high = self.interval_px
+        return f"{text}; {low:.0f} to {high:.0f} px with a probability of 90 %"
+
+
+def read_focal_length(capture: Path) -> FocalLength | None:
+    """What the report of a tracked capture says; None where it has no report, or where a
+    calibration told it. Raises StgaError where the report is malformed."""
+    path = capture / REPORT_FILE
+    report = read_json(path) if path.is_file() else None
+    if not isinstance(report, dict) or report.get(FOCAL_KEYS["pixels"]) is None:
+        return None
+    return from_json(
+        FocalLength, {name: report.get(key) for name, key in FOCAL_KEYS.items()}, str(path)
+    )
 
 
 @dataclass(frozen=True)

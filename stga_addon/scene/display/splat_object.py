@@ -10,7 +10,7 @@ import bpy
 import numpy as np
 
 from ...avatar.file import UNSEEN_REGION, Avatar, AvatarLight
-from ...avatar.filmed import filmed_sides
+from ...avatar.filmed import FROM_ALL_SIDES, filmed_sides
 from ...avatar.offsets import OFFSETS
 from ...avatar.splats import Splats
 from ...errors import StgaError
@@ -258,6 +258,11 @@ def later_modifiers(splat_object: Any) -> list[Any]:
     """The modifiers after ours that change what viewports show of the splats."""
     last = [*splat_object.modifiers].index(splat_modifier(splat_object))
     return [each for each in splat_object.modifiers[last + 1 :] if each.show_viewport]
+
+
+def is_partly_filmed(splat_object: Any) -> bool:
+    """Whether some of its splats are on sides of the head that no camera saw."""
+    return splat_object.get(tags.FILMED, "") not in ("", FROM_ALL_SIDES)
 
 
 def set_input(splat_object: Any, name: str, value: Any) -> None:
