@@ -52,6 +52,9 @@ BACK_GAP_VOXELS = 1.5
 """Depth of a back, an ellipse, as a share of half of the torso's width; heights, in distances of
 the eyes from the mouth, within which that, between quantiles, and the color are measured; how deep
 it is at the sides."""
+BACK_SIDE = 0.5
+"""How far from its middle, in half of its width, a front has the color of its back: a collar is
+lower in front than behind."""
 
 
 @dataclass(frozen=True)
@@ -205,7 +208,7 @@ def _round_back(
 ) -> tuple[np.ndarray, np.ndarray]:
     """The neutral vertices (V, 3), those of the triangles `front` (F,) bool moved into the back of
     an elliptic torso as wide as these; at each of these triangles' heights, the median color (M, 3)
-    of the front's colors (F, 3)."""
+    of the front's sides, of colors (F, 3)."""
     across, up, ahead = at.axes
     reach_m = BACK_LEVELS * at.unit
     places = np.array(capture.neutral, np.float64)
@@ -213,14 +216,23 @@ def _round_back(
     triangles = places[capture.faces[front]].mean(1) - at.eyes
     width = triangles @ across
     level = triangles @ up
+
+    def around(y: float) -> tuple[np.ndarray, float, float]:
+        """Triangles (N,) bool near a height; the middle and the half of their width."""
+        near = abs(level - y) < reach_m
+        low, high = np.quantile(width[near] if near.any() else width, BACK_REACH)
+        return near, (low + high) / 2, max((high - low) / 2, 1e-9)
+
     behind = np.empty(len(vertices))
     for row, (x, y) in enumerate((places[vertices] - at.eyes) @ np.stack([across, up], 1)):
-        around = abs(level - y) < reach_m
-        low, high = np.quantile(width[around] if around.any() else width, BACK_REACH)
-        half = max((high - low) / 2, 1e-9)
-        beside = min(abs(x - (high + low) / 2) / half, 1)
+        _, middle, half = around(y)
+        beside = min(abs(x - middle) / half, 1)
         behind[row] = BACK_SHARE * half * np.sqrt(1 - beside**2)
     behind += BACK_GAP_VOXELS * voxel_size(places)
     places[vertices] -= behind[:, None] * ahead
-    usual = [np.median(color[front][abs(level - y) < reach_m], axis=0) for y in level]
-    return places, np.array(usual)
+    usual = np.empty((len(level), 3))
+    for row, y in enumerate(level):
+        near, middle, half = around(y)
+        beside = near & (abs(width - middle) > BACK_SIDE * half)
+        usual[row] = np.median(color[front][beside if beside.any() else near], axis=0)
+    return places, usual
