@@ -18,8 +18,9 @@ import tomllib
 import zipfile
 import zlib
 from collections.abc import Callable, Collection, Iterator, Mapping
-from contextlib import AbstractContextManager, contextmanager, suppress
+from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
 from contextvars import ContextVar
+from dataclasses import dataclass
 from fnmatch import fnmatch
 from functools import cache, partial
 from pathlib import Path
@@ -574,45 +575,70 @@ def read_npz(
     """Read the arrays of an npz that are among `names`, by default every one, without pickle.
     Raises StgaError where it is missing, truncated or holds objects, and, before anything is
     unpacked, where the arrays have more than `limit` bytes together."""
-    arrays = {}
-    with _npz_entries(path) as entries:
-        chosen = [each for each in entries if names is None or each[0] in names]
-        unpacked = sum(entry.file_size for _, entry, _ in chosen)
-        if unpacked > limit:
-            problem = f"unpacks to {unpacked} bytes, more than the {limit} allowed"
-            raise StgaError(f"{path}: {problem}")
-        for name, entry, archive in chosen:
-            with archive.open(entry) as stream:
-                arrays[name] = _read_array(stream, entry.file_size)
-    return arrays
-
-
-def npz_outlines(path: Path) -> dict[str, np.ndarray]:
-    """The arrays of an npz with their types and shapes, without contents, which take no memory: to
-    look at before a small file is unpacked to gigabytes. Raises StgaError as `read_npz` does."""
-    outlines = {}
-    with _npz_entries(path) as entries:
-        for name, entry, archive in entries:
-            with archive.open(entry) as stream:
-                shape, dtype = _read_outline(stream, entry.file_size)
-            outlines[name] = np.broadcast_to(np.zeros((), dtype), shape)
-    return outlines
+    with open_npz(path) as file:
+        return file.arrays(names, limit)
 
 
 @contextmanager
-def _npz_entries(path: Path) -> Iterator[list[tuple[str, zipfile.ZipInfo, zipfile.ZipFile]]]:
-    """Name and entry of each array of an npz, and the open archive. Raises as `read_npz`."""
+def open_npz(path: Path) -> Iterator["NpzFile"]:
+    """An npz whose arrays are read one after another while it is open. Raises as `read_npz`."""
     file_size(path)  # refuses pipes, whose reading need never end
-    with _reading(path, "npz"), zipfile.ZipFile(path) as archive:
-        entries = []
-        for entry in archive.infolist():
-            if not entry.filename.endswith(".npy"):
-                raise ValueError(f"entry '{entry.filename}' is no array")
-            # LZMA's own header makes it allocate gigabytes
-            if entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
-                raise ValueError("is packed as no npz is")
-            entries.append((entry.filename.removesuffix(".npy"), entry, archive))
-        yield entries
+    with ExitStack() as opened:
+        with _reading(path, "npz"):
+            archive = opened.enter_context(zipfile.ZipFile(path))
+            entries = {}
+            for entry in archive.infolist():
+                if not entry.filename.endswith(".npy"):
+                    raise ValueError(f"entry '{entry.filename}' is no array")
+                # LZMA's own header makes it allocate gigabytes
+                if entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+                    raise ValueError("is packed as no npz is")
+                entries[entry.filename.removesuffix(".npy")] = entry
+        yield NpzFile(path, archive, entries)
+
+
+@dataclass(frozen=True)
+class NpzFile:
+    """An open npz: its archive, and the entry of each array by the array's name."""
+
+    path: Path
+    archive: zipfile.ZipFile
+    entries: Mapping[str, zipfile.ZipInfo]
+
+    def arrays(
+        self, names: Collection[str] | None = None, limit: int = MAX_ARRAYS_BYTES
+    ) -> dict[str, np.ndarray]:
+        """The arrays that are among `names`, by default every one, of at most `limit` bytes."""
+        wanted = {n: each for n, each in self.entries.items() if names is None or n in names}
+        unpacked = sum(entry.file_size for entry in wanted.values())
+        if unpacked > limit:
+            problem = f"unpacks to {unpacked} bytes, more than the {limit} allowed"
+            raise StgaError(f"{self.path}: {problem}")
+        return dict(self._each(wanted, _read_array))
+
+    def outlines(self) -> dict[str, np.ndarray]:
+        """The arrays with their types and shapes, without contents, which take no memory: to look
+        at before a small file is unpacked to gigabytes."""
+        outlines = {}
+        for name, (shape, dtype) in self._each(self.entries, _read_outline):
+            outlines[name] = np.broadcast_to(np.zeros((), dtype), shape)
+        return outlines
+
+    def digest(self) -> str:
+        """SHA-256 of the whole file."""
+        stream = self.archive.fp
+        assert stream is not None
+        with naming(self.path, "read"):
+            stream.seek(0)
+            return hashlib.file_digest(stream, "sha256").hexdigest()  # type: ignore[arg-type]
+
+    def _each(
+        self, entries: Mapping[str, zipfile.ZipInfo], read: Callable[[IO[bytes], int], Any]
+    ) -> Iterator[tuple[str, Any]]:
+        for name, entry in entries.items():
+            with _reading(self.path, "npz"), self.archive.open(entry) as stream:
+                found = read(stream, entry.file_size)
+            yield name, found
 
 
 def read_npy(path: Path) -> np.ndarray:

@@ -18,7 +18,7 @@ from ..files import (
     is_folder,
     matching,
     naming,
-    npz_outlines,
+    open_npz,
     read_json,
     read_npy,
 )
@@ -92,7 +92,8 @@ def open_capture(
     if folder.suffix.lower() == ".npz" and is_file(folder):
         path = folder.resolve()
         # A file that names its expressions is of the bundled head, and needs no model file.
-        bundled = EXPRESSION_NAMES in npz_outlines(path)
+        with open_npz(path) as file:
+            bundled = EXPRESSION_NAMES in file.entries
         model_file = BUNDLED_HEAD if bundled else _model_file(path, flame)
         return sequence_capture(path, read_motion(path, flame_model(model_file)), model_file, {})
     if not is_folder(folder):

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from ..errors import StgaError
-from ..files import converted, npz_outlines, read_npz
+from ..files import NpzFile, converted, file_digest, open_npz
 from .unpickle import read_pickled_arrays
 
 Arrays = Mapping[str, np.ndarray]
@@ -56,6 +56,7 @@ class FlameModel:
     has_found_masks  whether these are of no file, but found on the mesh
     expression_names  ARKit's name of each expression, whose coefficient is then a weight from 0 to
                       1; else ()
+    file_digest  SHA-256 of the file; "": of none
     """
 
     v_template: np.ndarray
@@ -69,6 +70,7 @@ class FlameModel:
     masks: Mapping[str, np.ndarray] = field(default_factory=dict)
     expression_names: tuple[str, ...] = ()
     has_found_masks: bool = False
+    file_digest: str = ""
 
     @property
     def n_expression(self) -> int:
@@ -85,9 +87,10 @@ def read_flame(path: Path) -> FlameModel:
     posedirs. Raises StgaError naming the file and key that is missing, of the wrong shape or not
     finite, and any class in a pickle that is not an array.
     """
-    arrays = _model_arrays(path)
+    arrays, digest = _model_arrays(path)
     model = model_of(path, arrays)
-    return replace(model, masks=_masks(path, arrays, len(model.v_template)))
+    masks = _masks(path, arrays, len(model.v_template))
+    return replace(model, masks=masks, file_digest=digest)
 
 
 def model_of(path: Path, arrays: Arrays) -> FlameModel:
@@ -116,28 +119,31 @@ def model_of(path: Path, arrays: Arrays) -> FlameModel:
     )
 
 
-def _model_arrays(path: Path) -> Arrays:
-    """Those of MODEL_KEYS, and what else the file has of a model."""
+def _model_arrays(path: Path) -> tuple[Arrays, str]:
+    """Those of MODEL_KEYS, what else the file has of a model, and the file's digest."""
     if path.suffix.lower() == ".npz":
         own = (*MODEL_KEYS, "n_identity", "shape_steps", EXPRESSION_NAMES)
-        arrays = read_model_npz(path, own)
+        with open_npz(path) as file:
+            digest = file.digest()
+            arrays = model_arrays(file, own)
         if "shape_steps" in arrays and "v_template" in arrays:
             steps = finite(path, arrays, "shape_steps", (None, len(arrays["v_template"]), 3))
             arrays["shapedirs"] = np.moveaxis(SHAPE_STEP_M * steps, 0, -1)
         if "v_template" in arrays:
             arrays.setdefault("posedirs", np.zeros((len(arrays["v_template"]), 3, POSE_FEATURES)))
     else:
+        digest = file_digest(path)
         arrays = read_pickled_arrays(path, (*MODEL_KEYS, "n_identity"))
-    return arrays
+    return arrays, digest
 
 
-def read_model_npz(path: Path, names: Collection[str]) -> dict[str, np.ndarray]:
+def model_arrays(file: NpzFile, names: Collection[str]) -> dict[str, np.ndarray]:
     """Arrays of a head model, `names` and vertex masks. Raises StgaError before it is unpacked
     where a model of these would have more than MAX_MODEL_NUMBERS."""
-    outlines = npz_outlines(path)
+    outlines = file.outlines()
     chosen = [name for name in outlines if name in names or name.startswith(MASK_PREFIX)]
-    _check_size(path, {name: outlines[name] for name in chosen})
-    return read_npz(path, chosen)
+    _check_size(file.path, {name: outlines[name] for name in chosen})
+    return file.arrays(chosen)
 
 
 def _check_size(path: Path, arrays: Arrays) -> None:

@@ -9,8 +9,8 @@ import numpy as np
 
 from ..capture.camera import MAX_COORDINATE_M
 from ..errors import StgaError
-from ..files import write_npz
-from ..flame.model import JOINTS, POSE_FEATURES, FlameModel, finite, read_model_npz
+from ..files import open_npz, write_npz
+from ..flame.model import JOINTS, POSE_FEATURES, FlameModel, finite, model_arrays
 from ..flame.parts import flame_model
 from .glb import read_glb
 
@@ -64,7 +64,8 @@ def read_head_model(path: Path | None) -> HeadModel:
         mesh = read_glb(path)
         arrays = shape_arrays(mesh.positions, mesh.faces, mesh.names, mesh.targets)
     elif suffix == ".npz":
-        arrays = read_model_npz(path, LINEAR_MODEL_KEYS)
+        with open_npz(path) as file:
+            arrays = model_arrays(file, LINEAR_MODEL_KEYS)
     if "mean" in arrays:
         return checked(path, HeadModel(linear_model(path, arrays), "mesh"))
     return checked(path, HeadModel(flame_model(path), "flame"))
