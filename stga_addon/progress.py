@@ -3,11 +3,11 @@
 import logging
 import math
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from time import monotonic
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -29,6 +29,7 @@ class Progress:
     preview   writes the result so far into a file; None before there is one
     picture   draws the result so far: `rgb` (H, W, 3) uint8, of a head `vertices` (V, 3) and
               `faces` (F, 3) too; or nothing. None where nothing new is to be seen
+    metrics   of a training: its evaluations so far, the lines of metrics.jsonl
     """
 
     share: float = 0.0
@@ -37,6 +38,7 @@ class Progress:
     figures: Callable[[], Mapping[str, float]] = dict
     preview: Callable[[Path], None] | None = None
     picture: Callable[[], Mapping[str, np.ndarray] | None] | None = None
+    metrics: Sequence[Mapping[str, Any]] = ()
 
 
 Report = Callable[[Progress], bool]

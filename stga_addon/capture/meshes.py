@@ -106,13 +106,18 @@ def tracked_meshes(
 def cached_meshes(mesh: Callable[[int], np.ndarray], vertices: int) -> Callable[[int], np.ndarray]:
     """The function with its latest results kept, read-only, within CACHE_BYTES."""
 
-    @lru_cache(maxsize=max(2, CACHE_BYTES // (24 * max(1, vertices))))
+    @lru_cache(cached_timesteps(vertices))
     def kept(timestep: int) -> np.ndarray:
         result = mesh(timestep)
         result.setflags(write=False)
         return result
 
     return kept
+
+
+def cached_timesteps(vertices: int) -> int:
+    """How many timesteps with three float64 a vertex CACHE_BYTES hold."""
+    return max(2, CACHE_BYTES // (24 * max(1, vertices)))
 
 
 def file_of(files: Mapping[int, Path], timestep: int) -> Path:

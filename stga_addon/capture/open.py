@@ -4,7 +4,7 @@ import os
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from functools import partial
+from functools import lru_cache, partial
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -386,10 +386,14 @@ def _open_flame_capture(root: Path, transforms: Transforms, model_file: Path | N
         raise StgaError(
             f"{folder}: holds no parameters; expected one .npz per timestep, such as 00000.npz"
         )
-    shape, static_offset = read_identity(files[min(files)], model)
+    first = files[min(files)]
+    person = read_npz(first)
+    shape, static_offset = read_identity(first, model, person)
 
+    @lru_cache(meshes.cached_timesteps(len(model.v_template)))
     def frame(timestep: int) -> FlameFrame:
-        return read_frame(meshes.file_of(files, timestep), model)
+        path = meshes.file_of(files, timestep)
+        return read_frame(path, model, person if path == first else None)
 
     sequence = FlameSequence(model, shape, static_offset, tuple(files), frame)
     return sequence_capture(root, sequence, model_file, transforms.views)

@@ -4,11 +4,11 @@ import math
 from collections.abc import Mapping
 from dataclasses import KW_ONLY, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..avatar.file import read_avatar
+from ..avatar.file import Avatar, read_avatar
 from ..capture import model as capture_model
 from ..capture.meshes import SELECTED_WEIGHT, find_region, is_region_file
 from ..capture.model import Capture
@@ -28,6 +28,9 @@ from ..training.run import folder as run_folder
 from ..training.run.folder import AVATAR, Continuation, OpenedRun, Run
 from ..training.run.identity import identity_of
 from ..training.settings import MAX_GROWTH, TrainingSettings, with_budget
+
+if TYPE_CHECKING:
+    from ..training.run.session import Trained
 
 MAX_NAMED_VIEWS = 6  # Views that a warning names
 AFTERWARDS = (StgaError, Cancelled, MemoryError)
@@ -193,21 +196,26 @@ Training = Train | Resume | Refine | Extend
 
 @dataclass(frozen=True)
 class Prepared:
-    """A run that can be trained: the capture of all its takes, and what each timestep trains."""
+    """A run that can be trained: the capture of all its takes, and what each timestep trains.
+
+    parent  the avatar that it continues, which is held so that `read_avatar` reads its file once
+    """
 
     request: Training
     run: Run
     capture: Capture
     selection: Selection | None = None
+    parent: Avatar | None = None
 
-    def train_as_asked(self, report: Report) -> Path:
-        """Train on the device of the request, or the one chosen for it; the path of the avatar.
-        Raises as `training.run.session.train_run`."""
-        from ..training.run.session import train_more, train_run, train_run_or_fall_back
+    def train_as_asked(self, report: Report) -> "Trained":
+        """Train on the device of the request, or the one chosen for it. Raises as
+        `training.run.session.train_and_measure`."""
+        from ..training.run.session import train_and_measure, train_more, train_run_or_fall_back
 
         if isinstance(self.request, Resume) and self.request.more_s is not None:
             return train_more(self.capture, self.request.run, self.run, self.request.more_s, report)
-        train = train_run_or_fall_back if self.request.device == "auto" else train_run
+        is_auto = self.request.device == "auto"
+        train = train_run_or_fall_back if is_auto else train_and_measure
         resumes = isinstance(self.request, Resume)
         return train(self.capture, self.request.run, self.run, self.selection, resumes, report)
 
@@ -239,7 +247,7 @@ def train_and_finish(request: Training, report: Report, say: Say) -> Written:
 
     def report_training(progress: Progress) -> bool:
         nonlocal latest, is_stopped
-        draw()
+        draw(progress.metrics)
         latest = progress
         is_stopped = tell(progress, 0.0)
         return is_stopped
@@ -250,9 +258,10 @@ def train_and_finish(request: Training, report: Report, say: Say) -> Written:
     def report_world(progress: Progress) -> bool:
         return tell(progress, after[0] + progress.share)
 
-    avatar = prepared.train_as_asked(report_training)
+    trained = prepared.train_as_asked(report_training)
+    avatar = trained.path
     tell(Progress(stage="Drawing the curve"), 0.0)
-    lines = report_run(folder)
+    lines = report_run(folder, latest.metrics)
     # whoever stops a training does not wait; `stga relight` finds the light out later
     if not is_stopped:
         lines += _light_of(prepared, avatar, report_light)
@@ -388,7 +397,8 @@ def _refinement(request: Refine, report: Report, say: Say) -> Prepared:
         name = "painted"
     else:
         raise StgaError(f"weights: expected one for each triangle ({count},), got {weights.shape}")
-    face = read_avatar(parent / AVATAR).splats.face
+    avatar = read_avatar(parent / AVATAR)
+    face = avatar.splats.face
     if not region[face].any():
         raise StgaError(f"region '{name}': the avatar has no splats there")
     growth = request.growth * float(region[face].mean())
@@ -404,7 +414,7 @@ def _refinement(request: Refine, report: Report, say: Say) -> Prepared:
         raise StgaError(f"region '{name}': faces no training camera {between}")
     continuation = Continuation(parent.resolve(), file_digest(parent / AVATAR), first, last)
     run = replace(opened.run, settings=settings, identity=None, continuation=continuation)
-    return Prepared(request, run, capture, {capture.timesteps[0]: region})
+    return Prepared(request, run, capture, {capture.timesteps[0]: region}, avatar)
 
 
 def _extension(request: Extend, report: Report, say: Say) -> Prepared:
@@ -412,10 +422,10 @@ def _extension(request: Extend, report: Report, say: Say) -> Prepared:
     from ..training.run.continuation import continued_settings
 
     report(Progress(stage="Comparing the avatar with the images"))
+    avatar = read_avatar(request.parent / AVATAR)
     opened, capture, selection, run = _joined_takes(request, say)
     needed = np.any(list(selection.values()), axis=0)
-    face = read_avatar(request.parent / AVATAR).splats.face
-    growth = request.growth * float(needed[face].mean())
+    growth = request.growth * float(needed[avatar.splats.face].mean())
     settings = continued_settings(
         opened.run.settings, "extend", growth, request.seconds, request.iterations, request.seed
     )
@@ -425,7 +435,7 @@ def _extension(request: Extend, report: Report, say: Say) -> Prepared:
         if new.on != old.on:
             say(f"{new.effect}  {new}")
     run = replace(run, settings=settings, effect_plan=plan)
-    return Prepared(request, run, capture, selection)
+    return Prepared(request, run, capture, selection, avatar)
 
 
 def _joined_takes(request: Extend, say: Say) -> tuple[OpenedRun, Capture, Selection, Run]:

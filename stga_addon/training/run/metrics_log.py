@@ -47,12 +47,13 @@ def append_metrics(folder: Path, line: Mapping[str, Any]) -> None:
         out.write(json.dumps(line) + "\n")
 
 
-def cut_metrics(folder: Path, count: int) -> None:
+def cut_metrics(folder: Path, count: int) -> list[dict[str, Any]]:
     """Remove the evaluations beyond the first `count`, which a resumed run makes again, or a
-    stopped run has made for itself."""
+    stopped run has made for itself; returns these."""
     kept = read_metrics(folder)[:count]
     with replacing(folder / METRICS) as partial:
         partial.write_text("".join(json.dumps(line) + "\n" for line in kept), encoding="utf-8")
+    return kept
 
 
 def _fault(line: Any) -> str | None:
