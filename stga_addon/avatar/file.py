@@ -252,7 +252,7 @@ def read_avatar(path: Path) -> Avatar:
     """
     try:
         state = path.stat()
-    except OSError:  # which reading it names
+    except (OSError, ValueError):  # which reading it names
         return _read_avatar(path)
     key = path.absolute(), state.st_ino, state.st_mtime_ns, state.st_size
     found = _HELD.get(key)

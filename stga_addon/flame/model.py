@@ -132,8 +132,8 @@ def _model_arrays(path: Path) -> tuple[Arrays, str]:
         if "v_template" in arrays:
             arrays.setdefault("posedirs", np.zeros((len(arrays["v_template"]), 3, POSE_FEATURES)))
     else:
+        arrays = read_pickled_arrays(path, (*MODEL_KEYS, "n_identity"))  # which refuses pipes
         digest = file_digest(path)
-        arrays = read_pickled_arrays(path, (*MODEL_KEYS, "n_identity"))
     return arrays, digest
 
 

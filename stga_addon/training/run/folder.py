@@ -122,7 +122,7 @@ def read_run(folder: Path) -> Run:
     path = folder / RUN
     with naming(path, "read"):
         state = path.stat()
-    return _remembered(path.absolute(), state.st_ino, state.st_mtime_ns, state.st_size)
+    return _remembered(path, state.st_ino, state.st_mtime_ns, state.st_size)
 
 
 @lru_cache(maxsize=8)
