@@ -21,6 +21,7 @@ from ..files import (
     open_npz,
     read_json,
     read_npy,
+    read_npz,
 )
 from ..flame.forward import FlameFrame
 from ..flame.model import BUNDLED_HEAD, EXPRESSION_NAMES
