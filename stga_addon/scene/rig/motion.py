@@ -54,6 +54,7 @@ def apply_motion(
     count = max(len(used), 1 + max(sliders, default=-1))
     frames = [replace(each, expr=np.pad(each.expr, (0, count - len(each.expr)))) for each in frames]
     keys = head.data.shape_keys
+
     has_expression = "expression" in parts
     offsets = keyframes.offset_keys(head) if has_expression else []
     owners = [rig] if offsets or set(parts) & set(keyframes.PART_JOINTS) else []

@@ -23,35 +23,41 @@ from .surface import Surface
 from .unseen_sides import SOURCE_TRIANGLES, UnseenSides
 
 GRAZED_COSINE = 0.7
+"""A triangle has an occlusion layer behind it if the cosine between its normal and the camera that
+it faces most is below this."""
 FACE_ANGLE_DEG = 45.0
-"""Of the angle between a triangle and the camera that it faces most, below which it has a layer
-behind it; from straight ahead, beyond which there is no face, seen from the middle of the head."""
+"""Angle from straight ahead, from the middle of the head, beyond which there is no face."""
 ONE_DIRECTION_COSINE = 0.8
+"""GRAZED_COSINE of a head that was filmed from one direction, along which its splats lie: off-axis
+views would show the mouth's inside between them."""
 ONE_DIRECTION_FACE_ANGLE_DEG = 30.0
-"""The same of a head that was filmed from one direction, along which its splats lie: from aside,
-the mouth's inside shows between them."""
+"""FACE_ANGLE_DEG of such a head."""
 CELL_VOXELS = 2
+"""Side of the cell of a head's surface behind which one splat is enough."""
 BORDER_CELLS = 2.0
-"""Behind how large a part of the head one splat is enough; how far from the mesh's edge, in these
-cells, clothes have a layer behind them, as it would stand out there."""
+"""Least distance of clothes' layer from the mesh's edge, where it would stand out."""
 DEPTH_VOXELS = 0.5
+"""Step between the depths at which the layer may lie."""
 MAX_DEPTHS = 10
+"""Depths that are tried; the first that lies within the masks is taken."""
 MARGIN_SHARE = 0.015
+"""How far the layer must lie within the masks, as a fraction of their height."""
 BACK_MARGIN_SHARE = 0.03
+"""The same of a torso's back, whose triangles are large."""
 SPLAT_REACH = 1.8
-"""Step of the depths at which the layer may lie, and how many are tried: the first that is within
-the masks, with a margin as a share of their height; of a torso, whose triangles are large; how far
-the splats of these reach, three standard deviations, in the side of a square of two triangles, or
-in cells where these are larger."""
+"""Three standard deviations of a splat, in sides of a square of two triangles, or in cells where
+these are larger."""
 BEHIND_DEG = (-30.0, 0.0, 30.0)
 """Directions from behind from which the inner side of a torso's front may show."""
 BACK_SHARE = 0.5
+"""Depth of a back, an ellipse, as a fraction of half of the torso's width."""
 BACK_LEVELS = 0.5
+"""Height over which a torso's width and color are measured, in distances of the eyes from the
+mouth."""
 BACK_REACH = (0.02, 0.98)
+"""Quantiles of the positions across a torso between which its width lies."""
 BACK_GAP_VOXELS = 1.5
-"""Depth of a back, an ellipse, as a share of half of the torso's width; heights, in distances of
-the eyes from the mouth, within which that, between quantiles, and the color are measured; how deep
-it is at the sides."""
+"""Depth of the back at the torso's sides."""
 
 
 @dataclass(frozen=True)

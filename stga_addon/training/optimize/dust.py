@@ -10,16 +10,17 @@ from .backend import Backend
 from .change import Turn
 
 MIN_WEIGHT_PX = 0.5
+"""An unbound splat that fills less than this in every view serves the rays of a few pixels, and
+floats in the air for all other cameras."""
 MIN_WEIGHT_SHARE = 0.4
-"""A splat that fills less in every view, also as a share of the median of unbound ones, which fill
-much after a short training, serves the rays of a few pixels, and hangs in the air for all other
-cameras."""
+"""The same limit as a fraction of the median of unbound splats, which fill much after a short
+training."""
 TURNS = (0.6, 0.8)
 """Shares of the budget at which splats are weighed; what is trained afterwards fills in."""
 MAX_WEIGHED_VIEWS = 40
+"""Training views, spread over all, in which splats are measured, at most."""
 WEIGHED_SHARE = 0.03
-"""Training views that are looked at, spread over all: at most, and as a share of all iterations,
-which take longer than a look."""
+"""Views that are measured, as a fraction of all iterations, which take longer."""
 
 
 @dataclass(frozen=True)

@@ -20,11 +20,14 @@ image's height: the larger one counts where the smaller one holds no backdrop.""
 NO_CORRECTION = np.array([[1.0, 1.0, 1.0], [0.0, 0.0, 0.0]])
 """Gain and offset by channel."""
 MAX_GAIN = 4.0
+"""Largest gain of an image's exposure; the least is its inverse."""
 EXPOSURE_PRIOR = 1e-3
+"""Weight of an unchanged exposure as a fraction of the pixels, which decides where all have one
+color."""
 EXPOSURE_SCALE = 0.08
+"""Difference in 0…1 beyond which pixels are outliers."""
 EXPOSURE_ITERATIONS = 4
-"""Weight of the usual exposure as a share of the pixels, which decides where all have one color;
-and the difference in 0…1 beyond which pixels are outliers."""
+"""Reweighted least squares fits of an exposure."""
 
 
 def image_preparation(capture: Capture, settings: TrainingSettings) -> Preparation | None:

@@ -19,8 +19,9 @@ from .change import Turn
 from .state import PRUNED_BY, prunable
 
 MAX_OUTLINES = 16
+"""Views whose masks are read."""
 MAX_OUTLINE_HEIGHT_PX = 400
-"""Views whose masks are read; higher masks are shrunk to this."""
+"""Height to which higher masks are shrunk."""
 TOLERANCE_SHARE = 0.01
 """Error of masks and tracking, as a share of the image height."""
 MAX_OUTSIDE_SHARE = 0.5

@@ -22,23 +22,29 @@ from .surface import Surface
 from .unseen_hair import UnseenHair
 
 WELL_SEEN_COSINE = 0.8
+"""Cosine between a triangle and the camera that it faces most above which its splats are well
+observed: others' gradients are compared with theirs."""
 BEHIND_COSINE = -0.5
-"""Of the angle between a triangle and the camera that it faces most: above the first, gradients are
-those that others are compared with; below the second, nothing stands in an outline."""
+"""Cosine below which nothing stands in an outline."""
 DOUBT = 0.3
+"""Gradient, as a fraction of the median of well observed splats, at which a step pulls a splat
+halfway to what is plausible."""
 MIN_PULL = 0.02
-"""Gradient, as a share of the median of well seen splats, at which a splat is pulled halfway to
-what is plausible at a turn; the least share of the way that is worth it."""
+"""Least fraction of that way that is worth a change."""
 HIDDEN_SPACING_VOXELS = 1.0
+"""Spacing of the lattice on hidden triangles where no order is chosen."""
 MAX_HIDDEN_ORDER = 4
+"""Largest order of that lattice."""
 HIDDEN_OPACITY = 3.0
+"""Logit of the opacity of splats on hidden triangles."""
 HIDDEN_FLATNESS = 0.25
+"""Their thickness as a fraction of that of the lattice's splats."""
 LEAST_WIDTH_SHARE = 0.9
+"""Width below which they may not shrink, as a fraction of what the lattice begins with."""
 BACKING_OPACITY = 5.0
+"""Logit of the opacity of the occlusion layer."""
 CELL_WIDTH = 0.6
-"""Of the layer on hidden triangles: spacing and largest order of the lattice where none is chosen,
-logit, how much thinner it is than the lattice's splats and how much narrower it may become;
-logit, and least standard deviation in cells, of the one behind what may be looked through."""
+"""Least standard deviation of the occlusion layer's splats, in cells."""
 BESIDE_LID_SHARE = 0.6
 """Of the scale of the layer under lids, at their edges and in the mouth, where it would stand out
 beside the eye and the lips."""
@@ -50,12 +56,16 @@ BORDER_INSET = 0.6
 """Of the distance from the middle of a triangle, and of the scale, at the mesh's edge, of a lattice
 of order 1; a finer one reaches less beyond."""
 FLAT_VOXELS = 0.25
+"""Largest standard deviation along the normal of splats on skin and clothes; views of a narrow cone
+do not determine it."""
 FLAT_TOLERANCE = 1.02
-"""Largest standard deviation of splats on skin and clothes along the normal; how much more is worth
-a change. Views of a narrow cone do not tell it."""
+"""Factor by which a splat must be thicker for a change to be worth it."""
 MIN_VARIANCE = 1e-14
+"""Least variance of a splat along an axis, in m²."""
 GEOMETRY_MOMENTS = ("second/xyz", "second/rotation", "second/log_scale")
+"""Second moments of positions and shapes."""
 MOMENTS = ("second/color", "second/opacity", *GEOMETRY_MOMENTS)
+"""Second moments that are compared with those of well observed splats."""
 PULLED_COLUMNS = (
     "face",
     "parameters/color",
@@ -65,11 +75,11 @@ PULLED_COLUMNS = (
     "parameters/log_scale",
     *MOMENTS,
 )
+"""What is read of the splats that may be pulled."""
 PINNED_KINDS = ("parameters", "average", "first", "second")
+"""Arrays of the splats whose color is pinned."""
 INNER_PARAMETERS = ("xyz", "rotation", "log_scale", "opacity")
-"""Second moments of positions and shapes; of all that is compared with well seen splats; what is
-read of the splats that may be pulled; arrays of those whose color is pinned; parameters of the
-inner layer, and of the layer's end, that stay."""
+"""Parameters of the inner layer, and of the occlusion layer's end, that do not change."""
 
 
 class SurfacePrior:

@@ -25,17 +25,17 @@ from .likeness import (
 from .surface import FACING_TIMESTEPS, GRAZING_COSINE, UNSEEN_COSINE, Surface
 
 SPREAD_VIEWS = 12
+"""Training views, spread over all, whose colors are measured."""
 OPEN_VIEWS = 6
-"""Training views whose colors are looked at, spread over all, and of the timesteps in which the
-mouth is highest."""
+"""Views whose colors are measured of the timesteps in which the mouth is highest."""
 MIN_TEETH_SHARE = 0.04
 """Of the pixels that show the mouth, that teeth fill at least; a slit between lips is as well one
 of the mesh alone."""
 SOURCE_COSINE = 0.5
+"""Cosine between a triangle and a camera below which others do not take its color, which may
+contain a matte's edge."""
 FRINGE_COSINE = 0.2
-"""Of the angle between a triangle and a camera: below the first, others do not take its color,
-which a matte's edge may be in; below the second, nor does the scalp take that of a fringe, where it
-is not shown itself."""
+"""The same for the scalp, which takes the color of a fringe where it is not visible itself."""
 FRINGE_SHARE = 0.2
 """Of what is shown above the brows, the highest, where hair is if there is any."""
 MIN_SHOWN_SHARE = 0.1
@@ -48,13 +48,15 @@ SMOOTHING = {"scalp": (SMOOTHED, 1.0), "body": (2 * SMOOTHED, 3.0)}
 """Triangles over which copied colors are smoothed, and by how much those above and below count as
 farther than those beside: collars are level, and shadows of a chin are on the neck's front only."""
 SOFTENING_FACTOR = 4
+"""Triangles over which colors are softened, in multiples of those they are smoothed over."""
 SAME_COLOR_DEVIATION = 0.12
-"""How many times as many triangles are softened over, and by how much colors, in 0…1, may differ
-that count as the same but for their shade: collars and hairlines stay sharp."""
+"""Largest difference in 0…1 of colors that differ by their shade alone: collars and hairlines stay
+sharp."""
 SHOWN_COSINE = 0.5
+"""Cosine between a triangle and the camera that it faces most above which its color depends on no
+view."""
 ASIDE_SHARE = 0.75
-"""Of the angle between a triangle and the camera that it faces most, above which its color depends
-on no view; share of the color from aside at a right angle to the views."""
+"""Fraction of the off-axis color at a right angle to the views."""
 
 
 @dataclass(frozen=True)

@@ -29,16 +29,20 @@ from .folder import AVATAR, CHECKPOINT, Continuation, Run
 START_SHARE = 0.5
 """Share of the run's schedule of learning rates that has passed when its continuation begins."""
 DENSITY_INTERVAL = 40
+"""Iterations between density control's steps in a continuation, whose budget is a tenth of a
+training's."""
 DENSITY_SPAN = (0.0, 0.6)
-"""Density control of a continuation, whose budget is a tenth of a training's."""
+"""Fractions of the budget between which density control acts."""
 MIN_RESIDUAL_RATIO = 1.5
+"""Ratio of a triangle's residual in new takes to that in old ones from which it is trained."""
 MIN_RESIDUAL_GAIN = 0.005
-"""How much larger a triangle's residual in new takes than in old ones calls for training."""
+"""Difference of these residuals from which it is trained."""
 COMPARED_VIEWS = 36
 """Views of the old takes, and of the new ones, in which residuals are compared."""
 MIN_UNLIKE_RATIO = 3.0
+"""Ratio of a strange view's residual to its take's median."""
 MIN_UNLIKE_RESIDUAL = 0.05
-"""How much larger than its take's median, and how large, the residual of a strange view is."""
+"""Residual of a strange view at least."""
 MIN_GROUP_VIEWS = 4
 """Evaluation views of a group at least, where it has so many."""
 ROUNDING = 1e-5

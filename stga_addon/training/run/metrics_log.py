@@ -12,6 +12,7 @@ from ...schema import from_json
 from ..evaluate.forecast import Forecast
 
 METRICS = "metrics.jsonl"
+"""Name of the file in a run's folder."""
 REQUIRED = ("iteration", "seconds", "splats", "evaluation_s", "wall_s")
 """Fields of every line."""
 TRACKING_GAIN = "tracking_gain_db"

@@ -40,22 +40,26 @@ from ..settings import TrainingSettings
 from .folder import AVATAR, avatar_version, open_refined, open_run, read_run
 
 EXPOSURE_VIEWS = 24
+"""Views of a camera, spread over the take, that its exposure is fitted to."""
 EXPOSURE_HEIGHT_PX = 160
-"""Views of a camera, spread over the take, that its exposure is fitted to, and their height."""
+"""Height of these images."""
 CAMERA_WEIGHT = 0.2
 """Of the camera's exposure in that of a view, as a share of the view's pixels."""
 MIN_COVER = 250
 """Of a mask, of 255, from which a pixel shows the person alone."""
 SHADING_PRIOR = 0.01
+"""Weight of the light that the avatar was trained in as a fraction of the pixels, where that of a
+take is fitted."""
 SHADING_ITERATIONS = 6
-"""Weight of the light that the avatar was trained in, as a share of the pixels."""
+"""Reweighted least squares fits of that light."""
 SCALE_TIMESTEPS = 6
 """Spread over the take, that the scale is found from."""
 ROUNDS = 2
 """Of tracking, each from the motion that the one before has led to, smoothed in takes in order."""
 IDENTITY = Similarity(1.0, np.eye(3), np.zeros(3))
+
 PART_TIMESTEPS = 16
-"""Tracked by a helping process at a time."""
+"""Timesteps that a helping process tracks at a time."""
 Source = tuple[Path, int, Path, float, int]
 """A run, when its avatar was written, and a capture, once scaled and tracked in rounds."""
 HeadColors = tuple[np.ndarray, np.ndarray, np.ndarray]

@@ -59,24 +59,28 @@ from .folder import AVATAR, CHECKPOINT, TRACKING, Run
 from .metrics_log import METRICS, TRACKING_GAIN, append_metrics, cut_metrics
 
 _log = logging.getLogger(__name__)
+
 CHECKPOINT_S = 30.0
 """Seconds of training between checkpoints: what a crash may cost."""
 CHECKPOINT_VARIABLE = "STGA_CHECKPOINT_S"
 """Environment variable that replaces it, for machines that are taken away often."""
 TRACKING_START_SHARE = 0.5
+"""Fraction of the budget after which the avatar tracks its head."""
 TRACKING_TIME_SHARE = 0.2
-"""Of the budget, after which the avatar tracks its head; what that may take of seconds."""
+"""Fraction of the seconds that this tracking may take."""
 LEFT_OUT_INTERVAL = 12
+"""Every how many timesteps one is left out of that tracking where no camera is held out."""
 LEFT_OUT_VIEWS = 24
+"""Views that decide whether the tracking is kept."""
 MIN_NEIGHBORS = 3
-"""Where no camera is held out, every how many timesteps one is left out of that tracking; views
-that say whether it is kept; timesteps of which one has neighbors."""
+"""Tracked timesteps around a left-out one without which it decides nothing."""
 UNCHECKED = (
     "no held-out view shows a timestep that is trained, and none of these lies between others"
 )
+"""Why a tracking that nothing checked is not kept."""
 SET_ASIDE = {AVATAR: "avatar_to_resume.npz", TRACKING: "tracking_to_resume.npz"}
-"""Files of a stopped run that belong to an evaluation of its own -> those that an unbroken run
-would have, put back when it is resumed."""
+"""Files of a stopped run that belong to its evaluation -> those that an unbroken run would have,
+put back when it is resumed."""
 Selection = Mapping[int, np.ndarray]
 """timestep -> (F,) bool: triangles."""
 RECENT_LOSSES = 100
@@ -84,8 +88,9 @@ RECENT_LOSSES = 100
 RESIDUAL_VIEWS = 24
 """Views in which the residuals of a finished run are measured."""
 READERS_BESIDE_CPU = 0.2
+"""Threads that decode images beside a training on the CPU, as a fraction of its own."""
 READERS_BESIDE_GPU = 0.5
-"""Threads that decode images, as a share of those that kernels run on, or would."""
+"""The same beside one on the GPU, as a fraction of those that kernels would run on."""
 
 
 def image_readers(device: str) -> int:
