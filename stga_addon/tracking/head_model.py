@@ -18,9 +18,11 @@ IDENTITY_PREFIX = "identity"
 """Begins the names of shapes that make another person; all others are expressions."""
 LINEAR_KEYS = ("mean", "faces")
 LINEAR_MODEL_KEYS = (*LINEAR_KEYS, "identity", "expression", "J_regressor", "weights")
+
 MIN_EXTENT_M = 0.1
+"""Least extent of a head model along its longest axis; below, the file is in other units."""
 MAX_EXTENT_M = 2.0
-"""Extent of a head model along its longest axis; outside of it, the file is in other units."""
+"""Largest extent of a head model along its longest axis."""
 MAX_COMPONENT_M = 100.0
 """Displacement of a vertex by a component at coefficient 1; scales of components differ from model
 to model."""
