@@ -32,9 +32,7 @@ spread over the rig."""
 
 ITERATIONS = 15
 """Reweighted least squares fits of a landmark's position."""
-OUTLIER_SCALE = (
-    1.5  # Distances from a ray, in the landmark's medians, at which its weight is a quarter
-)
+OUTLIER_SCALE = 1.5
 """Distance from a ray, in the landmark's medians, at which its weight is a quarter."""
 MIN_DISTANCE_SHARE = 1e-5
 """Least scale of outliers as a fraction of the distance to the cameras; below is rounding."""
