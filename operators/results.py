@@ -30,12 +30,10 @@ from ..stga_addon.scene.record import (
     store_path,
     stored_path,
 )
-from ..stga_addon.scene.vertex_groups import write_selection
 from ..stga_addon.tracking.folder import is_flame
 from ..stga_addon.training.run.folder import AVATAR, TRACKING, has_run, read_run
 from ..stga_addon.worker.status import WorkerState
 from .common import is_head
-from .select import count_selected
 
 Answer = SliceBuilt | Shown | None
 """What a function of `SHOW` returns; None: the result is still being read."""
@@ -370,17 +368,6 @@ def _fill_effects(scene: Any, state: RequestState) -> Answer:
     return Shown()
 
 
-def _select_for_take(scene: Any, state: RequestState) -> Answer:
-    """Select what extending the run by the head's take would train."""
-    head = request_head(scene, state)
-    found: Any = read_result(state.folder_path)
-    if head is None or head != scene.stga.head:
-        raise StgaError(f"{state.subject}: its head is no longer that of the scene")
-    write_selection(head, dict(found.selection))
-    count_selected(scene, head)
-    return Shown(undoable=True)
-
-
 def _apply_performance(scene: Any, state: RequestState) -> Answer:
     head = request_head(scene, state)
     if head is None or head != scene.stga.head:
@@ -398,7 +385,6 @@ SHOW = {
     Kind.TRACKING: _import,
     Kind.AVATAR: _show_made,
     Kind.ANALYSIS: _fill_effects,
-    Kind.SELECTION: _select_for_take,
     Kind.PERFORMANCE: _apply_performance,
     **dict.fromkeys(ADDS, _store_added),
 }
@@ -412,7 +398,7 @@ def changed_object(scene: Any, state: RequestState) -> Any:
     return request_head(scene, state) if state.kind in CHANGES_HEAD else None
 
 
-CHANGES_HEAD = (Kind.TRACKING, Kind.SELECTION, Kind.PERFORMANCE)
+CHANGES_HEAD = (Kind.TRACKING, Kind.PERFORMANCE)
 PLACES = {
     Kind.TRAINING: ("training_run", "result_shown"),
     Kind.TRACKING: ("tracking_capture", "tracking_shown"),

@@ -25,14 +25,13 @@ from ..report import CurveUpdater, report_run
 from ..schema import setting
 from ..training.effect_catalog import RELIGHT, WORLD
 from ..training.run import folder as run_folder
-from ..training.run.folder import AVATAR, Continuation, OpenedRun, Run
+from ..training.run.folder import AVATAR, Continuation, Run
 from ..training.run.identity import identity_of
 from ..training.settings import MAX_GROWTH, TrainingSettings, with_budget
 
 if TYPE_CHECKING:
     from ..training.run.session import Trained
 
-MAX_NAMED_VIEWS = 6  # Views that a warning names
 AFTERWARDS = (StgaError, Cancelled, MemoryError)
 """What may end the work after a training, whose avatar is whole without it."""
 AFTER_S = 20.0
@@ -180,15 +179,6 @@ class Selected:
     """timestep -> (F,) bool: triangles."""
 
     selection: Selection
-
-
-@dataclass(frozen=True)
-class SelectForTake:
-    """Find out which triangles extending a run by a take would train."""
-
-    parent: Path
-    capture: Path
-    flame: Path | None = None
 
 
 Training = Train | Resume | Refine | Extend
@@ -344,20 +334,6 @@ def prepare(request: Training, report: Report, say: Say) -> Prepared:
     return replace(prepared, run=replace(prepared.run, device=device))
 
 
-def select_for_take(request: SelectForTake, report: Report, say: Say) -> Selected:
-    """timestep -> (F,) bool: what extending the run by the take would train. Raises StgaError."""
-    report(Progress(stage="Comparing the avatar with the images"))
-    parent = request.parent
-    takes = (request.capture,)
-    wanted = Extend(parent, parent, takes, iterations=1, flame=request.flame)
-    _, _, selection, run = _joined_takes(wanted, say)
-    start = run.takes[-1].start
-    selection = {timestep - start: faces for timestep, faces in selection.items()}
-    for timestep, faces in selection.items():
-        say(f"{timestep:5d}  {faces.mean():6.1%}")
-    return Selected(selection)
-
-
 def _new_run(request: Train, report: Report, say: Say) -> Prepared:
     from ..raster.cpu.precompile import begin_compiling
     from ..training.effects.plan import plan_effects
@@ -421,32 +397,26 @@ def _extension(request: Extend, report: Report, say: Say) -> Prepared:
     from ..training.effects.plan import add_effects
     from ..training.run.continuation import continued_settings
 
-    report(Progress(stage="Comparing the avatar with the images"))
+    report(Progress(stage="Opening the takes"))
     avatar = read_avatar(request.parent / AVATAR)
-    opened, capture, selection, run = _joined_takes(request, say)
-    needed = np.any(list(selection.values()), axis=0)
-    growth = request.growth * float(needed[avatar.splats.face].mean())
-    settings = continued_settings(
-        opened.run.settings, "extend", growth, request.seconds, request.iterations, request.seed
-    )
-    say(f"takes: {1 + len(run.takes)}; the new ones need {needed.mean():.0%} of the triangles")
+    capture, run = _joined_takes(request)
+    budget = (request.seconds, request.iterations)
+    settings = continued_settings(run.settings, "extend", request.growth, *budget, request.seed)
+    say(f"takes: {1 + len(run.takes)}")
     settings, plan = add_effects(capture, settings, run.effect_plan)
     for old, new in zip(run.effect_plan, plan, strict=True):
         if new.on != old.on:
             say(f"{new.effect}  {new}")
     run = replace(run, settings=settings, effect_plan=plan)
-    return Prepared(request, run, capture, selection, avatar)
+    return Prepared(request, run, capture, {}, avatar)
 
 
-def _joined_takes(request: Extend, say: Say) -> tuple[OpenedRun, Capture, Selection, Run]:
-    """The run, its capture joined with the new takes, what these train, and the run with them.
+def _joined_takes(request: Extend) -> tuple[Capture, Run]:
+    """The capture of the run joined with the new takes, and the run with them.
 
     Raises StgaError where the run or a take does not exist, or a take is of another head, has no
-    training views or is in the run already. Says which views do not show the head as the avatar
-    does.
+    training views or is in the run already.
     """
-    from ..training.run.continuation import select_for_takes
-
     opened = run_folder.open_run(request.parent, flame=request.flame)
     run = opened.run
     new = list[Capture]()
@@ -474,9 +444,5 @@ def _joined_takes(request: Extend, say: Say) -> tuple[OpenedRun, Capture, Select
     parent = request.parent
     last = max(capture.timesteps)
     continuation = Continuation(parent.resolve(), file_digest(parent / AVATAR), starts[0], last)
-    selection, unlike = select_for_takes(continuation, capture, run.settings, starts)
-    if unlike:
-        names = ", ".join(view.name for view in unlike[:MAX_NAMED_VIEWS])
-        say(f"warning: {names}: does not look like the head from this camera; are images swapped?")
     run = replace(run, identity=None, takes=(*run.takes, *added), continuation=continuation)
-    return opened, capture, selection, run
+    return capture, run

@@ -27,7 +27,7 @@ MAX_THREADS = 1024
 
 
 def kind_name(kind: type[Any]) -> str:
-    """ "select-for-take" for SelectForTake."""
+    """ "render-blend" for RenderBlend."""
     return "".join(f"-{c.lower()}" if c.isupper() else c for c in kind.__name__).lstrip("-")
 
 

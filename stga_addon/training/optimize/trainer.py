@@ -11,7 +11,7 @@ from ...avatar.splats import joined
 from ...capture.model import Capture, View
 from ...schema import to_json
 from ..schedule import learning_rates, sh_degree
-from ..settings import CONTINUATIONS, TrainingSettings
+from ..settings import TrainingSettings
 from .avatar_tracking import RefinedTracking
 from .backend import Batch, RenderOptions
 from .change import Change, Turn, is_turn_of
@@ -25,9 +25,6 @@ from .state import TrainState, new_state, with_offsets
 from .strays import StrayReset
 from .surface_prior import SurfacePrior, above_unseen_hair, hidden_splats, splats_behind
 from .unseen_sides import plausible_aside
-
-EXTEND_LOCAL_SHARE = 0.5
-"""Of an extension's budget, in which what the new takes need is trained, before all splats."""
 
 
 class Start(NamedTuple):
@@ -47,22 +44,18 @@ NEW = Start()
 class Strategy:
     """Decides which triangles each iteration trains, as `TrainingSettings.strategy` says.
 
-    region          (F,) bool: the only triangles whose splats the run may change; None for all
-    refined_region  the same of a refinement; None for any other run
+    region  (F,) bool: the only triangles whose splats a refinement may change; None for all
 
     "selective" alternates local iterations, which train a frame's selected triangles, with global
-    ones (STGA, training). "refine" trains the same region throughout, "extend" first what new takes
-    need, in views of all takes, and then all splats. Not in turn: where some splats are frozen in
-    the new views only, the others make up for them there, and drift.
+    ones (STGA, training). "refine" trains its region throughout, all others all splats.
     """
 
     def __init__(self, settings: TrainingSettings, selection: Mapping[int, np.ndarray]) -> None:
-        """selection: timestep -> (F,) bool triangles; continuations train the union."""
+        """selection: timestep -> (F,) bool triangles; a refinement trains the union."""
         self._settings = settings
         self._selection = selection
-        continues = settings.strategy in CONTINUATIONS
-        self.region = np.any(list(selection.values()), axis=0) if continues else None
-        self.refined_region = self.region if settings.strategy == "refine" else None
+        refines = settings.strategy == "refine"
+        self.region = np.any(list(selection.values()), axis=0) if refines else None
 
     def triangles(
         self, iteration: int, visit: int, timestep: int, progress: float
@@ -74,10 +67,8 @@ class Strategy:
         progress          share of the budget spent
         """
         settings = self._settings
-        region = self.region
-        if region is not None:
-            is_local = progress < EXTEND_LOCAL_SHARE and region.any()
-            return region if settings.strategy == "refine" or is_local else None
+        if self.region is not None:
+            return self.region
         selected = self._selection.get(timestep)
         count = iteration if settings.global_unit == "iteration" else visit
         is_global = count % (settings.global_interval + 1) == settings.global_interval

@@ -391,7 +391,7 @@ class _Session:
             views = capture.views["train"]
             order = view_order(views, settings.views_per_visit, settings.seed, first)
         else:
-            region = self.trainer.strategy.refined_region
+            region = self.trainer.strategy.region
             order = continued_order(self.run.continuation, capture, region, settings.seed, first)
         coarse, full = image_scales(settings, capture.views["train"])
 
@@ -753,7 +753,7 @@ def _session(
     strain_range = checkpoints.strain_range_of(folder, capture, run)
     trainer = Trainer(capture, settings, selection, Start(state, strain_range), run.device)
     if run.continuation is not None:
-        views = continued_evaluation_views(run, capture, trainer.strategy.refined_region)
+        views = continued_evaluation_views(run, capture, trainer.strategy.region)
     else:
         background = settings.background
         backdrop = settings.backdrop
