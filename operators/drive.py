@@ -41,10 +41,11 @@ from .windows import redraw
 MAX_PORT = 65535
 TICK_S = 1 / 60
 MIN_WAIT_S = 0.001
+
 PANEL_INTERVAL_S = 0.2
-"""At which the panel's figures are drawn anew."""
+"""Interval at which the panel's figures are drawn anew."""
 SLOWEST_TICKS = 600
-"""Those of the last ten seconds."""
+"""Ticks of the last ten seconds, of which the panel shows the slowest."""
 LEFT_TAKES = "stga_takes"
 """Folder beside other temporary files for takes that have no other place as a session ends."""
 

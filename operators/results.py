@@ -119,11 +119,13 @@ def forget_heads() -> None:
 
 
 TRACKED_NAME = "Head, being tracked"
+
 MIN_ITERATIONS = 300
 """Below, new splats look like gray fog: neither previews nor a run that was cancelled replace
 another avatar."""
 
 _pool = ThreadPoolExecutor(1, "stga")
+
 _loading: dict[int, Future[tuple[Avatar, SplatAttributes]]] = {}
 """Session id of a scene -> the avatar file that a thread reads for it."""
 
@@ -399,6 +401,7 @@ def changed_object(scene: Any, state: RequestState) -> Any:
 
 
 CHANGES_HEAD = (Kind.TRACKING, Kind.PERFORMANCE)
+"""Kinds whose result changes the head itself."""
 PLACES = {
     Kind.TRAINING: ("training_run", "result_shown"),
     Kind.TRACKING: ("tracking_capture", "tracking_shown"),

@@ -40,6 +40,7 @@ WEB_PAGE = re.compile(rb"(<\?xml[^>]*>|<!--.*?-->|\s)*<(!doctype html|html|head|
 CHANGED_LINE_ENDS = (
     "was carried over as text, which changed its line ends (CR LF); copy it again as binary"
 )
+
 MAX_ARRAYS_BYTES = 1 << 30
 """Largest sum of the arrays that are read from an npz: an avatar of four million splats."""
 MAX_CHECKPOINT_BYTES = 4 << 30
@@ -52,12 +53,14 @@ MAX_NAME_BYTES = 255
 """Longest name of a file or folder on the file systems of Linux, macOS and Windows."""
 PARTIAL_NAME = re.compile(
     r"\..+\.(?P<host>[0-9a-f]{8})-(?P<process>\d{1,10})-[0-9a-f]{8}\.partial", re.DOTALL
-)  # Name of a temporary file: .NAME.HOST-PROCESS-RANDOM.partial
+)
+"""Name of a temporary file: .NAME.HOST-PROCESS-RANDOM.partial"""
 RENAME_PATIENCE_S = 5.0
+"""How long a rename is tried again while another program has the file open, on Windows."""
 RENAME_INTERVAL_S = 0.1
-"""How long, and how often, a rename is tried again while another program has the file open, on
-Windows."""
-WINDOWS_SHARING_ERRORS = (5, 32)  # ERROR_ACCESS_DENIED, ERROR_SHARING_VIOLATION: of an open file
+"""Interval of these attempts."""
+WINDOWS_SHARING_ERRORS = (5, 32)
+"""ERROR_ACCESS_DENIED and ERROR_SHARING_VIOLATION of an open file."""
 NO_FILE = (errno.ENOENT, errno.ENOTDIR, errno.ELOOP, errno.ENAMETOOLONG, errno.EINVAL)
 """What the system answers where there is nothing under a name."""
 NewFile = Callable[[Path], AbstractContextManager[Path]]
@@ -71,9 +74,11 @@ BYTE_ORDER_MARKS = {
 }
 DELIMITERS = ",;\t"
 DECIMAL_COMMA = re.compile(r"\s*[-+]?\d*,\d+([eE][-+]?\d+)?\s*", re.ASCII)
-LINES_BEFORE_COLUMNS = 5  # Of comments, in which the row of a table's columns is searched
+
+LINES_BEFORE_COLUMNS = 5
+"""Comments in which the row of a table's columns is searched."""
 _HOST = f"{zlib.crc32(platform.node().encode()):08x}"
-"""Computers that share a disk cannot see each other's processes."""
+"""This computer: those that share a disk cannot see each other's processes."""
 
 
 @contextmanager

@@ -65,8 +65,8 @@ class TimeLeft:
     def __init__(self, clock: Callable[[], float] = monotonic) -> None:
         self._clock = clock
         self._last = clock(), 0.0
+        # Seconds and fractions of the steps that tell the pace
         self._steps: deque[tuple[float, float]] = deque()
-        """Seconds and shares of the steps that tell the pace."""
 
     def after(self, share: float) -> float:
         """Once `share` of the work is done; NaN where the pace is not known yet."""
@@ -95,8 +95,8 @@ class Clock:
         self._clock = clock
         self._by_share = TimeLeft(clock)
         self._left_s = math.inf
+        # When work lately reported how many seconds are left, and how many
         self._asked: deque[tuple[float, float]] = deque()
-        """When work lately said how many seconds are left, and how many."""
 
     def told(self, progress: Progress) -> dict[str, float]:
         """The finite figures of some progress; `left_s`, by the share where the work does not say,

@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 CURVE = "curve.png"
+
 MAX_DRAWING_SHARE = 0.01
 """Largest share of the time that drawing the curve may take while a run trains."""
 
@@ -228,7 +229,8 @@ def finish_axes(axes: "Axes") -> None:
 
 # The curve in Blender's panel: its Python need not have matplotlib or Pillow
 
-SIZE = 256  # Width and height in pixels: Blender's icons are square
+SIZE = 256
+"""Width and height in pixels: Blender's icons are square."""
 MARGIN = 6.0
 LINE_WIDTH = 3.0
 BACKGROUND_COLOR = (0.11, 0.11, 0.11)
@@ -236,7 +238,9 @@ GRID_COLOR = (0.25, 0.25, 0.25)
 CURVE_COLOR = (0.34, 0.71, 0.91)
 FORECAST_COLOR = (0.90, 0.62, 0.0)
 DETAIL_COLOR = (0.0, 0.62, 0.45)
-BAND_OPACITY = 0.35  # Of the band that shows a forecast's error
+
+BAND_OPACITY = 0.35
+"""Opacity of the band that shows a forecast's error."""
 GRID_STEPS_DB = (0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0)
 """The first step is used that gives at most MAX_GRID_STEPS."""
 MAX_GRID_STEPS = 6

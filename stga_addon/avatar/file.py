@@ -31,6 +31,7 @@ from .strain import STRAIN_COMPONENTS, TRAINED_RANGE, StrainBasis, at_rest, stra
 FORMAT = "stga-avatar"
 VERSION = 3
 MAX_HEADER_BYTES = 16 << 20
+
 _HEADER = {
     "convention": str,
     "background": list,
@@ -42,6 +43,7 @@ _HEADER = {
 """Field of the avatar -> what JSON holds of it; of the regions their names."""
 
 SOURCES = "estimated", "gray_card", "file"
+"""Where an avatar's light can come from."""
 _LIGHT_ARRAYS = {
     "radiance": (9, 3),
     "transfer": (-1, 9),
@@ -49,13 +51,16 @@ _LIGHT_ARRAYS = {
     "irradiance": (-1, 3),
     "roughness": (-1,),
 }
-"""Field -> shape, -1: vertices."""
+"""Array of a light -> its shape, -1: vertices."""
 _PREFIX = "light_"
 _OPTIONAL_ARRAYS = "strain_range", "linear_base", "filmed_along"
+
 MIN_COLOR_CHANGE = 1 / 255
+"""Offsets of colors that never change them by as much are not stored."""
 MIN_SHIFT_M = 2e-4
+"""The same of positions."""
 MIN_SCALE_CHANGE = 0.02
-"""Of splats that follow a signal: what never changes them by as much is not kept."""
+"""The same of scales, relative."""
 
 
 UNSEEN_REGION = "unseen"

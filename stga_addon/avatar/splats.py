@@ -13,14 +13,16 @@ import numpy as np
 from ..flame.quaternions import normalized, unit
 
 MAX_SH_DEGREE = 3
+
 SH_C0 = 0.28209479177387814
 """The constant spherical harmonic, 1 / (2·sqrt(π)): a color is 0.5 + SH_C0 times the degree-0
 coefficient."""
 
 
 MAX_LOGIT = 15.0
+"""Logit of an opacity of 1 to 3e-7."""
 MIN_LOG_SCALE = -20.0
-"""An opacity of 1 to 3e-7, and a standard deviation of nothing, before activation."""
+"""Logarithm of a standard deviation of nothing."""
 
 
 @dataclass(frozen=True)

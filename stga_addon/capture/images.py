@@ -20,14 +20,18 @@ from .color import in_bands, is_srgb, to_srgb, with_gamma
 from .model import View
 
 WHITE = (255, 255, 255)
-WHITE_LEVEL = 247  # Of all channels, from which a pixel without a mask counts as a white background
+
+WHITE_LEVEL = 247
+"""Level of all channels from which a pixel without a mask counts as a white background."""
 FORMATS = ("PNG", "JPEG", "WEBP", "TIFF", "BMP")
 """Pillow opens more than these, some by running other programs."""
 ORIENTATION_TAG = 0x0112
 """EXIF's: 1 upright, 2 to 4 mirrored or upside down, 5 to 8 with width and height exchanged."""
 # PNG's gAMA of what is shown as sRGB
 SRGB_GAMMA = 0.45455
+"""Value of a PNG's gAMA chunk that stands for sRGB."""
 GAMMA_TOLERANCE = 0.02
+"""Difference from it that still does."""
 CICP = "stga_cicp"
 """Key of an opened image's information: what `_cicp` found in its file."""
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"

@@ -16,13 +16,18 @@ from .glb import WIDTHS, allowed_numbers, glb_chunks
 from .model import Capture
 from .ply import ply_rows
 
-Mesh = tuple[np.ndarray, np.ndarray]  # Vertices (V, 3) and triangles (F, 3)
+Mesh = tuple[np.ndarray, np.ndarray]
+"""Vertices (V, 3) and triangles (F, 3)."""
 MESH_SUFFIXES = (".obj", ".ply", ".glb", ".stl")
+
 PRIMITIVE_NUMBERS = (
     1000  # That each primitive counts for: trimesh takes time even where it is small
 )
-CACHE_BYTES = 96 << 20  # Of a take of ten seconds, each is posed once
+"""Numbers that each primitive counts for: trimesh takes time even where it is small."""
+CACHE_BYTES = 96 << 20
+"""Memory for posed meshes: of a take of ten seconds, each is posed once."""
 MAX_MESH_BYTES = 512 << 20
+
 MIN_EXTENT_M = 1e-9
 """A smaller mesh is a point: no shape to train on, and no scale to compare motion with."""
 PLY_CORNERS = ("vertex_indices", "vertex_index")  # The names that writers give a face's list

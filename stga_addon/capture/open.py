@@ -55,15 +55,23 @@ from .transforms import (
 )
 
 MIN_HEAD_EXTENT_M = 0.05
+"""Least extent of a neutral mesh along its longest axis: below, its unit is probably not the
+meter."""
 TYPICAL_HEAD_EXTENT_M = 0.3
+"""Extent of an average head, which messages name."""
 MAX_HEAD_EXTENT_M = 3.0
-"""Largest extent of a neutral mesh: outside of these, its unit is probably not the meter."""
-NEUTRAL = ("neutral", "canonical")  # Names of a mesh without expression
+"""Largest extent of a neutral mesh in meters."""
+NEUTRAL = ("neutral", "canonical")
+"""Names of a mesh without expression."""
 MAX_COMPARED_VIEWS = 4
+"""Views whose images or masks are read to check a capture."""
 NAMES_IN_WARNING = 3
-MIN_SHARE_DIFFERENCE = 0.01  # of the vertices
+"""Files that a warning names at most."""
+MIN_SHARE_DIFFERENCE = 0.01
+"""Fraction of the vertices by which a convention must be worse than another to be doubted."""
 CANONICAL_NAME = "canonical_flame_param.npz"
 PARAMETERS = "flame_param"
+
 OWN_MODELS = ("flame_model.npz", "flame_model.pkl")
 """Names of a FLAME model file in the folder of a capture, which is used where none is given."""
 BUNDLED_MODEL = "bundled_head.npz"

@@ -17,8 +17,11 @@ POSE_FEATURES = 9 * (len(JOINTS) - 1)
 # FLAME 2020 and 2023: 300 identity then 100 expression components
 FULL_COMPONENTS = 400
 FULL_IDENTITY = 300
+
 MASK_FILE = "FLAME_masks.pkl"
-MASK_PREFIX = "masks/"  # an npz model may carry its vertex masks itself
+
+MASK_PREFIX = "masks/"
+"""Prefix of the vertex masks that an npz model may carry itself."""
 MAX_MODEL_NUMBERS = 1 << 25
 """Numbers of a head model with all that is filled in, each 8 bytes in memory: five times FLAME."""
 FILLED_NUMBERS_PER_VERTEX = 3 * POSE_FEATURES + 2 * len(JOINTS)
@@ -26,6 +29,7 @@ FILLED_NUMBERS_PER_VERTEX = 3 * POSE_FEATURES + 2 * len(JOINTS)
 TEMPLATE_KEYS = ("v_template", "mean")
 """Keys of the neutral head, in FLAME's form and in a linear model's."""
 MODEL_KEYS = ("v_template", "shapedirs", "posedirs", "J_regressor", "kintree_table", "weights", "f")
+"""Arrays of a FLAME model."""
 BUNDLED_HEAD = Path(__file__).with_name("head.npz")
 """The head model of this package: ICT-FaceKit (MIT License, Copyright (c) 2020 USC Institute for
 Creative Technologies) in FLAME's form, made by `development/bundled_head.py`."""

@@ -50,6 +50,7 @@ FIELD_ALIASES = {
     "jaw_params": "jaw_pose",
     "shape_params": "shape",
 }
+"""Field as other programs name it -> as it is read."""
 JOINT_COUNTS = {"rotation": 1, "neck_pose": 1, "jaw_pose": 1, "eyes_pose": 2}
 """Fields that are rotations -> how many of them."""
 # Numbers of a rotation by two rows of its matrix, or the matrix

@@ -66,6 +66,7 @@ Request = (
     | MakeExact
 )
 Result = Written | Selected | Analyzed
+
 Work = Callable[..., Result]
 """Called with a request, a `Report` and a `Say`; raises what `perform` does."""
 
@@ -118,6 +119,7 @@ _NEW_RUN = Job(
     output="run",
     files=avatar_file,
 )
+
 JOBS: dict[type[Any], Job] = {
     Train: _NEW_RUN,
     Refine: _NEW_RUN,

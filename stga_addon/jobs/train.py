@@ -35,8 +35,9 @@ if TYPE_CHECKING:
 AFTERWARDS = (StgaError, Cancelled, MemoryError)
 """What may end the work after a training, whose avatar is whole without it."""
 AFTER_S = 20.0
+"""Seconds that light and world take after a training, about."""
 AFTER_SHARE = 0.05
-"""Of light and of world, about: seconds, and share of the progress."""
+"""Fraction of the progress that they take."""
 Selection = Mapping[int, np.ndarray]  # timestep -> (F,) bool: triangles to train
 
 

@@ -37,6 +37,7 @@ HELD_OUT = 8
 STEPS = (1, 2, 2, 3)
 """One point of so many is fitted, for each level."""
 REGIONS = ("lower face", "middle face", "eyes", "brows")
+
 REGION_EDGES = (0.4, 0.62, 0.735)
 """Edges of the REGIONS, in the landmarks' height on the neutral head."""
 UPPER_FACE = 2
@@ -101,8 +102,8 @@ class DenseHead:
         eyeballs = model.weights[:, [JOINTS.index(f"{side}_eye") for side in ("left", "right")]]
         balls = template[(eyeballs > EYEBALL_WEIGHT).any(1)]
         on_lids = cKDTree(balls).query(at)[0] < LID_DISTANCE_M if len(balls) else False
+        # (L,) bool: landmarks on eyeballs and teeth, and at what covers and uncovers eyeballs
         self.inner = ~skin | on_lids
-        """(L,) bool: landmarks on eyeballs and teeth, and at what covers and uncovers eyeballs."""
         used = reliable & skin
         used = used if used.any() else reliable
         points = surface_points(head, HEAD_POINTS)

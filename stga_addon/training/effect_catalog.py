@@ -143,6 +143,7 @@ _EFFECTS = (
         "tracking",
     ),
 )
+
 EFFECTS = {effect.name: effect for effect in _EFFECTS}
 """Effects by name, in display order."""
 CHOICES = ("auto", "on", "off")

@@ -73,8 +73,9 @@ SOURCES = {
 
 
 LOOPBACK = "127.0.0.1"
+
 MAX_DATAGRAM_BYTES = 1 << 14
-"""Of a frame of a source; more is foreign."""
+"""Size of a source's frame; larger packets are foreign."""
 MAX_DATAGRAMS = 256
 """Read at once, more than a socket keeps."""
 MAX_READ_BYTES = 1 << 15
@@ -150,14 +151,18 @@ def leaves_this_machine(source: Source, address: str, phone: str) -> bool:
 
 Sender = tuple[str, str]  # Address and subject: two phones may share either
 
-MAX_SENDERS = 8  # Kept in memory; of more, those silent for longest are forgotten
-SILENCE_S = 2.0  # Without a packet, after which another sender is followed
+MAX_SENDERS = 8
+"""Senders kept in memory; of more, those silent for longest are forgotten."""
+SILENCE_S = 2.0
+"""Silence after which another sender is followed."""
 RESTART_S = 1.0
 """A clock set back by more is a source that started anew; by less, a packet that came late."""
-PAUSE_S = 2.0  # Longer gaps are pauses of the source, not lost packets
-GAP = 1.5  # Packets farther apart than this many usual steps have lost some between them
+PAUSE_S = 2.0
+"""Longer gaps are pauses of the source, not lost packets."""
+GAP = 1.5
+"""Packets farther apart than this many median steps have lost some between them."""
 MIN_CLOCK_STEP_S = 1e-4
-"""Between packets by the source's clock; less is the same moment."""
+"""Time between packets by the source's clock below which they are of the same moment."""
 # Steps of the source's clock, and arrivals, that are remembered
 STEPS = 31
 ARRIVALS = 240
@@ -274,9 +279,10 @@ def _remember(table: dict[Any, Any], key: Any, value: Any) -> None:
         del table[next(iter(table))]
 
 
-RESTING_PACKETS = 15  # Whose mean is the resting face: a quarter of a second
+RESTING_PACKETS = 15
+"""Packets whose mean is the resting face: a quarter of a second."""
 MIN_STEP_S = 2 / MAX_FPS
-"""Between rows: a file's times are rounded, and rows at MAX_FPS could be refused."""
+"""Time between rows: a file's times are rounded, and rows at MAX_FPS could be refused."""
 MAX_LEAD_S = 5.0
 """By which a source's clock may be ahead of the packets' arrival: a usual socket keeps packets for
 4 s while Blender is busy. Beyond it, the clock was set, or is another's."""

@@ -163,6 +163,7 @@ def job_command(job: Job) -> list[str]:
 # Plans
 
 PLAN_KEYS = ("out", "resources", "job")
+"""Keys of a plan's top level."""
 TABLE_KEYS = ("request", "after", "resources", "minutes")
 """Keys of a job's table that are not fields of its request."""
 REPLACED = "replaced"  # Folder of the batch that keeps what changed jobs wrote before

@@ -118,6 +118,7 @@ PLACED: dict[str | None, NodeGroup] = {
     name: _meshes(f"Place Splats ({name})", partial(_placed_splats, name), "Splats", "Frames")
     for name in CONVENTIONS
 }
+
 PLACED[None] = _meshes("Place Splats (world)", partial(_placed_splats, None), "Splats")
 """Splats (and the mesh with frames) -> splats in object space; None: in world space."""
 

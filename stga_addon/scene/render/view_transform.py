@@ -19,7 +19,9 @@ DATA_VIEWS = ("Raw", "False Color", "Log", "Filmic Log")
 """View transforms that show data instead of colors; they are left alone."""
 # samples along an axis of the table measured, and of its inverse
 GRID = 41
+"""Samples along an axis of the table measured."""
 INVERSE_GRID = 25
+"""Samples along an axis of its inverse."""
 DARKEST = -14.0
 """Log2 of the darkest scene-linear sample after 0."""
 BRIGHTEST = 6.0

@@ -176,8 +176,8 @@ class LivePose:
         self._rig: Any = None if rig is None else Identity(rig)
         self.takes_frames = rig is not None
         keys = head.data.shape_keys.key_blocks
+        # Component, or column of the 52 -> slider
         self._names = keyframes.shape_key_names(head)
-        """Component, or column of the 52 -> slider."""
         still: list[str] = []
         if rig is not None:
             self._names = keyframes.expression_keys(head)
