@@ -116,7 +116,7 @@ class Avatar:
                     each of three components of a signal
     light       what relighting needs, None where it was not estimated
     filmed_along  (F, 3) float32: unit direction in which the only camera sees each triangle, world
-                  axes; what harmonics add from aside is plausible only (`colored_aside`). None: of
+                  axes; what harmonics add off-axis is plausible only (`colored_off_axis`). None: of
                   several cameras, or of trained harmonics
     linear_base  (N, 4) float32: constant coefficients and logit of each splat with which renderers
                  that blend in linear light come nearest to it (`render.linear_fit`); None: those

@@ -200,7 +200,7 @@ def sh_color(sh: np.ndarray, direction: np.ndarray) -> np.ndarray:
     return 0.5 + SH_C0 * sh[:, 0] + rest
 
 
-def colored_aside(
+def colored_off_axis(
     splats: Splats, direction: np.ndarray, share: np.ndarray, color: np.ndarray
 ) -> Splats:
     """Splats of degree 0 that look as they do along a unit direction (N, 3) from the eye, and the

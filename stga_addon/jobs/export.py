@@ -120,7 +120,7 @@ class Export:
         "leave out the capture's light: colors are the albedo (docs/light.md)", False
     )
     filmed_only: bool = option(
-        "leave out what is plausible only: splats that no camera saw, colors from aside", False
+        "leave out what is plausible only: splats that no camera saw, off-axis colors", False
     )
 
     def check(self) -> None:

@@ -70,7 +70,7 @@ _EFFECTS = (
     ),
     Effect(
         "depth-limits",
-        "No stray splats",
+        "No outliers",
         "free",
         "none: splats are smaller and nearer to their triangles",
         on=_LIMITS,

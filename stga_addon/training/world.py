@@ -171,7 +171,7 @@ def trained_on(plates: Sequence[CleanPlate], center: np.ndarray, report: Report 
     frames = face_frames(mesh, faces, mesh)
     face = np.zeros(len(start), np.int32)
     trainer = Trainer(capture, settings, {}, Start(new_state(to_local(start, frames, face))))
-    trainer.changes.clear()  # what stands still has neither dust around it nor unseen sides
+    trainer.hooks.clear()  # what stands still has neither floaters around it nor unseen sides
     targets = [np.rint(255 * plate.image).astype(np.uint8) for plate in plates]
     for target in targets:
         # as in training: Numba would compile again for writable arrays

@@ -138,7 +138,7 @@ def test_the_avatar_before_is_the_first_evaluation(parent, toy, tmp_path):
 
 
 def test_one_cameras_avatar_goes_on_as_it_was_trained(toy, tmp_path):
-    """Catches colors from aside, plausible only, that are trained on, or taken for another avatar
+    """Catches colors off-axis, plausible only, that are trained on, or taken for another avatar
     than the checkpoint's, whose moments are lost then."""
     capture = one_camera(toy)
     run = run_of(capture, iterations=4, sh_degree=0, sh_steps=(), lattice=1)

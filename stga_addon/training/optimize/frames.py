@@ -14,8 +14,8 @@ from ...avatar.strain import strain_basis, trained_range
 from ...capture.model import Capture
 from ...raster.cpu.rasterize import moved_frames
 from ..settings import TrainingSettings
-from .backing import Backing, backing_of
 from .initial_splats import voxel_size
+from .occlusion_layer import OcclusionLayer, occlusion_layer
 from .surface import Surface
 from .unseen_sides import UnseenSides, unseen_sides
 
@@ -109,8 +109,8 @@ class FrameStore:
         return unseen_sides(self.surface)
 
     @cached_property
-    def backing(self) -> Backing:
-        return backing_of(self.surface, self.sides)
+    def occlusion_layer(self) -> OcclusionLayer:
+        return occlusion_layer(self.surface, self.sides)
 
     @cached_property
     def layer_height(self) -> np.ndarray:

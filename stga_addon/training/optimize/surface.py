@@ -24,7 +24,8 @@ from ...flame.model import torso_faces
 from ...flame.quaternions import unit
 from ...tracking.solve import lid_shares
 from .initial_splats import FEW_CAMERAS, SAMPLED_HEIGHT_PIXELS, mirrored, voxel_size
-from .likeness import (
+from .outlines import TOLERANCE_SHARE, clear_of
+from .semantic_regions import (
     JAW_LEVEL,
     TORSO_HEIGHT,
     HeadCoordinates,
@@ -34,7 +35,6 @@ from .likeness import (
     nearest_rows,
     teeth_of,
 )
-from .outlines import TOLERANCE_SHARE, clear_of
 
 FACING_TIMESTEPS = 300
 """Timesteps of the training views that are examined, spread over all: half a second of a turned

@@ -13,11 +13,11 @@ from ...avatar.splats import SH_C0, Splats, joined
 from ...flame.quaternions import from_matrices, to_matrices
 from ..settings import TrainingSettings
 from .backend import Backend
-from .backing import CELL_VOXELS
-from .change import Turn
 from .frames import FrameStore
-from .likeness import eyeballs_of, lining_of
+from .occlusion_layer import CELL_VOXELS
+from .semantic_regions import eyeballs_of, lining_of
 from .state import parameters_and_average
+from .step_hook import Schedule
 from .surface import Surface
 from .unseen_hair import UnseenHair
 
@@ -41,7 +41,7 @@ HIDDEN_FLATNESS = 0.25
 """Their thickness as a fraction of that of the lattice's splats."""
 LEAST_WIDTH_SHARE = 0.9
 """Width below which they may not shrink, as a fraction of what the lattice begins with."""
-BACKING_OPACITY = 5.0
+OCCLUSION_OPACITY = 5.0
 """Logit of the opacity of the occlusion layer."""
 CELL_WIDTH = 0.6
 """Least standard deviation of the occlusion layer's splats, in cells."""
@@ -103,13 +103,13 @@ class SurfacePrior:
         surface = self._surface
         sides = self._frames.sides
         may_be = sides.triangles | ~sides.shown | surface.lids | surface.is_flat
-        may_be |= self._frames.backing.triangles | self._eyeballs
+        may_be |= self._frames.occlusion_layer.triangles | self._eyeballs
         return np.asarray(may_be | (surface.turned_away > 0))
 
     def prepare(self) -> None:
         self.may_be_pulled  # noqa: B018
 
-    def apply(self, backend: Backend, turn: Turn) -> None:
+    def apply(self, backend: Backend, schedule: Schedule) -> None:
         where = backend.columns(("face", "unbound"))
         is_bound = ~where["unbound"]
         bound = np.flatnonzero(is_bound & self.may_be_pulled[where["face"]])
@@ -335,7 +335,7 @@ class SurfacePrior:
         """(N,) bool: the splats of the layer behind lids and sides, each the nearest to its place.
         By depth, lids' own splats would join it, as training moves them by more than the tenth of a
         millimeter that it is deep, and never leave it."""
-        has_inner = self._surface.lids | self._frames.backing.triangles
+        has_inner = self._surface.lids | self._frames.occlusion_layer.triangles
         rows = np.flatnonzero(has_inner[columns["face"]])
         face = columns["face"][rows]
         place = self._inner.xyz[np.searchsorted(self._inner.face, face)]
@@ -387,7 +387,7 @@ def flattened(
 
 def above_unseen_hair(frames: FrameStore, splats: Splats) -> np.ndarray:
     """(N,) bool: unbound splats that stand higher than hair which faces no camera. Masks from
-    in front do not end the hull behind a head: what stands there hangs in the air from aside."""
+    in front do not end the hull behind a head: what stands there hangs in the air off-axis."""
     surface = frames.surface
     top = (surface.hair_height + frames.voxel) / frames.unit_lengths
     height = splats.xyz[:, NORMAL_AXIS[frames.convention]]
@@ -452,21 +452,21 @@ def border_inset(surface: Surface, order: np.ndarray) -> np.ndarray:
 
 def splats_behind(frames: FrameStore, sh_degree: int) -> Splats:
     """The opaque layer under lids, whose own splats, trained on open eyes, would leave gaps when
-    they close, and the `backing`."""
+    they close, and the `occlusion_layer`."""
     surface = frames.surface
     inner = inner_layer(frames, sh_degree)
-    has_inner = (surface.lids & ~surface.closed) | frames.backing.triangles
+    has_inner = (surface.lids & ~surface.closed) | frames.occlusion_layer.triangles
     return inner.rows(has_inner[inner.face])
 
 
 def inner_layer(frames: FrameStore, sh_degree: int = 0) -> Splats:
     """One splat in its plausible color, sorted by triangle, for each triangle of lids, under its
     middle and so large that closed lids have no gaps, of the mouth's unseen inside, and of the
-    `backing`."""
+    `occlusion_layer`."""
     capture = frames.capture
     axis = NORMAL_AXIS[frames.convention]
     lids = frames.surface.lids
-    backing = frames.backing
+    occlusion = frames.occlusion_layer
     layer = lattice_splats(
         capture.neutral, capture.faces, 0, sh_degree, HIDDEN_OPACITY, frames.convention
     )
@@ -477,17 +477,17 @@ def inner_layer(frames: FrameStore, sh_degree: int = 0) -> Splats:
     layer.log_scale[:] += np.log(share)[:, None]
     layer.log_scale[:, axis] += np.log(HIDDEN_FLATNESS)
     behind = lattice_splats(
-        backing.places, capture.faces, 0, sh_degree, BACKING_OPACITY, frames.convention
-    ).rows(backing.triangles)
+        occlusion.places, capture.faces, 0, sh_degree, OCCLUSION_OPACITY, frames.convention
+    ).rows(occlusion.triangles)
     behind.log_scale[:, axis] += np.log(HIDDEN_FLATNESS)
-    there = face_frames(backing.places, capture.faces, backing.places, frames.convention)
+    there = face_frames(occlusion.places, capture.faces, occlusion.places, frames.convention)
     world = to_world(behind, there)
     least = np.where(np.arange(3) == axis, 0, CELL_WIDTH * CELL_VOXELS * frames.voxel)
     world = replace(world, log_scale=np.log(np.maximum(np.exp(world.log_scale), least)))
     behind = to_local(world, frames.neutral, behind.face)
     within = lids | (frames.sides.triangles & ~frames.surface.outside)
-    layer = joined([layer.rows((within & ~backing.triangles)[layer.face]), behind])
+    layer = joined([layer.rows((within & ~occlusion.triangles)[layer.face]), behind])
     layer = layer.rows(np.argsort(layer.face))
-    color = np.where(backing.triangles[:, None], backing.color, frames.sides.color)
+    color = np.where(occlusion.triangles[:, None], occlusion.color, frames.sides.color)
     layer.sh[:, 0] = (color[layer.face] - 0.5) / SH_C0
     return layer

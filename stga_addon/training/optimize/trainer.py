@@ -14,17 +14,17 @@ from ..schedule import learning_rates, sh_degree
 from ..settings import TrainingSettings
 from .avatar_tracking import RefinedTracking
 from .backend import Batch, RenderOptions
-from .change import Change, Turn, is_turn_of
 from .density import DensityControl
-from .dust import DustPruning
+from .floaters import FloaterPruning
 from .frames import FrameStore
 from .initial_splats import initial_splats, unseen_share
 from .make_backend import make_backend
+from .outliers import OutlierReset
 from .outlines import OutlinePruning
 from .state import TrainState, new_state, with_offsets
-from .strays import StrayReset
+from .step_hook import Schedule, StepHook, is_due
 from .surface_prior import SurfacePrior, above_unseen_hair, hidden_splats, splats_behind
-from .unseen_sides import plausible_aside
+from .unseen_sides import plausible_off_axis
 
 
 class Start(NamedTuple):
@@ -84,7 +84,7 @@ class Trainer:
     visit          visits of frames so far, minus one: consecutive views of one timestep are one
                    visit
     initial_count  splats of the whole lattice and hull points, which density control counts from
-    changes        by name, what may change the splats after a step, in this order
+    hooks          by name, what may edit the splats after a step, in this order
     """
 
     def __init__(
@@ -118,16 +118,16 @@ class Trainer:
             self.initial_count = len(state)
         self._backend = make_backend(device, settings, self.frames, state)
         limits = self.frames.stray_limits(settings)
-        strays = StrayReset(settings.stray_reset_interval, limits, settings.stray_reset_share)
-        self.changes: dict[str, Change] = {
-            "strays": strays,
+        interval = settings.stray_reset_interval
+        self.hooks: dict[str, StepHook] = {
+            "outliers": OutlierReset(interval, limits, settings.stray_reset_share),
             "density": density_control(settings),
         }
         if settings.random_background:  # alpha is learned from masks
-            self.changes["outlines"] = OutlinePruning(capture, settings.seed, self.frames.moved)
-        self.changes["dust"] = DustPruning(capture)
+            self.hooks["outlines"] = OutlinePruning(capture, settings.seed, self.frames.moved)
+        self.hooks["floaters"] = FloaterPruning(capture)
         if self.strategy.region is None:
-            self.changes["unseen sides"] = SurfacePrior(self.frames)
+            self.hooks["unseen sides"] = SurfacePrior(self.frames)
 
     def __len__(self) -> int:
         """How many splats there are."""
@@ -197,7 +197,7 @@ class Trainer:
         splats = state.splats(averaged=True)
         along = self.frames.surface.filmed_along if splats.sh_degree == 0 else None
         if along is not None:
-            splats = plausible_aside(splats, along, self.frames.sides)
+            splats = plausible_off_axis(splats, along, self.frames.sides)
         return Avatar(
             splats=splats,
             convention=settings.convention,
@@ -213,21 +213,22 @@ class Trainer:
             filmed_along=along,
         ).with_limited_offsets
 
-    def prepare_turns(self) -> None:
-        """Find out now what the first turns of changes to the splats would find out once."""
-        for change in self.changes.values():
-            change.prepare()
+    def prepare_hooks(self) -> None:
+        """Find out now what the first calls of the hooks would find out once."""
+        for hook in self.hooks.values():
+            hook.prepare()
 
     def _post_step(self, progress: float) -> None:
-        """Change the splats after an optimizer step, where it is the turn of one of the changes."""
+        """Call the hooks that are due after an optimizer step."""
         before = self._progress
         if before is None:  # begun or resumed: as of steps that all take the same share
             before = progress * (1 - 1 / max(1, self.iteration - 1))
         self._progress = progress
-        turn = Turn(self.iteration, progress, self.initial_count, self.strategy.region, before)
-        for change in self.changes.values():
-            if is_turn_of(change, turn):
-                change.apply(self._backend, turn)
+        region = self.strategy.region
+        schedule = Schedule(self.iteration, progress, self.initial_count, region, before)
+        for hook in self.hooks.values():
+            if is_due(hook, schedule):
+                hook.apply(self._backend, schedule)
 
 
 def density_control(settings: TrainingSettings) -> DensityControl:

@@ -11,7 +11,7 @@ from ...avatar.splats import Splats, joined
 from ...capture.mesh_geometry import vertex_normals
 from ...flame.quaternions import from_matrices, unit
 from .frames import SKIN_DEPTH, FrameStore
-from .likeness import HeadCoordinates
+from .semantic_regions import HeadCoordinates
 
 STRAND_COSINE = -0.3
 """Of the angle between a triangle and the camera that it faces most, below which strands grow:

@@ -5,11 +5,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from ...avatar.embedding import MIN_DIVISOR, face_areas
-from ...avatar.splats import Splats, colored_aside
+from ...avatar.splats import Splats, colored_off_axis
 from ...capture.mesh_geometry import connected_parts
 from ...capture.model import Capture, View, evenly_spread, views_by_timestep
 from .initial_splats import mean_colors, mirror_images
-from .likeness import (
+from .semantic_regions import (
     BROWS_LEVEL,
     SMOOTHED,
     HeadCoordinates,
@@ -55,7 +55,7 @@ sharp."""
 SHOWN_COSINE = 0.5
 """Cosine between a triangle and the camera that it faces most above which its color depends on no
 view."""
-ASIDE_SHARE = 0.75
+OFF_AXIS_WEIGHT = 0.75
 """Fraction of the off-axis color at a right angle to the views."""
 
 
@@ -70,7 +70,7 @@ class UnseenSides:
     is_hair     (F,) bool: hair's triangles, where any is shown
     view_dependence  (F,) 0…1 of the color that views show: 1 in hair, for its sheen and strands,
                 more than 0 where a triangle turns away from all views
-    aside       (F, 3) in 0…1: the color from a right angle to the views
+    off_axis    (F, 3) in 0…1: the color from a right angle to the views
     """
 
     triangles: np.ndarray
@@ -78,7 +78,7 @@ class UnseenSides:
     color: np.ndarray
     is_hair: np.ndarray
     view_dependence: np.ndarray
-    aside: np.ndarray
+    off_axis: np.ndarray
 
 
 def unseen_sides(surface: Surface) -> UnseenSides:
@@ -103,7 +103,7 @@ def unseen_sides(surface: Surface) -> UnseenSides:
     centers = np.asarray(capture.neutral)[capture.faces].mean(1)
     found = _as_nearest(capture, color, sources, unseen | ~shown | surface.lids)
     turned = np.where(is_outside, surface.turned_from(SHOWN_COSINE), 0.0)
-    aside = color.copy()
+    off_axis = color.copy()
     turns_away = np.zeros_like(shown)
     hair = np.full(3, np.inf)
     is_hair = np.zeros_like(shown)
@@ -121,7 +121,7 @@ def unseen_sides(surface: Surface) -> UnseenSides:
                 own = hairy_triangles(own, centers, color, color[is_skin])
             if kind == "scalp" and len(own):
                 near = nearest_rows(centers[own], centers[members], SOURCE_TRIANGLES)
-                aside[members] = np.median(color[own[near]], axis=1)
+                off_axis[members] = np.median(color[own[near]], axis=1)
                 is_hair |= members
                 hair = np.median(color[own], axis=0)
             rows = np.flatnonzero(members & unseen)
@@ -138,18 +138,18 @@ def unseen_sides(surface: Surface) -> UnseenSides:
     found[lids] = of_skin
     shown[lids] = False
     triangles = (is_outside & (cosine < UNSEEN_COSINE)) | inside
-    aside = np.where((unseen | ~(shown | is_hair))[:, None], found, aside)
-    return UnseenSides(triangles, shown, found, is_hair, np.where(is_hair, 1.0, turned), aside)
+    off_axis = np.where((unseen | ~(shown | is_hair))[:, None], found, off_axis)
+    return UnseenSides(triangles, shown, found, is_hair, np.where(is_hair, 1.0, turned), off_axis)
 
 
-def plausible_aside(splats: Splats, along: np.ndarray, sides: UnseenSides) -> Splats:
+def plausible_off_axis(splats: Splats, along: np.ndarray, sides: UnseenSides) -> Splats:
     """Splats that views show along one direction only, that of their triangle (F, 3), with what is
-    plausible from aside: hair, and of the rest what lies on it, not what hangs before it."""
+    plausible off-axis: hair, and of the rest what lies on it, not what hangs before it."""
     face = splats.face
-    share = ASIDE_SHARE * sides.view_dependence[face]
+    share = OFF_AXIS_WEIGHT * sides.view_dependence[face]
     share[splats.unbound & ~sides.is_hair[face]] = 0
     share[sides.triangles[face]] = 0  # they have one color from everywhere, and hair its locks
-    return colored_aside(splats, along[face], share, sides.aside[face])
+    return colored_off_axis(splats, along[face], share, sides.off_axis[face])
 
 
 def _smoothed(color: np.ndarray, places: np.ndarray, smoothing: tuple[int, float]) -> np.ndarray:

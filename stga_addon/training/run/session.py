@@ -262,7 +262,7 @@ class _Session:
         # meanwhile, the splats are shown as they begin
         self._tell("Compiling kernels", longer=1.0)
         precompile_kernels(self.run.device)
-        self.trainer.prepare_turns()
+        self.trainer.prepare_hooks()
         lines = self.evaluator.lines
         self.began = perf_counter() - (lines[-1]["wall_s"] if lines else 0.0)
         if self._is_whole():

@@ -1,5 +1,5 @@
-"""An opaque layer behind the surface, so that nobody looks through a head from aside: images make
-its sides transparent where it is tracked too wide, and a torso may have a front only."""
+"""An opaque layer behind the surface, which off-axis views would look through: images make a head's
+sides transparent where it is tracked too wide, and a torso may have a front only."""
 
 from dataclasses import dataclass
 
@@ -11,7 +11,7 @@ from ...avatar.lattice import NORMAL_AXIS
 from ...capture.mesh_geometry import vertex_normals
 from ...capture.model import Capture
 from .initial_splats import voxel_size
-from .likeness import (
+from .semantic_regions import (
     CHIN_LEVEL,
     TORSO_HEIGHT,
     HeadCoordinates,
@@ -61,7 +61,7 @@ BACK_GAP_VOXELS = 1.5
 
 
 @dataclass(frozen=True)
-class Backing:
+class OcclusionLayer:
     """The layer behind some triangles.
 
     triangles  (F,) bool: those behind which it has a splat
@@ -74,38 +74,38 @@ class Backing:
     color: np.ndarray
 
 
-def backing_of(surface: Surface, sides: UnseenSides) -> Backing:
+def occlusion_layer(surface: Surface, sides: UnseenSides) -> OcclusionLayer:
     """Behind neck and clothes, and the outside of a head that few cameras see at a grazing angle or
     not at all, but for ears and the parts of the face: at the least depth that masks allow, in the
-    color from aside. Behind the front of a torso that has no back: a round one in the usual color
+    off-axis color. Behind the front of a torso that has no back: a round one in the usual color
     of its height."""
     capture = surface.capture
     faces = capture.faces
     neutral = np.asarray(capture.neutral, np.float64)
     at = surface.at
     if at is None or not surface.has_few_cameras:
-        return Backing(np.zeros(len(faces), bool), neutral, sides.aside)
+        return OcclusionLayer(np.zeros(len(faces), bool), neutral, sides.off_axis)
     front, back, usual = _back(surface, at, sides.color)
     of_back = np.zeros(len(neutral), bool)
     of_back[faces[front]] = True
     grazed, behind = _behind_sides(surface, at, ~of_back[faces].any(1))
     centers = neutral[faces].mean(1)
-    color = sides.aside.copy()
+    color = sides.off_axis.copy()
     color[front] = usual
     skin = np.flatnonzero(grazed & ~sides.is_hair)
     if len(skin):
         around = nearest_rows(centers[skin], centers[skin], SOURCE_TRIANGLES)
         color[skin] = np.median(color[skin][around], axis=1)
     places = np.where(of_back[:, None], back, behind)
-    return Backing(grazed | front, places, color)
+    return OcclusionLayer(grazed | front, places, color)
 
 
 def _behind_sides(
     surface: Surface, at: HeadCoordinates, allowed: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """One triangle in each cell, of those `allowed` (F,) bool that somebody may look through from
-    aside, as (F,) bool: what is `_grazed`; neck and clothes, as what a collar or a fold hides from
-    the cameras need not be opaque for them. The neutral vertices (V, 3), moved inside the head
+    """One triangle in each cell, of those `allowed` (F,) bool that an off-axis view may look
+    through, as (F,) bool: what is `_grazed`; neck and clothes, as what a collar or a fold hides
+    from the cameras need not be opaque for them. The neutral vertices (V, 3), moved inside the head
     until masks cover them."""
     faces = surface.capture.faces
     neutral = np.asarray(surface.capture.neutral, np.float64)

@@ -1,4 +1,4 @@
-"""Pruning of dust: unbound splats in the air that fill next to nothing of any image."""
+"""Pruning of floaters: unbound splats in the air that fill next to nothing of any image."""
 
 from dataclasses import dataclass
 from typing import ClassVar
@@ -7,7 +7,7 @@ import numpy as np
 
 from ...capture.model import Capture, evenly_spread
 from .backend import Backend
-from .change import Turn
+from .step_hook import Schedule
 
 MIN_WEIGHT_PX = 0.5
 """An unbound splat that fills less than this in every view serves the rays of a few pixels, and
@@ -15,8 +15,8 @@ floats in the air for all other cameras."""
 MIN_WEIGHT_SHARE = 0.4
 """The same limit as a fraction of the median of unbound splats, which fill much after a short
 training."""
-TURNS = (0.6, 0.8)
-"""Shares of the budget at which splats are weighed; what is trained afterwards fills in."""
+PRUNING_TIMES = (0.6, 0.8)
+"""Fractions of the budget at which splats are measured; what is trained afterwards fills in."""
 MAX_WEIGHED_VIEWS = 40
 """Training views, spread over all, in which splats are measured, at most."""
 WEIGHED_SHARE = 0.03
@@ -24,30 +24,30 @@ WEIGHED_SHARE = 0.03
 
 
 @dataclass(frozen=True)
-class DustPruning:
+class FloaterPruning:
     """Prunes unbound splats by what they do: the largest sum of a splat's blend weights in any one
-    view. Neither opacity nor density tells dust from the faint rim of hair."""
+    view. Neither opacity nor density tells floaters from the faint rim of hair."""
 
     capture: Capture
-    interval: ClassVar[int] = 1  # turns are told by the share of the budget
+    interval: ClassVar[int] = 1  # it goes by the fraction of the budget
 
     def prepare(self) -> None:
         """Nothing is found out once."""
 
-    def apply(self, backend: Backend, turn: Turn) -> None:
-        if not any(map(turn.passes, TURNS)):
+    def apply(self, backend: Backend, schedule: Schedule) -> None:
+        if not any(map(schedule.passes, PRUNING_TIMES)):
             return
         columns = backend.columns(("face", "unbound"))
         weighed = columns["unbound"]
-        if turn.region is not None:
-            weighed = weighed & turn.region[columns["face"]]
+        if schedule.region is not None:
+            weighed = weighed & schedule.region[columns["face"]]
         if not weighed.any():
             return
-        iterations = turn.iteration / turn.progress
+        iterations = schedule.iteration / schedule.progress
         count = min(MAX_WEIGHED_VIEWS, max(1, round(WEIGHED_SHARE * iterations)))
         views = evenly_spread(self.capture.views["train"], count)
         weight = np.max([backend.blend_weights(view) for view in views], axis=0)
         usual = np.median(weight[columns["unbound"]])
-        dust = weighed & (weight < max(MIN_WEIGHT_PX, MIN_WEIGHT_SHARE * usual))
-        if dust.any():
-            backend.keep(~dust)
+        floaters = weighed & (weight < max(MIN_WEIGHT_PX, MIN_WEIGHT_SHARE * usual))
+        if floaters.any():
+            backend.keep(~floaters)
