@@ -64,7 +64,7 @@ class DriveSettings(bpy.types.PropertyGroup, MotionProperties):
         "alone; 0.0.0.0: from every computer and phone of the network",
         default=LOOPBACK,
     )
-    port: options.integer("Port", "UDP port; 0: the source's usual one", min=0, max=MAX_PORT)
+    port: options.integer("Port", "UDP port; 0: the source's standard one", min=0, max=MAX_PORT)
     phone: options.text("Phone", "IP address that the app on the phone shows", default=LOOPBACK)
     smoothing: options.number(
         "Smoothing",

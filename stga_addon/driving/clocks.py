@@ -17,7 +17,7 @@ TIMECODE = re.compile(
 """Also behind a date, as in ISO 8601; hours may be missing."""
 BASES = (24, 25, 30, 48, 50, 60, 100, 120, 240)
 """Frames per second that timecodes count."""
-USUAL_BASE = 60
+TYPICAL_BASE = 60
 """Base of a take of less than a second, whose frame numbers do not tell it."""
 DAY_S = 86_400.0
 
@@ -63,7 +63,7 @@ MAX_ROWS_PER_S = 250.0
 MAX_FRAME_STEP = 4  # Between rows that are numbered by frames of `DEFAULT_FPS`
 DEFAULT_FPS = 60.0  # Of files that hold neither times nor a rate: ARKit's own
 RATES = tuple(sorted({rate * share for rate in (10, 12, 15, *BASES) for share in (1, DROP_RATIO)}))
-MAX_RATE_DIFFERENCE = 0.02  # Of a usual rate from that of the times, relative
+MAX_RATE_DIFFERENCE = 0.02  # Of a standard rate from that of the times, relative
 GRID_TOLERANCE = 0.1  # Of a row's distance, within which all rows come evenly
 LONG_STEP = 1.5  # Times the median, above which rows are missing between two
 
@@ -307,7 +307,7 @@ def _seconds_of_frames(
     possible = [base for base in BASES if base > (frames + parts).max()] or [
         10 ** len(str(int(frames.max())))
     ]
-    base = USUAL_BASE if USUAL_BASE in possible else possible[0]
+    base = TYPICAL_BASE if TYPICAL_BASE in possible else possible[0]
     if len(np.unique(second)) > 1:
         base = min(possible, key=lambda base: _unevenness(second + (frames + parts) / base))
     if not is_dropping:
@@ -327,13 +327,13 @@ def evened(times: np.ndarray) -> tuple[np.ndarray, float]:
     """Ascending times (T,) from 0, and how many rows a second there are where none is missing.
 
     Where rows come evenly but for rounding, as whole milliseconds are, times are those of even
-    rows, at a usual rate where that agrees as well.
+    rows, at a standard rate where that agrees as well.
     """
     if len(times) < 2:
         return times, DEFAULT_FPS
     steps = np.diff(times)
-    usual = steps[steps <= LONG_STEP * np.median(steps)]
-    mean = 1 / float(usual.mean())
+    typical = steps[steps <= LONG_STEP * np.median(steps)]
+    mean = 1 / float(typical.mean())
     near = [rate for rate in RATES if abs(rate / mean - 1) < MAX_RATE_DIFFERENCE]
     for rate in (*sorted(near, key=lambda own: abs(own - mean)), mean):
         rows = np.round(times * rate)

@@ -27,7 +27,7 @@ Decoded = tuple[FacePacket | None, Any]
 class Source:
     """A protocol on UDP.
 
-    port     usual port
+    port     standard port
     decode   datagram and what is known of its sender (None at first) -> `Decoded`; None for bytes
              of another kind
     request  what is sent to the phone to make it send, on the same port; b"" for sources that send
@@ -89,7 +89,7 @@ class Receiver:
     def __init__(
         self, source: Source, address: str = LOOPBACK, port: int = 0, phone: str = ""
     ) -> None:
-        """Listen on `address` and `port` (0: the usual one); phone: whom a source with a request
+        """Listen on `address` and `port` (0: the standard one); phone: whom a source with a request
         asks. Raises StgaError for no address, or a port that cannot be opened."""
         self.source = source
         self.port = port or source.port
@@ -284,7 +284,7 @@ RESTING_PACKETS = 15
 MIN_STEP_S = 2 / MAX_FPS
 """Time between rows: a file's times are rounded, and rows at MAX_FPS could be refused."""
 MAX_LEAD_S = 5.0
-"""By which a source's clock may be ahead of the packets' arrival: a usual socket keeps packets for
+"""By which a source's clock may be ahead of the packets' arrival: a socket keeps packets for
 4 s while Blender is busy. Beyond it, the clock was set, or is another's."""
 
 

@@ -139,8 +139,8 @@ def fit_drift(samples: Samples, color: np.ndarray) -> np.ndarray:
     for _ in range(CAMERA_FIT_ITERATIONS):
         mean = np.where(known, _mean(color / gain[:, None]), 0)
         gain = (np.where(known, color * mean, 0).sum(1) + prior) / ((mean**2).sum(1) + prior)
-        usual = np.stack([gain[row == camera].mean(0) for camera in range(row.max() + 1)])
-        gain /= usual[row]
+        mean = np.stack([gain[row == camera].mean(0) for camera in range(row.max() + 1)])
+        gain /= mean[row]
     return gain
 
 

@@ -47,7 +47,7 @@ class FloaterPruning:
         count = min(MAX_WEIGHED_VIEWS, max(1, round(WEIGHED_SHARE * iterations)))
         views = evenly_spread(self.capture.views["train"], count)
         weight = np.max([backend.blend_weights(view) for view in views], axis=0)
-        usual = np.median(weight[columns["unbound"]])
-        floaters = weighed & (weight < max(MIN_WEIGHT_PX, MIN_WEIGHT_SHARE * usual))
+        median = np.median(weight[columns["unbound"]])
+        floaters = weighed & (weight < max(MIN_WEIGHT_PX, MIN_WEIGHT_SHARE * median))
         if floaters.any():
             backend.keep(~floaters)

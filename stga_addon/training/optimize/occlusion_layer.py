@@ -77,7 +77,7 @@ class OcclusionLayer:
 def occlusion_layer(surface: Surface, sides: UnseenSides) -> OcclusionLayer:
     """Behind neck and clothes, and the outside of a head that few cameras see at a grazing angle or
     not at all, but for ears and the parts of the face: at the least depth that masks allow, in the
-    off-axis color. Behind the front of a torso that has no back: a round one in the usual color
+    off-axis color. Behind the front of a torso that has no back: a round one in the median color
     of its height."""
     capture = surface.capture
     faces = capture.faces
@@ -85,13 +85,13 @@ def occlusion_layer(surface: Surface, sides: UnseenSides) -> OcclusionLayer:
     at = surface.at
     if at is None or not surface.has_few_cameras:
         return OcclusionLayer(np.zeros(len(faces), bool), neutral, sides.off_axis)
-    front, back, usual = _back(surface, at, sides.color)
+    front, back, median_color = _back(surface, at, sides.color)
     of_back = np.zeros(len(neutral), bool)
     of_back[faces[front]] = True
     grazed, behind = _behind_sides(surface, at, ~of_back[faces].any(1))
     centers = neutral[faces].mean(1)
     color = sides.off_axis.copy()
-    color[front] = usual
+    color[front] = median_color
     skin = np.flatnonzero(grazed & ~sides.is_hair)
     if len(skin):
         around = nearest_rows(centers[skin], centers[skin], SOURCE_TRIANGLES)
@@ -189,7 +189,7 @@ def _back(
     front = _open_front(surface, at)
     if not front.any():
         return front, neutral, color[front]
-    places, usual = _round_back(surface.capture, at, front, color)
+    places, median_color = _round_back(surface.capture, at, front, color)
     rows = np.flatnonzero(front)
     turned = face_frames(neutral, faces, neutral, "stga").rotation[rows]
     there = face_frames(places, faces, places, "stga")
@@ -203,7 +203,7 @@ def _back(
     fits = ~surface.beside_masks(rows, offsets[:, :1], -BACK_MARGIN_SHARE)[:, 0]
     fits &= ~surface.beside_masks(rows, offsets[:, 1:]).any(1)
     front[rows] = fits
-    return front, places, usual[fits]
+    return front, places, median_color[fits]
 
 
 def _round_back(
@@ -228,5 +228,5 @@ def _round_back(
         behind[row] = BACK_SHARE * half * np.sqrt(1 - beside**2)
     behind += BACK_GAP_VOXELS * voxel_size(places)
     places[vertices] -= behind[:, None] * ahead
-    usual = [np.median(color[front][abs(level - y) < reach_m], axis=0) for y in level]
-    return places, np.array(usual)
+    median_color = [np.median(color[front][abs(level - y) < reach_m], axis=0) for y in level]
+    return places, np.array(median_color)

@@ -200,9 +200,9 @@ def hairy_triangles(
     shades (K, 3) do; all where no skin is known."""
     if not len(sources) or not len(skin):
         return sources
-    usual = np.median(skin, axis=0)
-    shades = (skin - usual).T @ (skin - usual) / len(skin) + LEAST_SHADE**2 * np.eye(3)
-    away = color[sources] - usual
+    median = np.median(skin, axis=0)
+    shades = (skin - median).T @ (skin - median) / len(skin) + LEAST_SHADE**2 * np.eye(3)
+    away = color[sources] - median
     contrast = np.sqrt((away * np.linalg.solve(shades, away.T).T).sum(1))
     near = nearest_rows(centers[sources], centers[sources], SMOOTHED)
     contrast = np.quantile(contrast[near], 0.1, axis=1)

@@ -336,8 +336,8 @@ class Surface:
             share = hanging_share(self.at)
             hanging = self._scalp & (share > 0)
             growing = self._scalp & ~hanging
-            usual = np.median(height[growing]) if growing.any() else 0.0
-            height[hanging] = usual + share[hanging] * (HANGING_HEIGHT * self.at.unit - usual)
+            median = np.median(height[growing]) if growing.any() else 0.0
+            height[hanging] = median + share[hanging] * (HANGING_HEIGHT * self.at.unit - median)
         # one side's hair may be higher than the other's, which it is mirrored from
         offsets = np.zeros((len(scalp), HEIGHTS + 1, 3))
         offsets[:, :, NORMAL_AXIS["stga"]] = height[scalp, None] * np.linspace(1, 0, HEIGHTS + 1)

@@ -116,8 +116,8 @@ class SurfacePrior:
         if not len(bound):
             return
         well_seen = is_bound & (self._surface.facing > WELL_SEEN_COSINE)[where["face"]]
-        usual = np.flatnonzero(well_seen if well_seen.any() else is_bound)
-        moments = backend.columns(MOMENTS, usual)
+        reference = np.flatnonzero(well_seen if well_seen.any() else is_bound)
+        moments = backend.columns(MOMENTS, reference)
         columns = backend.columns(PULLED_COLUMNS, bound)
         is_inner = self._is_inner(columns)
         self._pull_colors(backend, bound, columns, moments["second/color"], is_inner)
@@ -134,12 +134,12 @@ class SurfacePrior:
         backend: Backend,
         bound: np.ndarray,
         columns: Mapping[str, np.ndarray],
-        usual: np.ndarray,
+        reference: np.ndarray,
         is_inner: np.ndarray,
     ) -> None:
         sides = self._frames.sides
         face = columns["face"]
-        share = doubt(columns["second/color"], usual) * ~sides.shown[face]
+        share = doubt(columns["second/color"], reference) * ~sides.shown[face]
         # the avatar is made of averages, which only steps move
         is_untouched = ~sides.shown[face] & ~columns["second/color"].any(1)
         # of a lid, the edge of a fold is seen, in the fold's shade
@@ -167,10 +167,10 @@ class SurfacePrior:
         backend: Backend,
         bound: np.ndarray,
         columns: Mapping[str, np.ndarray],
-        usual: np.ndarray,
+        reference: np.ndarray,
     ) -> None:
         face = columns["face"]
-        share = doubt(columns["second/opacity"][:, None], usual[:, None])
+        share = doubt(columns["second/opacity"][:, None], reference[:, None])
         surface = self._surface
         turned_away = np.where(surface.sticks_out, 0, surface.turned_away)
         share = (share * turned_away[face]) ** 2  # little of what outlines show
@@ -193,11 +193,11 @@ class SurfacePrior:
         backend: Backend,
         bound: np.ndarray,
         columns: Mapping[str, np.ndarray],
-        usual: Mapping[str, np.ndarray],
+        reference: Mapping[str, np.ndarray],
     ) -> None:
         """Where gradients are below DOUBT times those of well seen splats, Adam moves and shapes
         splats by steps that are as much shorter: a layer that hardly shows would get holes."""
-        least = {name: DOUBT**2 * np.median(usual[name].mean(1)) for name in GEOMETRY_MOMENTS}
+        least = {name: DOUBT**2 * np.median(reference[name].mean(1)) for name in GEOMETRY_MOMENTS}
         moments = {name: np.maximum(columns[name], least[name]) for name in GEOMETRY_MOMENTS}
         backend.assign(bound, moments)
 
@@ -347,11 +347,11 @@ class SurfacePrior:
         return is_inner
 
 
-def doubt(second: np.ndarray, usual: np.ndarray) -> np.ndarray:
+def doubt(second: np.ndarray, reference: np.ndarray) -> np.ndarray:
     """Share (N,) in 0…1 of what is plausible: 1 where views tell nothing, a half where gradients
-    are DOUBT times those of well seen splats. second (N, C): Adam's moments; usual (M, C): those
-    of well seen splats."""
-    little = DOUBT * np.median(np.sqrt(usual.mean(1))) + np.finfo(np.float32).tiny
+    are DOUBT times those of well observed splats. second (N, C): Adam's moments; reference (M, C):
+    those of well observed splats."""
+    little = DOUBT * np.median(np.sqrt(reference.mean(1))) + np.finfo(np.float32).tiny
     return np.asarray(little / (little + np.sqrt(second.mean(1))), np.float32)
 
 

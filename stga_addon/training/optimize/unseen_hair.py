@@ -141,7 +141,7 @@ class UnseenHair:
         return -SKIN_DEPTH * self._frames.units
 
     def shades(self, face: np.ndarray, xyz: np.ndarray) -> np.ndarray:
-        """(N,) brightness of hair at places (N, 3) on triangles, as a multiple of the usual one."""
+        """(N,) brightness of hair at places (N, 3) on triangles, relative to the typical one."""
         return lock_shades(self._at, points_to_world(xyz, self._frames.neutral, face))
 
     @property
@@ -175,7 +175,7 @@ def growth(at: HeadCoordinates, places: np.ndarray, normals: np.ndarray) -> np.n
 
 
 def lock_shades(at: HeadCoordinates, places: np.ndarray) -> np.ndarray:
-    """(N,) brightness of hair at places (N, 3), as a multiple of the usual one: locks, which reach
+    """(N,) brightness of hair at places (N, 3), relative to the typical one: locks, which reach
     from the crown down, have their own, that changes slowly along them."""
     crown = _crown(at)
     across = at.axes[0]

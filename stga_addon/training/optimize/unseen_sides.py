@@ -39,7 +39,8 @@ FRINGE_COSINE = 0.2
 FRINGE_SHARE = 0.2
 """Of what is shown above the brows, the highest, where hair is if there is any."""
 MIN_SHOWN_SHARE = 0.1
-"""Of the pixels that usually show as much of the surface: a folded eyelid has less."""
+"""Fraction of the median of the pixels that show as much of the surface, below which it is not
+visible: a folded eyelid has less."""
 SOURCE_TRIANGLES = 100
 """Of whose colors a hidden triangle has the median."""
 MAX_LIGHT_RATIO = 2.0
@@ -92,8 +93,8 @@ def unseen_sides(surface: Surface) -> UnseenSides:
     color, pixels = mean_colors(capture, _color_views(capture))
     density = pixels / np.maximum(face_areas(capture.neutral, capture.faces), MIN_DIVISOR)
     facing = density[cosine > SOURCE_COSINE]
-    usual = np.median(facing[facing > 0]) if facing.any() else 0.0
-    shown = density > MIN_SHOWN_SHARE * usual
+    median = np.median(facing[facing > 0]) if facing.any() else 0.0
+    shown = density > MIN_SHOWN_SHARE * median
     is_source = (pixels > 0) & is_outside & (cosine > SOURCE_COSINE) & ~surface.lids
     sources = np.flatnonzero(is_source)
     if not len(sources):
@@ -215,7 +216,7 @@ def _mirrored_colors(
 def _lid_colors(
     surface: Surface, is_source: np.ndarray, color: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Lids (M,) that stay in their folds, which are in the shade, and the usual color (M, 3) of the
+    """Lids (M,) that stay in their folds, which are in the shade, and the median color (M, 3) of
     skin in their half of the face; none where no skin is shown there."""
     found = np.full(color.shape, np.nan)
     at = surface.at

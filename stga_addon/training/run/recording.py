@@ -202,11 +202,11 @@ def _fit_rotation(run: Path, root: Path) -> np.ndarray | None:
     stored = read_run(run)
     capture = open_capture(root, stored.flame)
     cameras = cameras_of(capture)
-    usual = cameras_of(open_run(run).capture)
-    if set(cameras) != set(usual):
+    trained = cameras_of(open_run(run).capture)
+    if set(cameras) != set(trained):
         return None
     rotations = [
-        usual[index].world_to_camera[:3, :3].T @ camera.world_to_camera[:3, :3]
+        trained[index].world_to_camera[:3, :3].T @ camera.world_to_camera[:3, :3]
         for index, camera in cameras.items()
     ]
     rotation = Rotation.from_matrix(rotations).mean().as_matrix()
@@ -268,20 +268,20 @@ def _light(avatar: Avatar, settings: TrainingSettings, capture: Capture) -> Ligh
     lit = []
     for chosen, pixels in _colors_by_camera(avatar, settings, capture):
         drawn, seen, normals = (np.concatenate(side, 1) for side in zip(*pixels, strict=True))
-        usual = fit_exposure(drawn, seen)
+        overall = fit_exposure(drawn, seen)
         for view, (own_drawn, own_seen, _) in zip(chosen, pixels, strict=True):
-            own = fit_exposure(own_drawn, own_seen, usual, CAMERA_WEIGHT)
+            own = fit_exposure(own_drawn, own_seen, overall, CAMERA_WEIGHT)
             scaled = own * np.array([[1.0], [255.0]])
             rows.append((float(view.camera_index), *scaled.ravel().tolist(), float(view.timestep)))
-        lit.append((drawn, (seen - usual[1][:, None]) / usual[0][:, None], normals))
+        lit.append((drawn, (seen - overall[1][:, None]) / overall[0][:, None], normals))
     return tuple(rows), _fit_shading(*(np.concatenate(side, 1) for side in zip(*lit, strict=True)))
 
 
 def _fit_shading(drawn: np.ndarray, seen: np.ndarray, normals: np.ndarray) -> np.ndarray:
     """Harmonics (9, 3) by the normal (3, N) of a factor from colors (3, N) to those seen."""
     by_normal = basis(normals.T)
-    usual = uniform(1.0)
-    found = usual.copy()
+    even = uniform(1.0)
+    found = even.copy()
     for _ in range(SHADING_ITERATIONS):
         for channel, (x, y) in enumerate(zip(drawn, seen, strict=True)):
             residual = y - x * (by_normal @ found[:, channel])
@@ -289,7 +289,7 @@ def _fit_shading(drawn: np.ndarray, seen: np.ndarray, normals: np.ndarray) -> np
             system = by_normal * x[:, None]
             prior = SHADING_PRIOR * (weight @ x**2 + 1e-9)
             matrix = (weight * system.T) @ system + prior * np.eye(len(found))
-            right = system.T @ (weight * y) + prior * usual[:, channel]
+            right = system.T @ (weight * y) + prior * even[:, channel]
             found[:, channel] = np.linalg.solve(matrix, right)
     return found
 
