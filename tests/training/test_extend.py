@@ -116,7 +116,7 @@ def test_a_take_of_the_back_replaces_what_was_plausible(tmp_path):
     capture = open_capture(front)
     run = run_of(capture, iterations=60, lattice=1, density_interval=0)
     train_run(capture, tmp_path / "run", run)
-    extend(tmp_path / "run", back, tmp_path / "extended", iterations=90)
+    extend(tmp_path / "run", back, tmp_path / "extended", iterations=150)
     before, after = (read_avatar(tmp_path / name / "avatar.npz") for name in ("run", "extended"))
     height = capture.neutral[capture.faces].mean(1)[:, 2] / factory.RADIUS
     assert before.regions["unseen"][height < -0.2].all()

@@ -98,28 +98,28 @@ def test_after_a_short_training(usual, toy):
     assert_array_equal(kept, (weight > 0.6) | (usual < 5))
 
 
-def test_a_turn_comes_once(toy):
+def test_a_pruning_comes_once(toy):
     """Catches a look that is missed or made twice where steps take different shares of the budget,
     or where a run is resumed between two steps."""
     shares = np.cumsum(np.random.default_rng(0).uniform(0.001, 0.05, 60))
     shares = shares[shares < 1]
     begun = Trainer(toy, quick_settings("global", lattice=0), {})
     trainer = copy(begun)
-    turns = []
-    changes = {"all": SimpleNamespace(interval=1, apply=lambda _, turn: turns.append(turn))}
-    trainer.hooks = changes
+    calls = []
+    hooks = {"all": SimpleNamespace(interval=1, apply=lambda _, schedule: calls.append(schedule))}
+    trainer.hooks = hooks
     for share in shares:
         trainer.iteration += 1
         trainer._post_step(share)
-    assert sum(turn.passes(0.6) for turn in turns) == 1
+    assert sum(schedule.passes(0.6) for schedule in calls) == 1
     steps = [n / 50 for n in range(50)]
     for stop in (1, 12, 29, 30, 31, 48):
-        turns.clear()
+        calls.clear()
         for part in (steps[:stop], steps[stop:]):
             resumed = copy(begun)
             resumed.iteration = 0 if part[0] == 0 else stop
-            resumed.changes = changes
+            resumed.hooks = hooks
             for share in part:
                 resumed.iteration += 1
                 resumed._post_step(share)
-        assert [n for n, turn in enumerate(turns) if turn.passes(0.6)] == [30]
+        assert [n for n, schedule in enumerate(calls) if schedule.passes(0.6)] == [30]
