@@ -40,6 +40,7 @@ MODULES = (
     export,
 )
 PICK = "stga.pick_avatar"
+
 KEYS = (
     ("Pose", "EMPTY", "stga.turn_jaw", "R", "PRESS", False),
     ("3D View", "VIEW_3D", "stga.stop_live", "ESC", "PRESS", False),

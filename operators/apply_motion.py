@@ -48,22 +48,38 @@ def _gain_property(part: str, what: str) -> Any:
     return options.number(f"{part} Gain", about, default=1.0, soft_max=2.0, options=ONCE, **limits)
 
 
-def exchange_property(pair: str, **more: Any) -> Any:
+def _exchange_property(pair: str) -> Any:
     """Whether left and right of a pair of shapes (`EXCHANGEABLE`) are exchanged."""
     what = f"exchange {pair}Left and {pair}Right, which some senders exchange"
     name = f"Exchange {pair.capitalize()} Sides"
-    return options.boolean(name, f"Of a face performance: {what}", **more)
+    return options.boolean(name, f"Of a face performance: {what}", options=ONCE)
 
 
-def stay_trained_property(**more: Any) -> Any:
-    """How far a motion is led back to the trained range."""
-    about = "Lead expression, jaw and eyes softly back to the range of the head's own recording"
-    return options.number("Stay Trained", f"{about}; 1: fully", min=0.0, max=1.0, **more)
+class MotionProperties:
+    """Mixin: the `MotionOptions` that files, takes and live sources have in Blender."""
+
+    strength: options.field(MotionOptions, "strength", soft_max=2.0, options=ONCE)
+    stay_trained: options.number(
+        "Stay Trained",
+        "Lead expression, jaw and eyes softly back to the range of the head's own recording; "
+        "1: fully",
+        min=0.0,
+        max=1.0,
+        options=ONCE,
+    )
+    smoothing: options.field(MotionOptions, "smoothing", soft_max=0.2, options=ONCE)
+    mirror: options.field(MotionOptions, "mirror", options=ONCE)
+    exchange_jaw: _exchange_property("jaw")
+    exchange_mouth: _exchange_property("mouth")
+
+    def motion_options(self: Any, neutral: str, **more: Any) -> MotionOptions:
+        pairs = tuple(pair for pair in EXCHANGEABLE if getattr(self, f"exchange_{pair}"))
+        chosen = {name: getattr(self, name) for name in TAKEN_OVER}
+        return MotionOptions(neutral=neutral, exchange=pairs, **chosen, **more)
 
 
-def exchanged_pairs(options: Any) -> tuple[str, ...]:
-    """The pairs that an owner of `exchange_property`s exchanges."""
-    return tuple(pair for pair in EXCHANGEABLE if getattr(options, f"exchange_{pair}"))
+TAKEN_OVER = ("strength", "stay_trained", "smoothing", "mirror")
+"""Options of driving live that its takes are applied with; their sides are exchanged already."""
 
 
 def own_range(head: Any, own: FlameSequence) -> TrainedRange:
@@ -82,7 +98,7 @@ def _performer(settings: Any, name: str) -> Any:
     return next((thing for thing in named if thing != settings.head), next(iter(named), None))
 
 
-class ApplyMotion(Edit, bpy.types.Operator, FileImport):
+class ApplyMotion(Edit, bpy.types.Operator, FileImport, MotionProperties):
     """Animate this head with the expressions and pose of another person; its earlier animation is
     kept"""
 
@@ -105,7 +121,6 @@ class ApplyMotion(Edit, bpy.types.Operator, FileImport):
     eyes: _part_property("Eyes", "the rotation of the eyes")
     neck: _part_property("Neck", "the rotation of the neck")
     head: _part_property("Head", "the rotation and translation of the whole head")
-    strength: options.field(MotionOptions, "strength", soft_max=2.0, options=ONCE)
     own_offsets: options.boolean(
         "Own Offsets",
         "The motion is this head's own, refined by training: keep its tracked "
@@ -116,9 +131,6 @@ class ApplyMotion(Edit, bpy.types.Operator, FileImport):
         "Start Frame", "Frame of the first keyframe", default=1, min=0, options=ONCE
     )
     neutral: options.field(MotionOptions, "neutral", labels=NEUTRAL_LABELS, options=ONCE)
-    stay_trained: stay_trained_property(options=ONCE)
-    smoothing: options.field(MotionOptions, "smoothing", soft_max=0.2, options=ONCE)
-    mirror: options.field(MotionOptions, "mirror", options=ONCE)
     face_gain: _gain_property("Face Shapes", "the face's shapes")
     jaw_gain: _gain_property("Jaw", "the jaw's shapes")
     eyes_gain: _gain_property("Eyes", "the gaze")
@@ -129,8 +141,6 @@ class ApplyMotion(Edit, bpy.types.Operator, FileImport):
         "their part's, such as jawOpen=0.8 cheekPuff=0",
         options=ONCE,
     )
-    exchange_jaw: exchange_property("jaw", options=ONCE)
-    exchange_mouth: exchange_property("mouth", options=ONCE)
     sliders: options.boolean(
         "Face Sliders",
         "Of a face performance: keyframe the sliders that are named as its shapes, "
@@ -185,7 +195,8 @@ class ApplyMotion(Edit, bpy.types.Operator, FileImport):
         column = self.layout.column()
         column.use_property_split = True
         names = list(ApplyMotion.__annotations__)
-        others = names[names.index("expression") : names.index("filter_glob")]
+        shared = MotionProperties.__annotations__
+        others = [*shared, *names[names.index("expression") : names.index("filter_glob")]]
         for name in FIRST_OPTIONS:
             column.prop(self, name)
         arrow = "DISCLOSURE_TRI_DOWN" if self.is_open else "DISCLOSURE_TRI_RIGHT"
@@ -309,8 +320,7 @@ class ApplyMotion(Edit, bpy.types.Operator, FileImport):
         gains = {part: getattr(self, f"{part}_gain") for part in PART_OF_SHAPES}
         given = self.shape_gains.replace(",", " ").split()
         gains |= dict(map(open_motion.parsed_gain, given))
-        shared = (self.strength, self.neutral, self.smoothing, self.mirror)
-        return MotionOptions(*shared, gains, self.stay_trained, exchanged_pairs(self))
+        return self.motion_options(self.neutral, gains=gains)
 
     def _trained(self, head: Any) -> TrainedRange | None:
         """The range of the head's own recording, where it is asked for."""

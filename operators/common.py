@@ -25,14 +25,16 @@ from ..stga_addon.schema import alternatives, type_hints
 from . import options
 from .options import ONCE
 
-TAB = "STGA"  # of the 3D viewport's sidebar
+TAB = "STGA"
+"""Tab of the 3D viewport's sidebar."""
 MAX_REPORT_CHARACTERS = 90
-"""Of what popup and status bar show of a report."""
+"""Length of what popup and status bar show of a report."""
 UNSAVED = "has not been saved yet"
 """In messages that saving the file makes void."""
 PARENT_FOLDERS = re.compile(r"(?:[A-Za-z]:)?[\\/](?:[^\\/:;,()]+[\\/])+")
 
 Poll = Callable[[Any, Any], bool]
+
 AtEnd = Callable[..., Any]
 """`ExitStack.callback` of the extension: takes a function, with its arguments, that undoes what was
 just registered."""

@@ -31,7 +31,7 @@ from ..stga_addon.scene.record import capture_of, stored_path
 from ..stga_addon.scene.rig.motion import LivePose, stored_range
 from ..stga_addon.training.run.folder import has_run, read_run
 from . import common, options, timers
-from .apply_motion import exchange_property, exchanged_pairs, own_range, stay_trained_property
+from .apply_motion import TAKEN_OVER, MotionProperties, own_range
 from .common import Action, Edit, FileImport, file_path, head_of, need, own_motion, rig_or_none
 from .options import ONCE
 from .request import idle, start
@@ -41,15 +41,16 @@ from .windows import redraw
 MAX_PORT = 65535
 TICK_S = 1 / 60
 MIN_WAIT_S = 0.001
+
 PANEL_INTERVAL_S = 0.2
-"""At which the panel's figures are drawn anew."""
+"""Interval at which the panel's figures are drawn anew."""
 SLOWEST_TICKS = 600
-"""Those of the last ten seconds."""
+"""Ticks of the last ten seconds, of which the panel shows the slowest."""
 LEFT_TAKES = "stga_takes"
 """Folder beside other temporary files for takes that have no other place as a session ends."""
 
 
-class DriveSettings(bpy.types.PropertyGroup):
+class DriveSettings(bpy.types.PropertyGroup, MotionProperties):
     """What the panel stores about driving live."""
 
     source: options.choice(
@@ -63,9 +64,8 @@ class DriveSettings(bpy.types.PropertyGroup):
         "alone; 0.0.0.0: from every computer and phone of the network",
         default=LOOPBACK,
     )
-    port: options.integer("Port", "UDP port; 0: the source's usual one", min=0, max=MAX_PORT)
+    port: options.integer("Port", "UDP port; 0: the source's standard one", min=0, max=MAX_PORT)
     phone: options.text("Phone", "IP address that the app on the phone shows", default=LOOPBACK)
-    strength: options.field(MotionOptions, "strength", soft_max=2.0)
     smoothing: options.number(
         "Smoothing",
         "Time constant in seconds; the head follows later by as much",
@@ -73,10 +73,6 @@ class DriveSettings(bpy.types.PropertyGroup):
         soft_max=0.2,
         max=open_motion.MAX_SMOOTHING_S,
     )
-    stay_trained: stay_trained_property()
-    mirror: options.field(MotionOptions, "mirror")
-    exchange_jaw: exchange_property("jaw")
-    exchange_mouth: exchange_property("mouth")
     takes: options.path(
         "Takes",
         "Folder for recorded takes (CSV); one that begins with // lies beside the .blend file",
@@ -188,11 +184,8 @@ class LiveSession:
 
     def options(self) -> MotionOptions:
         """The panel's; the resting face is taken off where it is calibrated."""
-        settings = self.scene.get().stga.drive
-        names = ("strength", "smoothing", "mirror", "stay_trained")
-        chosen = {name: getattr(settings, name) for name in names}
-        neutral = "none" if self.rest is None else "calibrated"
-        return MotionOptions(neutral=neutral, exchange=exchanged_pairs(settings), **chosen)
+        options: MotionOptions = self.scene.get().stga.drive.motion_options(_neutral(self.rest))
+        return options
 
     def write_take(self, folder: Path) -> Path:
         """Write what is being recorded as the next take in the folder, and record no more. Raises
@@ -270,15 +263,19 @@ class LiveSession:
         scene = self.scene.get()
         if scene.stga.head != self._pose.head.get():
             raise StgaError("the panel holds another head than the one that was driven")
-        names = ("strength", "smoothing", "mirror", "stay_trained")
-        chosen = {name: getattr(scene.stga.drive, name) for name in names}
-        chosen["neutral"] = "none" if recording.rest is None else "calibrated"
+        chosen = {name: getattr(scene.stga.drive, name) for name in TAKEN_OVER}
+        chosen["neutral"] = _neutral(recording.rest)
         place = {} if bpy.context.scene == scene else {"scene": scene}
         with bpy.context.temp_override(**place):
             apply = bpy.ops.stga.apply_motion
             undoable = bpy.context.window is not None
             start = recording.start
             common.call(apply, "EXEC_DEFAULT", undoable, filepath=str(path), start=start, **chosen)
+
+
+def _neutral(rest: Performance | None) -> str:
+    """What a performance is relative to whose resting face was calibrated, or was not (None)."""
+    return "none" if rest is None else "calibrated"
 
 
 _session: LiveSession | None = None

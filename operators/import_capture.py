@@ -59,6 +59,7 @@ FOLDERS_ABOVE_FILE = 3
 DEMO = Path(__file__).parents[1] / "demo_capture"
 """In the complete edition; the others have none."""
 DEMO_MINUTES = 1.0
+
 USER_AVATARS = "stga_avatars"
 """Folder among Blender's user files for the parts of avatars from folders that are read-only."""
 SOURCE_FILE = "source.sha256"

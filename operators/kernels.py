@@ -14,8 +14,10 @@ from .common import AtEnd, package
 from .training_python import training_python
 
 PREPARATION = "stga_addon.jobs.compile_ahead"
+
 START_DELAY_S = 1.0
-"""After the extension was enabled: neither enabling nor Blender's start waits for a process."""
+"""Delay after the extension was enabled: neither enabling nor Blender's start waits for a
+process."""
 
 _preparations: list["Popen[bytes]"] = []
 

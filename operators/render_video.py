@@ -54,8 +54,9 @@ from .request import idle, start
 from .training_python import has_training_python, training_python
 
 RECORDING = "recording.bin"
+
 RECORDING_INTERVAL_S = 0.001
-"""Between two recorded images, so that Blender handles its events."""
+"""Interval between two recorded images, so that Blender handles its events."""
 
 
 def render_device() -> str:

@@ -30,12 +30,10 @@ from ..stga_addon.scene.record import (
     store_path,
     stored_path,
 )
-from ..stga_addon.scene.vertex_groups import write_selection
 from ..stga_addon.tracking.folder import is_flame
 from ..stga_addon.training.run.folder import AVATAR, TRACKING, has_run, read_run
 from ..stga_addon.worker.status import WorkerState
 from .common import is_head
-from .select import count_selected
 
 Answer = SliceBuilt | Shown | None
 """What a function of `SHOW` returns; None: the result is still being read."""
@@ -121,11 +119,13 @@ def forget_heads() -> None:
 
 
 TRACKED_NAME = "Head, being tracked"
+
 MIN_ITERATIONS = 300
 """Below, new splats look like gray fog: neither previews nor a run that was cancelled replace
 another avatar."""
 
 _pool = ThreadPoolExecutor(1, "stga")
+
 _loading: dict[int, Future[tuple[Avatar, SplatAttributes]]] = {}
 """Session id of a scene -> the avatar file that a thread reads for it."""
 
@@ -373,17 +373,6 @@ def _fill_effects(scene: Any, state: RequestState) -> Answer:
     return Shown()
 
 
-def _select_for_take(scene: Any, state: RequestState) -> Answer:
-    """Select what extending the run by the head's take would train."""
-    head = request_head(scene, state)
-    found: Any = read_result(state.folder_path)
-    if head is None or head != scene.stga.head:
-        raise StgaError(f"{state.subject}: its head is no longer that of the scene")
-    write_selection(head, dict(found.selection))
-    count_selected(scene, head)
-    return Shown(undoable=True)
-
-
 def _apply_performance(scene: Any, state: RequestState) -> Answer:
     head = request_head(scene, state)
     if head is None or head != scene.stga.head:
@@ -401,7 +390,6 @@ SHOW = {
     Kind.TRACKING: _import,
     Kind.AVATAR: _show_made,
     Kind.ANALYSIS: _fill_effects,
-    Kind.SELECTION: _select_for_take,
     Kind.PERFORMANCE: _apply_performance,
     **dict.fromkeys(ADDS, _store_added),
 }
@@ -415,7 +403,8 @@ def changed_object(scene: Any, state: RequestState) -> Any:
     return request_head(scene, state) if state.kind in CHANGES_HEAD else None
 
 
-CHANGES_HEAD = (Kind.TRACKING, Kind.SELECTION, Kind.PERFORMANCE)
+CHANGES_HEAD = (Kind.TRACKING, Kind.PERFORMANCE)
+"""Kinds whose result changes the head itself."""
 PLACES = {
     Kind.TRAINING: ("training_run", "result_shown"),
     Kind.TRACKING: ("tracking_capture", "tracking_shown"),

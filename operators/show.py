@@ -33,7 +33,9 @@ from .training_python import training_python
 GRAY = ("WIREFRAME", "SOLID")
 """Kinds of shading that show colors of splats as trained only."""
 OFFERED = [mode for mode in LIMITS if mode != NATIVE or compat.NATIVE_SPLATS]
+"""Displays that this Blender has."""
 SURFACES = ("MESH", "CURVE", "SURFACE", "META", "FONT", "CURVES", "POINTCLOUD", "VOLUME")
+"""Types of objects that the engine STGA Splats leaves out."""
 UP_ROTATION_DEG = {"Y": 90.0, "-Y": -90.0, "Z": 0.0}
 """Up axis of a file -> rotation about x that turns it to Blender's."""
 

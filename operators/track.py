@@ -34,11 +34,13 @@ from .training_python import training_python
 from .windows import show_panel
 
 XRAY_ALPHA = 0.4
+"""Opacity of the head over the footage."""
 TRACK_FIELDS = ("footage", "start", "step", "cameras", "model", "avatar", "landmarks", "stop")
-"""Of the request, beside its focal length, that are properties of the operator as well."""
+"""Fields of the request, beside its focal length, that are properties of the operator as well."""
 MAX_FOLDERS = 1000
+"""Numbers that are tried for the name of a new folder."""
 DIGITS = 3
-"""Of numbers that Blender keeps in single precision, which continue only as they began."""
+"""Decimals of numbers that Blender keeps in single precision: later ones are its rounding."""
 
 
 class TrackOptions:

@@ -18,7 +18,7 @@ from ..stga_addon.training.run.folder import AVATAR, has_run, next_folder, read_
 from ..stga_addon.training.settings import PRESETS, TrainingSettings, make_settings
 from ..stga_addon.worker.training_python import missing_packages
 from . import options
-from .common import Action, Edit, capture_source, file_path, head_of, needs_head, needs_own_head
+from .common import Action, Edit, capture_source, file_path, head_of, needs_head
 from .options import ONCE
 from .request import idle, start
 from .training_python import test, training_python
@@ -273,18 +273,3 @@ class Extend(ContinueOperator, ExtendOptions, DeviceOptions, bpy.types.Operator)
         if not take.is_dir():
             raise StgaError(f"{take}: is not a folder; expected a further capture of the same head")
         self.go_on(context, jobs.Extend, (take,))
-
-
-class SelectExtension(Action, bpy.types.Operator):
-    """Select the triangles that extending the run by this head's take would train in each frame:
-    those that move, and those that look different than in the run's images"""
-
-    bl_label = "Select for Extend"
-    needs = (idle(Kind.SELECTION), needs_own_head)
-
-    directory: options.path("Run Folder", "Folder of the run to extend", "DIR_PATH")
-
-    def run(self, context: Any) -> None:
-        run = file_path(self.directory, "run folder")
-        take, flame, _ = capture_source(head_of(context))
-        start(context.scene, jobs.SelectForTake(run, take, flame), training_python(context))

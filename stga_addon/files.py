@@ -18,8 +18,9 @@ import tomllib
 import zipfile
 import zlib
 from collections.abc import Callable, Collection, Iterator, Mapping
-from contextlib import AbstractContextManager, contextmanager, suppress
+from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
 from contextvars import ContextVar
+from dataclasses import dataclass
 from fnmatch import fnmatch
 from functools import cache, partial
 from pathlib import Path
@@ -39,6 +40,7 @@ WEB_PAGE = re.compile(rb"(<\?xml[^>]*>|<!--.*?-->|\s)*<(!doctype html|html|head|
 CHANGED_LINE_ENDS = (
     "was carried over as text, which changed its line ends (CR LF); copy it again as binary"
 )
+
 MAX_ARRAYS_BYTES = 1 << 30
 """Largest sum of the arrays that are read from an npz: an avatar of four million splats."""
 MAX_CHECKPOINT_BYTES = 4 << 30
@@ -51,12 +53,14 @@ MAX_NAME_BYTES = 255
 """Longest name of a file or folder on the file systems of Linux, macOS and Windows."""
 PARTIAL_NAME = re.compile(
     r"\..+\.(?P<host>[0-9a-f]{8})-(?P<process>\d{1,10})-[0-9a-f]{8}\.partial", re.DOTALL
-)  # Name of a temporary file: .NAME.HOST-PROCESS-RANDOM.partial
+)
+"""Name of a temporary file: .NAME.HOST-PROCESS-RANDOM.partial"""
 RENAME_PATIENCE_S = 5.0
+"""How long a rename is tried again while another program has the file open, on Windows."""
 RENAME_INTERVAL_S = 0.1
-"""How long, and how often, a rename is tried again while another program has the file open, on
-Windows."""
-WINDOWS_SHARING_ERRORS = (5, 32)  # ERROR_ACCESS_DENIED, ERROR_SHARING_VIOLATION: of an open file
+"""Interval of these attempts."""
+WINDOWS_SHARING_ERRORS = (5, 32)
+"""ERROR_ACCESS_DENIED and ERROR_SHARING_VIOLATION of an open file."""
 NO_FILE = (errno.ENOENT, errno.ENOTDIR, errno.ELOOP, errno.ENAMETOOLONG, errno.EINVAL)
 """What the system answers where there is nothing under a name."""
 NewFile = Callable[[Path], AbstractContextManager[Path]]
@@ -70,9 +74,11 @@ BYTE_ORDER_MARKS = {
 }
 DELIMITERS = ",;\t"
 DECIMAL_COMMA = re.compile(r"\s*[-+]?\d*,\d+([eE][-+]?\d+)?\s*", re.ASCII)
-LINES_BEFORE_COLUMNS = 5  # Of comments, in which the row of a table's columns is searched
+
+LINES_BEFORE_COLUMNS = 5
+"""Comments in which the row of a table's columns is searched."""
 _HOST = f"{zlib.crc32(platform.node().encode()):08x}"
-"""Computers that share a disk cannot see each other's processes."""
+"""This computer: those that share a disk cannot see each other's processes."""
 
 
 @contextmanager
@@ -574,45 +580,70 @@ def read_npz(
     """Read the arrays of an npz that are among `names`, by default every one, without pickle.
     Raises StgaError where it is missing, truncated or holds objects, and, before anything is
     unpacked, where the arrays have more than `limit` bytes together."""
-    arrays = {}
-    with _npz_entries(path) as entries:
-        chosen = [each for each in entries if names is None or each[0] in names]
-        unpacked = sum(entry.file_size for _, entry, _ in chosen)
-        if unpacked > limit:
-            problem = f"unpacks to {unpacked} bytes, more than the {limit} allowed"
-            raise StgaError(f"{path}: {problem}")
-        for name, entry, archive in chosen:
-            with archive.open(entry) as stream:
-                arrays[name] = _read_array(stream, entry.file_size)
-    return arrays
-
-
-def npz_outlines(path: Path) -> dict[str, np.ndarray]:
-    """The arrays of an npz with their types and shapes, without contents, which take no memory: to
-    look at before a small file is unpacked to gigabytes. Raises StgaError as `read_npz` does."""
-    outlines = {}
-    with _npz_entries(path) as entries:
-        for name, entry, archive in entries:
-            with archive.open(entry) as stream:
-                shape, dtype = _read_outline(stream, entry.file_size)
-            outlines[name] = np.broadcast_to(np.zeros((), dtype), shape)
-    return outlines
+    with open_npz(path) as file:
+        return file.arrays(names, limit)
 
 
 @contextmanager
-def _npz_entries(path: Path) -> Iterator[list[tuple[str, zipfile.ZipInfo, zipfile.ZipFile]]]:
-    """Name and entry of each array of an npz, and the open archive. Raises as `read_npz`."""
+def open_npz(path: Path) -> Iterator["NpzFile"]:
+    """An npz whose arrays are read one after another while it is open. Raises as `read_npz`."""
     file_size(path)  # refuses pipes, whose reading need never end
-    with _reading(path, "npz"), zipfile.ZipFile(path) as archive:
-        entries = []
-        for entry in archive.infolist():
-            if not entry.filename.endswith(".npy"):
-                raise ValueError(f"entry '{entry.filename}' is no array")
-            # LZMA's own header makes it allocate gigabytes
-            if entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
-                raise ValueError("is packed as no npz is")
-            entries.append((entry.filename.removesuffix(".npy"), entry, archive))
-        yield entries
+    with ExitStack() as opened:
+        with _reading(path, "npz"):
+            archive = opened.enter_context(zipfile.ZipFile(path))
+            entries = {}
+            for entry in archive.infolist():
+                if not entry.filename.endswith(".npy"):
+                    raise ValueError(f"entry '{entry.filename}' is no array")
+                # LZMA's own header makes it allocate gigabytes
+                if entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+                    raise ValueError("is packed as no npz is")
+                entries[entry.filename.removesuffix(".npy")] = entry
+        yield NpzFile(path, archive, entries)
+
+
+@dataclass(frozen=True)
+class NpzFile:
+    """An open npz: its archive, and the entry of each array by the array's name."""
+
+    path: Path
+    archive: zipfile.ZipFile
+    entries: Mapping[str, zipfile.ZipInfo]
+
+    def arrays(
+        self, names: Collection[str] | None = None, limit: int = MAX_ARRAYS_BYTES
+    ) -> dict[str, np.ndarray]:
+        """The arrays that are among `names`, by default every one, of at most `limit` bytes."""
+        wanted = {n: each for n, each in self.entries.items() if names is None or n in names}
+        unpacked = sum(entry.file_size for entry in wanted.values())
+        if unpacked > limit:
+            problem = f"unpacks to {unpacked} bytes, more than the {limit} allowed"
+            raise StgaError(f"{self.path}: {problem}")
+        return dict(self._each(wanted, _read_array))
+
+    def outlines(self) -> dict[str, np.ndarray]:
+        """The arrays with their types and shapes, without contents, which take no memory: to look
+        at before a small file is unpacked to gigabytes."""
+        outlines = {}
+        for name, (shape, dtype) in self._each(self.entries, _read_outline):
+            outlines[name] = np.broadcast_to(np.zeros((), dtype), shape)
+        return outlines
+
+    def digest(self) -> str:
+        """SHA-256 of the whole file."""
+        stream = self.archive.fp
+        assert stream is not None
+        with naming(self.path, "read"):
+            stream.seek(0)
+            return hashlib.file_digest(stream, "sha256").hexdigest()  # type: ignore[arg-type]
+
+    def _each(
+        self, entries: Mapping[str, zipfile.ZipInfo], read: Callable[[IO[bytes], int], Any]
+    ) -> Iterator[tuple[str, Any]]:
+        for name, entry in entries.items():
+            with _reading(self.path, "npz"), self.archive.open(entry) as stream:
+                found = read(stream, entry.file_size)
+            yield name, found
 
 
 def read_npy(path: Path) -> np.ndarray:

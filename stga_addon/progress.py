@@ -3,11 +3,11 @@
 import logging
 import math
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from time import monotonic
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -29,6 +29,7 @@ class Progress:
     preview   writes the result so far into a file; None before there is one
     picture   draws the result so far: `rgb` (H, W, 3) uint8, of a head `vertices` (V, 3) and
               `faces` (F, 3) too; or nothing. None where nothing new is to be seen
+    metrics   of a training: its evaluations so far, the lines of metrics.jsonl
     """
 
     share: float = 0.0
@@ -37,6 +38,7 @@ class Progress:
     figures: Callable[[], Mapping[str, float]] = dict
     preview: Callable[[Path], None] | None = None
     picture: Callable[[], Mapping[str, np.ndarray] | None] | None = None
+    metrics: Sequence[Mapping[str, Any]] = ()
 
 
 Report = Callable[[Progress], bool]
@@ -63,8 +65,8 @@ class TimeLeft:
     def __init__(self, clock: Callable[[], float] = monotonic) -> None:
         self._clock = clock
         self._last = clock(), 0.0
+        # Seconds and fractions of the steps that tell the pace
         self._steps: deque[tuple[float, float]] = deque()
-        """Seconds and shares of the steps that tell the pace."""
 
     def after(self, share: float) -> float:
         """Once `share` of the work is done; NaN where the pace is not known yet."""
@@ -93,8 +95,8 @@ class Clock:
         self._clock = clock
         self._by_share = TimeLeft(clock)
         self._left_s = math.inf
+        # When work lately reported how many seconds are left, and how many
         self._asked: deque[tuple[float, float]] = deque()
-        """When work lately said how many seconds are left, and how many."""
 
     def told(self, progress: Progress) -> dict[str, float]:
         """The finite figures of some progress; `left_s`, by the share where the work does not say,

@@ -22,7 +22,7 @@ from .training.evaluate.forecast import (
     detail_curve,
 )
 from .training.run.folder import read_run
-from .training.run.metrics_log import METRICS, TRACKING_GAIN, read_metrics
+from .training.run.metrics_log import TRACKING_GAIN, read_metrics
 from .training.settings import TrainingSettings
 
 # imported when a chart is drawn: it takes half a second, and the command line starts without it
@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 CURVE = "curve.png"
+
 MAX_DRAWING_SHARE = 0.01
 """Largest share of the time that drawing the curve may take while a run trains."""
 
@@ -42,36 +43,36 @@ class CurveUpdater:
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
-        self._drawn_size = -1
+        self._drawn_count = 0
         self._next_update = perf_counter() + FIRST_DRAWING_S
 
-    def __call__(self) -> None:
+    def __call__(self, metrics: Sequence[Mapping[str, Any]]) -> None:
         now = perf_counter()
         if now < self._next_update:
             return
-        path = self._folder / METRICS
-        size = path.stat().st_size if path.exists() else 0
-        if size != self._drawn_size:
+        if len(metrics) != self._drawn_count:
             with suppress(StgaError):  # a curve that cannot be written must not end the training
-                write_curve(self._folder)
-            self._drawn_size = size
+                write_curve(self._folder, metrics)
+            self._drawn_count = len(metrics)
         spent = perf_counter() - now
         self._next_update = now + spent / MAX_DRAWING_SHARE
 
 
-def write_curve(folder: Path) -> None:
+def write_curve(folder: Path, metrics: Sequence[Mapping[str, Any]]) -> None:
     """Write curve.png of the run in `folder`, with an evaluation to draw and matplotlib."""
-    metrics = read_metrics(folder)
     if curve_of(metrics) and find_spec("matplotlib") is not None:
         with replacing(folder / CURVE) as partial:
             run_chart(metrics).savefig(partial, format="png")
 
 
-def report_run(folder: Path) -> list[str]:
-    """Write the curve of a finished run and return the lines of its summary."""
-    write_curve(folder)
+def report_run(folder: Path, metrics: Sequence[Mapping[str, Any]] = ()) -> list[str]:
+    """Write the curve of a finished run and return the lines of its summary.
+
+    metrics: its evaluations, where they were read already.
+    """
     run = read_run(folder)
-    metrics = read_metrics(folder)
+    metrics = metrics or read_metrics(folder)
+    write_curve(folder, metrics)
     lines = summarize_run(metrics, run.settings)
     if run.continuation is not None:
         lines = summarize_continuation(metrics)
@@ -228,7 +229,8 @@ def finish_axes(axes: "Axes") -> None:
 
 # The curve in Blender's panel: its Python need not have matplotlib or Pillow
 
-SIZE = 256  # Width and height in pixels: Blender's icons are square
+SIZE = 256
+"""Width and height in pixels: Blender's icons are square."""
 MARGIN = 6.0
 LINE_WIDTH = 3.0
 BACKGROUND_COLOR = (0.11, 0.11, 0.11)
@@ -236,7 +238,9 @@ GRID_COLOR = (0.25, 0.25, 0.25)
 CURVE_COLOR = (0.34, 0.71, 0.91)
 FORECAST_COLOR = (0.90, 0.62, 0.0)
 DETAIL_COLOR = (0.0, 0.62, 0.45)
-BAND_OPACITY = 0.35  # Of the band that shows a forecast's error
+
+BAND_OPACITY = 0.35
+"""Opacity of the band that shows a forecast's error."""
 GRID_STEPS_DB = (0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0)
 """The first step is used that gives at most MAX_GRID_STEPS."""
 MAX_GRID_STEPS = 6

@@ -36,9 +36,11 @@ DISPLAY_INPUTS = (
     splat_nodes.SHOW_SELECTION,
     splat_nodes.SELECTED_ONLY,
 )
+
 UNSEEN_INPUTS = (splat_nodes.SHOW_UNSEEN, splat_nodes.FILMED_ONLY)
-"""Of avatars that know what was filmed."""
+"""Inputs of avatars that know what was filmed."""
 POPUP_MARGIN_PX = 60
+
 _is_told = False
 """Whether the render job in progress has said what it does not show."""
 

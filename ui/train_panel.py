@@ -162,9 +162,6 @@ class ContinuePanel(ClosedPanel, bpy.types.Panel):
         set_options(extend, settings, train.DeviceOptions)
         set_options(extend, settings.extend, train.ExtendOptions)
         extend.directory = settings.run_folder
-        if not draw_running(column, context, Kind.SELECTION):
-            select = column.operator("stga.select_extension", icon="GROUP_VERTEX")
-            select.directory = settings.run_folder
 
 
 class EffectsPanel(ClosedPanel, bpy.types.Panel):

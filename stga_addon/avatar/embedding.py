@@ -13,6 +13,7 @@ from .strain import StrainBasis, gram_deformation
 
 CONVENTIONS = ("stga", "gaussian_avatars")
 MIN_DIVISOR = 1e-30
+
 MAX_UNEVENNESS = 1e-6
 """Relative difference between a matrix's scales that is float32's rounding."""
 MIN_AREA_RATIO = 1e-4
@@ -21,8 +22,10 @@ on a line, rounded to float32, have ratios of 1e-6 to 1e-5, and their normal and
 the rounding."""
 # from this z on, the perpendicular of a unit vector is sought in the x direction
 UPRIGHT_COSINE = 0.8
+"""z component of a triangle's first axis above which x replaces z in the cross product that stands
+for a missing normal."""
 NO_COLUMNS = np.zeros((1, 0), np.float32)
-"""Of `FaceFrames.deformation` and `color` where nothing needs or drives them."""
+"""`FaceFrames.deformation` and `color` where nothing needs or drives them."""
 
 
 @dataclass(frozen=True)

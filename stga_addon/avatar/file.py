@@ -7,12 +7,13 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
+from weakref import WeakValueDictionary
 
 import numpy as np
 
 from ..capture.transforms import DEFAULT_PRINCIPAL_POINT, PRINCIPAL_POINTS
 from ..errors import StgaError, shorten
-from ..files import check_version, converted, npz_outlines, parse_json, read_npz, write_npz
+from ..files import check_version, converted, open_npz, parse_json, write_npz
 from .embedding import CONVENTIONS, FaceFrames, face_areas, face_frames
 from .offsets import (
     COLOR,
@@ -30,6 +31,7 @@ from .strain import STRAIN_COMPONENTS, TRAINED_RANGE, StrainBasis, at_rest, stra
 FORMAT = "stga-avatar"
 VERSION = 3
 MAX_HEADER_BYTES = 16 << 20
+
 _HEADER = {
     "convention": str,
     "background": list,
@@ -41,6 +43,7 @@ _HEADER = {
 """Field of the avatar -> what JSON holds of it; of the regions their names."""
 
 SOURCES = "estimated", "gray_card", "file"
+"""Where an avatar's light can come from."""
 _LIGHT_ARRAYS = {
     "radiance": (9, 3),
     "transfer": (-1, 9),
@@ -48,13 +51,16 @@ _LIGHT_ARRAYS = {
     "irradiance": (-1, 3),
     "roughness": (-1,),
 }
-"""Field -> shape, -1: vertices."""
+"""Array of a light -> its shape, -1: vertices."""
 _PREFIX = "light_"
 _OPTIONAL_ARRAYS = "strain_range", "linear_base", "filmed_along"
+
 MIN_COLOR_CHANGE = 1 / 255
+"""Offsets of colors that never change them by as much are not stored."""
 MIN_SHIFT_M = 2e-4
+"""The same of positions."""
 MIN_SCALE_CHANGE = 0.02
-"""Of splats that follow a signal: what never changes them by as much is not kept."""
+"""The same of scales, relative."""
 
 
 UNSEEN_REGION = "unseen"
@@ -110,7 +116,7 @@ class Avatar:
                     each of three components of a signal
     light       what relighting needs, None where it was not estimated
     filmed_along  (F, 3) float32: unit direction in which the only camera sees each triangle, world
-                  axes; what harmonics add from aside is plausible only (`colored_aside`). None: of
+                  axes; what harmonics add off-axis is plausible only (`colored_off_axis`). None: of
                   several cameras, or of trained harmonics
     linear_base  (N, 4) float32: constant coefficients and logit of each splat with which renderers
                  that blend in linear light come nearest to it (`render.linear_fit`); None: those
@@ -244,20 +250,41 @@ def write_avatar(path: Path, avatar: Avatar) -> None:
 
 def read_avatar(path: Path) -> Avatar:
     """Read an avatar file. Raises StgaError naming the file and the field that is missing or
-    malformed; names, types and shapes are looked at before anything is unpacked."""
-    outlines = npz_outlines(path)
-    if outlines.get("header", np.zeros(0)).size > MAX_HEADER_BYTES:
-        raise StgaError(f"{path}: header has more than {MAX_HEADER_BYTES} bytes")
-    header = _read_header(path, read_npz(path, ("header",)))
+    malformed; names, types and shapes are looked at before anything is unpacked.
+
+    While somebody holds the avatar of a file that has not changed since, it is that one, which
+    nobody may write into.
+    """
+    try:
+        state = path.stat()
+    except (OSError, ValueError):  # which reading it names
+        return _read_avatar(path)
+    key = path.absolute(), state.st_ino, state.st_mtime_ns, state.st_size
+    found = _HELD.get(key)
+    if found is None:
+        found = _HELD[key] = _read_avatar(path)
+    return found
+
+
+_HELD: WeakValueDictionary[tuple[Path, int, int, int], Avatar] = WeakValueDictionary()
+"""Avatars that were read and are in use, by path and state of the file."""
+
+
+def _read_avatar(path: Path) -> Avatar:
     needed = (*ARRAYS, "neutral", "faces", "region_faces")
-    missing = [name for name in needed if name not in outlines]
-    if missing:
-        raise StgaError(f"{path}: avatar file has no array {missing[0]!r}")
-    _check_shapes(path, _avatar_of(path, header, outlines))
-    if "light" in header:
-        _check_light_shapes(path, outlines)
     optional = (*_OPTIONAL_ARRAYS, *OFFSETS, *(_PREFIX + name for name in _LIGHT_ARRAYS))
-    arrays = read_npz(path, (*needed, *optional))
+    with open_npz(path) as file:
+        outlines = file.outlines()
+        if outlines.get("header", np.zeros(0)).size > MAX_HEADER_BYTES:
+            raise StgaError(f"{path}: header has more than {MAX_HEADER_BYTES} bytes")
+        header = _read_header(path, file.arrays(("header",)))
+        missing = [name for name in needed if name not in outlines]
+        if missing:
+            raise StgaError(f"{path}: avatar file has no array {missing[0]!r}")
+        _check_shapes(path, _avatar_of(path, header, outlines))
+        if "light" in header:
+            _check_light_shapes(path, outlines)
+        arrays = file.arrays((*needed, *optional))
     avatar = _avatar_of(path, header, arrays)
     check_avatar(path, avatar)
     light = _light(path, arrays, header["light"]) if "light" in header else None

@@ -5,11 +5,12 @@ import numpy as np
 from .embedding import face_areas, face_frames
 from .splats import Splats
 
-NORMAL_AXIS = {"stga": 2, "gaussian_avatars": 1}  # which local axis is the triangle's normal
+NORMAL_AXIS = {"stga": 2, "gaussian_avatars": 1}
+"""Convention -> local axis along the triangle's normal."""
 SCALE = 0.6
+"""Standard deviation of a splat per spacing of the lattice."""
 FLATNESS = 0.5
-"""Standard deviation per spacing of the lattice, and along the normal per that in the triangle's
-plane."""
+"""Standard deviation along the normal per that in the triangle's plane."""
 INSET = 0.1
 """Share of the way to the centroid by which points lie inside their triangle: neighbors' points
 must not coincide."""

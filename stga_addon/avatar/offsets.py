@@ -54,6 +54,7 @@ _ROWS = (
     DrivenOffset("strain_color", "smoothed_strain", COLOR, "strain_color", 0.8),
     DrivenOffset("normal_color", "normal", COLOR, "strain_color", 0.4, of_light=True),
 )
+
 OFFSETS: dict[str, DrivenOffset] = {offset.name: offset for offset in _ROWS}
 """By name. Everything that trains, stores or poses avatars goes by this table. Skin that is
 compressed bulges and darkens, and splats on what is stretched grow; skin that turns in a light that

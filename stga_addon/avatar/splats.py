@@ -13,14 +13,16 @@ import numpy as np
 from ..flame.quaternions import normalized, unit
 
 MAX_SH_DEGREE = 3
+
 SH_C0 = 0.28209479177387814
 """The constant spherical harmonic, 1 / (2·sqrt(π)): a color is 0.5 + SH_C0 times the degree-0
 coefficient."""
 
 
 MAX_LOGIT = 15.0
+"""Logit of an opacity of 1 to 3e-7."""
 MIN_LOG_SCALE = -20.0
-"""An opacity of 1 to 3e-7, and a standard deviation of nothing, before activation."""
+"""Logarithm of a standard deviation of nothing."""
 
 
 @dataclass(frozen=True)
@@ -198,7 +200,7 @@ def sh_color(sh: np.ndarray, direction: np.ndarray) -> np.ndarray:
     return 0.5 + SH_C0 * sh[:, 0] + rest
 
 
-def colored_aside(
+def colored_off_axis(
     splats: Splats, direction: np.ndarray, share: np.ndarray, color: np.ndarray
 ) -> Splats:
     """Splats of degree 0 that look as they do along a unit direction (N, 3) from the eye, and the

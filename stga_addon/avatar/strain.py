@@ -11,8 +11,9 @@ import numpy as np
 STRAIN_COMPONENTS = 3
 """Stretch along two directions of the triangle's plane, and the shear between them."""
 STRAIN_GAIN = 5.0
+"""Unit of strain: a stretch of 18 % (E = 0.2) counts as 1."""
 MAX_STRAIN = 2.0
-"""Unit and bounds: a stretch of 18 % (E = 0.2) counts as 1, and strain is clipped to ±2."""
+"""Bound to which strain is clipped, on both sides."""
 MIN_COMPRESSION = 0.2
 """Compression that colors do not follow yet (E = 0.04): coefficients fitted to so little are mostly
 noise."""

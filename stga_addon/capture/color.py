@@ -17,6 +17,7 @@ LINEAR = 8
 PQ = 16
 HLG = 18
 Conversion = Callable[[np.ndarray], np.ndarray]  # Of pixels
+
 GAMMAS = {4: 2.2, 5: 2.8}
 """Code of transfer characteristics -> exponent. Codes that are not named here are sRGB's curve."""
 
@@ -25,8 +26,9 @@ REFERENCE_WHITE_CD_M2 = 203.0
 HLG_PEAK = 1000.0 / REFERENCE_WHITE_CD_M2
 HLG_SYSTEM_GAMMA = 1.2
 BT2020_LUMINANCE = np.array([0.2627, 0.6780, 0.0593])
+
 BAND_PIXELS = 1 << 18
-"""Converted at a time: wide intermediate numbers of a large image would fill the memory."""
+"""Pixels converted at a time: wide intermediate numbers of a large image would fill the memory."""
 
 
 def is_srgb(primaries: int, transfer: int) -> bool:

@@ -12,16 +12,21 @@ Json = dict[str, Any]
 MAGIC = b"glTF"
 VERSION = 2
 JSON_KIND = b"JSON"
+
 HEADER_BYTES = 20
+"""Bytes of the file's header and of that of its first chunk."""
 CHUNK_HEADER_BYTES = 8
-"""The file's header and that of its first chunk; and that of any later chunk."""
+"""Bytes of the header of any later chunk."""
 DTYPES = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
+"""Component type of a GLB's accessor -> NumPy's name of it."""
 WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
 """Type of a GLB's accessor -> numbers of an element."""
 MIN_NUMBERS_ALLOWANCE = 1 << 20
+"""Numbers that the accessors of any file may have together."""
 MAX_NUMBERS_PER_BYTE = 8
+"""Numbers that they may have for each byte of a larger one."""
 UNREADABLE = LookupError, TypeError, ValueError, AttributeError, ArithmeticError, RecursionError
-"""What a damaged document leads to."""
+"""What reading a damaged document raises."""
 
 
 def glb_chunks(data: bytes) -> tuple[Json, bytes]:

@@ -8,6 +8,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from typing import IO
 
 import numpy as np
 from PIL import Image, ImageCms, ImageOps
@@ -19,14 +20,20 @@ from .color import in_bands, is_srgb, to_srgb, with_gamma
 from .model import View
 
 WHITE = (255, 255, 255)
-WHITE_LEVEL = 247  # Of all channels, from which a pixel without a mask counts as a white background
+
+WHITE_LEVEL = 247
+"""Level of all channels from which a pixel without a mask counts as a white background."""
 FORMATS = ("PNG", "JPEG", "WEBP", "TIFF", "BMP")
 """Pillow opens more than these, some by running other programs."""
 ORIENTATION_TAG = 0x0112
 """EXIF's: 1 upright, 2 to 4 mirrored or upside down, 5 to 8 with width and height exchanged."""
 # PNG's gAMA of what is shown as sRGB
 SRGB_GAMMA = 0.45455
+"""Value of a PNG's gAMA chunk that stands for sRGB."""
 GAMMA_TOLERANCE = 0.02
+"""Difference from it that still does."""
+CICP = "stga_cicp"
+"""Key of an opened image's information: what `_cicp` found in its file."""
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 
 # Once, not by `catch_warnings`, which is not safe in threads. Sizes have limits of their own; what
@@ -51,8 +58,12 @@ def _opened(path: Path) -> Iterator[Image.Image]:
     try:
         if not stat.S_ISREG(path.stat().st_mode):  # a pipe or device may never end
             raise OSError("not a regular file")
-        with Image.open(path, formats=FORMATS) as image:
-            yield image
+        with path.open("rb") as stream:
+            codes = _cicp(stream)
+            stream.seek(0)
+            with Image.open(stream, formats=FORMATS) as image:
+                image.info[CICP] = codes
+                yield image
     except FileNotFoundError as error:
         raise StgaError(f"{path}: does not exist; expected an image") from error
     except Exception as error:  # Pillow's decoders raise any kind of error for a bad file
@@ -64,9 +75,9 @@ def is_plain(path: Path) -> bool:
     """Whether programs that know neither EXIF's orientation nor color profiles show the image as it
     is read here."""
     try:
-        with Image.open(path, formats=FORMATS) as image:
-            return _orientation(image) == 1 and _conversion(image, path) is None
-    except Exception:  # reading it will say what is wrong
+        with _opened(path) as image:
+            return _orientation(image) == 1 and _conversion(image) is None
+    except StgaError:  # reading it will say what is wrong
         return True
 
 
@@ -143,7 +154,7 @@ def _decode(path: Path, view: View, kind: str) -> np.ndarray:
         size = _displayed_size(image)
         # before any pixel is unpacked
         if expected in (stored, size) and is_image_size(*expected):
-            convert = _conversion(image, path) if kind == "image" else None
+            convert = _conversion(image) if kind == "image" else None
             turn = size == expected and _orientation(image) != 1
             turned = ImageOps.exif_transpose(image) if turn else image
             if kind == "mask" and turned.mode.startswith("I"):
@@ -177,11 +188,11 @@ def _orientation(image: Image.Image) -> int:
     return found if isinstance(found, int) and 1 <= found <= 8 else 1
 
 
-def _conversion(image: Image.Image, path: Path) -> Callable[[Image.Image], Image.Image] | None:
+def _conversion(image: Image.Image) -> Callable[[Image.Image], Image.Image] | None:
     """How the image's colors become sRGB, None where they are: by cICP, profile, or gAMA."""
     if image.mode not in ("RGB", "RGBA", "CMYK"):
         return None
-    codes = _cicp(path) if image.format == "PNG" else None
+    codes = image.info.get(CICP)
     if codes is not None:
         convert = partial(_by_pixels, lambda pixels: to_srgb(pixels, *codes))
         return None if is_srgb(*codes) else convert
@@ -222,20 +233,20 @@ def _by_profile(data: bytes) -> Callable[[Image.Image], Image.Image] | None:
     return convert
 
 
-def _cicp(path: Path) -> tuple[int, int] | None:
-    """Codes of primaries and transfer in a PNG's cICP chunk, before the pixels; None without."""
-    with path.open("rb") as stream:
-        if stream.read(8) != PNG_SIGNATURE:
+def _cicp(stream: IO[bytes]) -> tuple[int, int] | None:
+    """Codes of primaries and transfer in a PNG's cICP chunk, before the pixels; None without, and
+    in files of other formats."""
+    if stream.read(8) != PNG_SIGNATURE:
+        return None
+    while len(head := stream.read(8)) == 8:
+        length = int.from_bytes(head[:4], "big")
+        name = head[4:]
+        if name in (b"IDAT", b"IEND"):
             return None
-        while len(head := stream.read(8)) == 8:
-            length = int.from_bytes(head[:4], "big")
-            name = head[4:]
-            if name in (b"IDAT", b"IEND"):
-                return None
-            if name == b"cICP":
-                codes = stream.read(4)
-                return (codes[0], codes[1]) if len(codes) == 4 else None
-            stream.seek(length + 4, 1)
+        if name == b"cICP":
+            codes = stream.read(4)
+            return (codes[0], codes[1]) if len(codes) == 4 else None
+        stream.seek(length + 4, 1)
     return None
 
 

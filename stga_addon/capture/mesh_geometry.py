@@ -10,8 +10,11 @@ from .camera import Camera
 
 ArrayPair = tuple[np.ndarray, np.ndarray]
 MAX_ITERATIONS = 100
-MIN_RESIDUAL = 1e-7  # Share of the mesh's size below which residuals are rounding
-CHUNK_PIXELS = 1 << 21  # Candidate pixels that are tested at a time, to bound the memory
+
+MIN_RESIDUAL = 1e-7
+"""Fraction of the mesh's size below which residuals are rounding."""
+CHUNK_PIXELS = 1 << 21
+"""Candidate pixels that are tested at a time, to bound the memory."""
 LIPS_AHEAD = np.radians(12.4)
 """Radians between straight down and where the lips are, seen from between the eyes."""
 MIN_EYE_HEIGHT_SHARE = 0.1  # Of the eyes' distance from each other, over the mouth

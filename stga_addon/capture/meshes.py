@@ -16,13 +16,18 @@ from .glb import WIDTHS, allowed_numbers, glb_chunks
 from .model import Capture
 from .ply import ply_rows
 
-Mesh = tuple[np.ndarray, np.ndarray]  # Vertices (V, 3) and triangles (F, 3)
+Mesh = tuple[np.ndarray, np.ndarray]
+"""Vertices (V, 3) and triangles (F, 3)."""
 MESH_SUFFIXES = (".obj", ".ply", ".glb", ".stl")
+
 PRIMITIVE_NUMBERS = (
     1000  # That each primitive counts for: trimesh takes time even where it is small
 )
-CACHE_BYTES = 96 << 20  # Of a take of ten seconds, each is posed once
+"""Numbers that each primitive counts for: trimesh takes time even where it is small."""
+CACHE_BYTES = 96 << 20
+"""Memory for posed meshes: of a take of ten seconds, each is posed once."""
 MAX_MESH_BYTES = 512 << 20
+
 MIN_EXTENT_M = 1e-9
 """A smaller mesh is a point: no shape to train on, and no scale to compare motion with."""
 PLY_CORNERS = ("vertex_indices", "vertex_index")  # The names that writers give a face's list
@@ -106,13 +111,18 @@ def tracked_meshes(
 def cached_meshes(mesh: Callable[[int], np.ndarray], vertices: int) -> Callable[[int], np.ndarray]:
     """The function with its latest results kept, read-only, within CACHE_BYTES."""
 
-    @lru_cache(maxsize=max(2, CACHE_BYTES // (24 * max(1, vertices))))
+    @lru_cache(cached_timesteps(vertices))
     def kept(timestep: int) -> np.ndarray:
         result = mesh(timestep)
         result.setflags(write=False)
         return result
 
     return kept
+
+
+def cached_timesteps(vertices: int) -> int:
+    """How many timesteps with three float64 a vertex CACHE_BYTES hold."""
+    return max(2, CACHE_BYTES // (24 * max(1, vertices)))
 
 
 def file_of(files: Mapping[int, Path], timestep: int) -> Path:

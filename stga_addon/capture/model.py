@@ -15,10 +15,13 @@ from .camera import Camera
 
 Item = TypeVar("Item")
 
-FPS_LIMIT = 1000.0  # Frame rates are below it
-RATE_TOLERANCE = 0.01  # Relative difference up to which the frame rates of takes are the same
+FPS_LIMIT = 1000.0
+"""Frame rates are below it."""
+RATE_TOLERANCE = 0.01
+"""Relative difference up to which the frame rates of takes are the same."""
 MAX_NEUTRAL_DIFFERENCE_M = 1e-4
-"""Between neutral meshes of takes of one head: trackers write rounded shape coefficients."""
+"""Largest distance between neutral meshes of takes of one head: trackers write rounded shape
+coefficients."""
 MAX_SCALE_FACTOR = 5.0
 """Largest ratio of the head's sizes in two takes; another unit makes it 10 or more."""
 COMPARED = 8  # Views, and timesteps, of a take whose scale is looked at
@@ -36,7 +39,8 @@ class View:
     mask: Path | None = None
 
 
-Views = Mapping[str, tuple[View, ...]]  # By their split, "train", "val" or "test"
+Views = Mapping[str, tuple[View, ...]]
+"""Views by their split, "train", "val" or "test"."""
 ViewExposure = Callable[[View], np.ndarray | None]
 """View -> gain and offset (2, 3), in levels, of red, green and blue; None where not known."""
 

@@ -4,7 +4,7 @@ import os
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from functools import partial
+from functools import lru_cache, partial
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -18,9 +18,10 @@ from ..files import (
     is_folder,
     matching,
     naming,
-    npz_outlines,
+    open_npz,
     read_json,
     read_npy,
+    read_npz,
 )
 from ..flame.forward import FlameFrame
 from ..flame.model import BUNDLED_HEAD, EXPRESSION_NAMES
@@ -54,15 +55,23 @@ from .transforms import (
 )
 
 MIN_HEAD_EXTENT_M = 0.05
+"""Least extent of a neutral mesh along its longest axis: below, its unit is probably not the
+meter."""
 TYPICAL_HEAD_EXTENT_M = 0.3
+"""Extent of an average head, which messages name."""
 MAX_HEAD_EXTENT_M = 3.0
-"""Largest extent of a neutral mesh: outside of these, its unit is probably not the meter."""
-NEUTRAL = ("neutral", "canonical")  # Names of a mesh without expression
+"""Largest extent of a neutral mesh in meters."""
+NEUTRAL = ("neutral", "canonical")
+"""Names of a mesh without expression."""
 MAX_COMPARED_VIEWS = 4
+"""Views whose images or masks are read to check a capture."""
 NAMES_IN_WARNING = 3
-MIN_SHARE_DIFFERENCE = 0.01  # of the vertices
+"""Files that a warning names at most."""
+MIN_SHARE_DIFFERENCE = 0.01
+"""Fraction of the vertices by which a convention must be worse than another to be doubted."""
 CANONICAL_NAME = "canonical_flame_param.npz"
 PARAMETERS = "flame_param"
+
 OWN_MODELS = ("flame_model.npz", "flame_model.pkl")
 """Names of a FLAME model file in the folder of a capture, which is used where none is given."""
 BUNDLED_MODEL = "bundled_head.npz"
@@ -92,7 +101,8 @@ def open_capture(
     if folder.suffix.lower() == ".npz" and is_file(folder):
         path = folder.resolve()
         # A file that names its expressions is of the bundled head, and needs no model file.
-        bundled = EXPRESSION_NAMES in npz_outlines(path)
+        with open_npz(path) as file:
+            bundled = EXPRESSION_NAMES in file.entries
         model_file = BUNDLED_HEAD if bundled else _model_file(path, flame)
         return sequence_capture(path, read_motion(path, flame_model(model_file)), model_file, {})
     if not is_folder(folder):
@@ -385,10 +395,14 @@ def _open_flame_capture(root: Path, transforms: Transforms, model_file: Path | N
         raise StgaError(
             f"{folder}: holds no parameters; expected one .npz per timestep, such as 00000.npz"
         )
-    shape, static_offset = read_identity(files[min(files)], model)
+    first = files[min(files)]
+    person = read_npz(first)
+    shape, static_offset = read_identity(first, model, person)
 
+    @lru_cache(meshes.cached_timesteps(len(model.v_template)))
     def frame(timestep: int) -> FlameFrame:
-        return read_frame(meshes.file_of(files, timestep), model)
+        path = meshes.file_of(files, timestep)
+        return read_frame(path, model, person if path == first else None)
 
     sequence = FlameSequence(model, shape, static_offset, tuple(files), frame)
     return sequence_capture(root, sequence, model_file, transforms.views)

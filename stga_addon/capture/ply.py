@@ -33,6 +33,7 @@ _TYPES = {
     "float64": "f8",
 }
 _BYTE_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": "="}
+
 Take = Callable[[str, int], Sequence[float]]
 """Type of numpy, count -> so many numbers of a row, behind those that were taken before."""
 

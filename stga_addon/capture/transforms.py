@@ -23,20 +23,26 @@ WHOLE_FILE = "transforms.json"
 SPLIT_FILES = {s: f"transforms_{s}.json" for s in SPLITS}
 PRINCIPAL_POINTS = ("vhap", "opencv", "center")
 DEFAULT_PRINCIPAL_POINT = PRINCIPAL_POINTS[0]
-ROTATION_TOLERANCE = 1e-3  # exporters write float32 poses, some rounded to a few decimals
-MAX_NUMBER = sys.float_info.max  # JSON does not limit whole numbers
+
+ROTATION_TOLERANCE = 1e-3
+"""Exporters write float32 poses, some rounded to a few decimals."""
+MAX_NUMBER = sys.float_info.max
+"""JSON does not limit whole numbers."""
+MIN_ANGLE = 1e-9
+"""Least angle of view in radians; half of it still has a tangent."""
 INDEX_LIMIT = 1 << 31
-MIN_ANGLE = 1e-9  # radians; half of it still has a tangent
 MAX_PATH_CHARACTERS = 2000
 MAX_NAME_BYTES = 255
 MATRIX = "a 4x4 matrix of finite numbers"
+
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp")
-"""Of images, in the order in which a path without one is looked for."""
+"""Suffixes of images, in the order in which a path without one is looked for."""
 TIMESTEP_KEYS = ("timestep_index", "keyframe")
 """VHAP writes timestep_index, the STGA authors' release keyframe."""
 READ_PATHS = ("file_path", "fg_mask_path", "mask_path", "mesh_path", "flame_param_path")
+"""Paths of a frame that are read."""
 TOP_PATHS = ("canonical_mesh_path", "regions_path", "ply_file_path")
-"""Of a frame, and of the top level; nerfstudio's points are of no use."""
+"""Paths at the top level that are read; nerfstudio's points are of no use."""
 NUMBERED = "without timestep_index, timesteps are the numbers of the tracked files"
 SCALED = "the scale of transform_matrix was left out"
 

@@ -6,7 +6,7 @@ import sys
 from argparse import ArgumentParser, Namespace
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack
-from dataclasses import dataclass, field, fields, make_dataclass, replace
+from dataclasses import dataclass, field, make_dataclass, replace
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
@@ -37,7 +37,7 @@ from ..jobs.track import (
     Track,
     read_inputs,
 )
-from ..jobs.train import Extend, Refine, Resume, Selected, SelectForTake, Train
+from ..jobs.train import Extend, Refine, Resume, Selected, Train
 from ..options import (
     add_options,
     flag_of,
@@ -319,23 +319,17 @@ def write_blend(
 # Continuing a finished run
 
 
-def _continuing(kind: Any, seconds: float, *more: Any) -> Command:
+def _continuing(kind: Any, seconds: float) -> Command:
     """A command that continues a finished run in one of its own, or resumes such a run."""
 
     def run(options: Namespace, head: OpenHead | None) -> None:
         given = given_options(options, kind)
-        takes = given.get("captures")
-        only = getattr(options, "select_only", None)
         if options.resume:
             if read_run(given["parent"]).continuation is None:
                 problem = "does not continue another run; resume it with `stga train --resume`"
                 raise StgaError(f"{given['parent']}: {problem}")
             same = {name: given[name] for name in ("flame", "device") if name in given}
             carry_out(Resume(given["parent"], **same))
-        elif takes and only:
-            if len(takes) != 1:
-                raise StgaError(f"--select-only: expected one CAPTURE, got {len(takes)}")
-            _write_selection(SelectForTake(options.parent, takes[0], options.flame), only)
         else:
             if not {"seconds", "iterations"} & given.keys():
                 given["seconds"] = seconds
@@ -347,12 +341,10 @@ def _continuing(kind: Any, seconds: float, *more: Any) -> Command:
 
     resume = _lone("resume", bool, "RUN was stopped: continue it", False)
     leaves = {"resume": ("parent", "flame", "device")}
-    leaves |= {spec.name: ("parent", "captures", "flame") for each in more for spec in fields(each)}
-    options = (kind, resume, *more)
-    return Command(_about(kind), run, options, may_lack=("run", "captures"), leaves=leaves)
+    return Command(_about(kind), run, (kind, resume), may_lack=("run", "captures"), leaves=leaves)
 
 
-def _write_selection(request: Select | SelectForTake, path: Path | None) -> None:
+def _write_selection(request: Select, path: Path | None) -> None:
     """Carry out the request; write timestep -> triangles into an .npz where asked to."""
     found = carry_out(request, with_bar=False)
     assert isinstance(found, Selected)
@@ -471,17 +463,7 @@ COMMANDS = {
         uses_head=True,
     ),
     "refine": _continuing(Refine, REFINE_SECONDS),
-    "extend": _continuing(
-        Extend,
-        EXTEND_SECONDS,
-        _lone(
-            "select_only",
-            Path | None,
-            "only write which triangles it would train: timestep of the take -> triangles",
-            None,
-            "NPZ",
-        ),
-    ),
+    "extend": _continuing(Extend, EXTEND_SECONDS),
     "relight": _asking(Relight),
     "exact": _asking(MakeExact),
     "perform": Command(

@@ -15,28 +15,36 @@ TIMECODE = re.compile(
     re.ASCII,
 )
 """Also behind a date, as in ISO 8601; hours may be missing."""
-BASES = (24, 25, 30, 48, 50, 60, 100, 120, 240)  # Frames per second that timecodes count
-USUAL_BASE = 60  # Of a take of less than a second, whose frame numbers do not tell
+BASES = (24, 25, 30, 48, 50, 60, 100, 120, 240)
+"""Frames per second that timecodes count."""
+TYPICAL_BASE = 60
+"""Base of a take of less than a second, whose frame numbers do not tell it."""
 DAY_S = 86_400.0
+
 DROP_DAY_S = (30 * DAY_S - 2 * 1296) * 1001 / 30_000
 """A day in which 1296 minutes leave out two of 30 frames a second."""
-DROP_RATIO = 1000 / 1001  # Of drop-frame timecodes, with a semicolon, whose frames come slower
-CLOCK_TOLERANCE_S = 0.002  # Of milliseconds that are cut off or rounded
-MIN_DISTINCT_FRAMES = 3  # Frames of a second that tell milliseconds from shares of a frame
+DROP_RATIO = 1000 / 1001
+"""Speed of drop-frame timecodes, with a semicolon, whose frames come slower."""
+CLOCK_TOLERANCE_S = 0.002
+"""Error of milliseconds that are cut off or rounded."""
+MIN_DISTINCT_FRAMES = 3
+"""Frames of a second that tell milliseconds from fractions of a frame."""
 UNITS_S = {
     **dict.fromkeys(("s", "sec", "secs", "second", "seconds"), 1.0),
     **dict.fromkeys(("ms", "msec", "millis", "millisecond", "milliseconds"), 1e-3),
     **dict.fromkeys(("us", "μs", "usec", "micros", "microsecond", "microseconds"), 1e-6),
     **dict.fromkeys(("ns", "nsec", "nanos", "nanosecond", "nanoseconds"), 1e-9),
 }
-"""As NFKC spells them, which makes the micro sign a Greek letter."""
+"""Units as NFKC spells them, which makes the micro sign a Greek letter -> seconds."""
 UNIT_NAMES = {1e-3: "milliseconds", 1e-6: "microseconds", 1e-9: "nanoseconds"}
+"""Seconds of a unit -> its name in messages."""
 TIME_WORDS = (
     *("timecode", "time", "timestamp", "elapsed", "t", "pts"),
     *("ts", "clock", "datetime", "date", "epoch", "unix", "utc"),
 )
 """Names of times, in the order in which one of several is taken."""
 BESIDE_TIMES = ("frame", "stamp", "code", "in", "relative", "media", "video")
+"""Words that may stand beside these in a column's name."""
 MIN_FPS = 1.0
 """Least rows a second of a performance."""
 MAX_FPS = 1000.0
@@ -48,12 +56,14 @@ MIN_DISTINCT = 0.5
 MAX_DIFFERENCE = 0.05
 """Relative difference of two columns' durations, above which they disagree."""
 MIN_ROWS_PER_S = 1.5
+"""Least rows a second that recordings of faces have: of seconds and their thousandths, only one
+gives such a rate."""
 MAX_ROWS_PER_S = 250.0
-"""Of recordings of faces; of seconds and their thousandths, only one gives such a rate."""
+"""Most rows a second that they have."""
 MAX_FRAME_STEP = 4  # Between rows that are numbered by frames of `DEFAULT_FPS`
 DEFAULT_FPS = 60.0  # Of files that hold neither times nor a rate: ARKit's own
 RATES = tuple(sorted({rate * share for rate in (10, 12, 15, *BASES) for share in (1, DROP_RATIO)}))
-MAX_RATE_DIFFERENCE = 0.02  # Of a usual rate from that of the times, relative
+MAX_RATE_DIFFERENCE = 0.02  # Of a standard rate from that of the times, relative
 GRID_TOLERANCE = 0.1  # Of a row's distance, within which all rows come evenly
 LONG_STEP = 1.5  # Times the median, above which rows are missing between two
 
@@ -297,7 +307,7 @@ def _seconds_of_frames(
     possible = [base for base in BASES if base > (frames + parts).max()] or [
         10 ** len(str(int(frames.max())))
     ]
-    base = USUAL_BASE if USUAL_BASE in possible else possible[0]
+    base = TYPICAL_BASE if TYPICAL_BASE in possible else possible[0]
     if len(np.unique(second)) > 1:
         base = min(possible, key=lambda base: _unevenness(second + (frames + parts) / base))
     if not is_dropping:
@@ -317,13 +327,13 @@ def evened(times: np.ndarray) -> tuple[np.ndarray, float]:
     """Ascending times (T,) from 0, and how many rows a second there are where none is missing.
 
     Where rows come evenly but for rounding, as whole milliseconds are, times are those of even
-    rows, at a usual rate where that agrees as well.
+    rows, at a standard rate where that agrees as well.
     """
     if len(times) < 2:
         return times, DEFAULT_FPS
     steps = np.diff(times)
-    usual = steps[steps <= LONG_STEP * np.median(steps)]
-    mean = 1 / float(usual.mean())
+    typical = steps[steps <= LONG_STEP * np.median(steps)]
+    mean = 1 / float(typical.mean())
     near = [rate for rate in RATES if abs(rate / mean - 1) < MAX_RATE_DIFFERENCE]
     for rate in (*sorted(near, key=lambda own: abs(own - mean)), mean):
         rows = np.round(times * rate)

@@ -14,6 +14,7 @@ AXES = {"yaw": 0, "pitch": 1, "roll": 2, "y": 0, "x": 1, "z": 2, "w": 3}
 _ROTATION = "(?:rotation|rot|quaternion|quat|eulerangles?|euler|angles?|orientation|pose)"
 _NAME = re.compile(f"(?:head|{_ROTATION})*(yaw|pitch|roll)|head{_ROTATION}+([xyzw])")
 _LIKE_A_ROTATION = re.compile(f"head$|head.*({_ROTATION}|matrix|transform|yaw|pitch|roll)")
+
 NECK_RAD = np.radians([100.0, 80.0, 80.0])
 """Yaw, pitch and roll that no neck reaches."""
 MAX_OUTLIERS = 0.01

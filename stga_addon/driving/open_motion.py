@@ -39,13 +39,16 @@ PART_FIELDS = {"face": "expr", "jaw": "jaw_pose", "eyes": "eyes_pose"}
 """Part of a face -> field of a frame that holds it."""
 # Of frames that count as quiet; compared ones
 QUIET_SHARE = 0.2
+"""Fraction of the frames that count as quiet."""
 MAX_COMPARED_FRAMES = 1000
+"""Frames that are compared to find these."""
 NEUTRALS = {
     "none": "as recorded",
     "quiet": "both recordings are at rest in the fifth of their frames that are most alike",
     "first": "both recordings begin at rest",
     "calibrated": "the motion is relative to the performer's resting face already",
 }
+"""Choice of a neutral face -> what it assumes."""
 MIN_WIDTH = {"face": 0.5, "jaw": 0.02, "eyes": 0.1}
 """Least half width of a trained range, in units of coefficients and in radians."""
 OUTER_QUANTILE = 0.01  # Of trained frames, cut off at both ends: single mistracked ones

@@ -54,8 +54,9 @@ def parse_packet(data: bytes) -> FacePacket | None:
 MAX_TEXT_BYTES = 256 << 20
 MAX_ROWS = 1 << 20
 COUNT_COLUMN = "blendshapecount"
+
 MAX_OTHERS = 256
-"""Columns of JSON frames, besides shapes, that are looked at."""
+"""Columns of JSON frames, besides shapes, that are examined."""
 MAX_DEPTH = 4
 """Levels of dictionaries in a JSON frame that are looked at."""
 MAX_PERCENT = 110.0  # Of weights, of which some are a little above the whole

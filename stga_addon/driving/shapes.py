@@ -68,21 +68,29 @@ def effective_weights(weights: np.ndarray) -> np.ndarray:
 
 
 EYE_JOINTS = (JOINTS.index("right_eye"), JOINTS.index("left_eye"))
+
 MIN_EYE_DISTANCE_M = 0.03
+"""Least distance of a head's eyes."""
 MAX_EYE_DISTANCE_M = 0.15
+"""Largest distance of a head's eyes."""
 EYEBALL_RADIUS_M = 0.012
-"""Of a head without eyeballs: its pupils are taken to lie in front of the eyes' joints."""
+"""Radius for a head without eyeballs: its pupils are taken to lie in front of the eyes' joints."""
 ITERATIONS = 12
+"""Steps in which a mesh is laid on the other."""
 CANDIDATES = 24
 """Triangles whose centers are nearest to a point, among which the nearest is looked for."""
 NEIGHBOURS = 200
+"""Triangles around each point that are kept for the next search."""
 MAX_MOVE_M = 0.01
-"""Triangles around each point that are kept for the next search, until a point has moved so far."""
-MIN_COSINE = 0.5  # Between the normals of a point and of the triangle that it may lie on
-FAR_M = 1.0  # Added to the distance of triangles that face another way
+"""Distance that a point may move until these are searched anew."""
+MIN_COSINE = 0.5
+"""Cosine between the normals of a point and of the triangle that it may lie on."""
+FAR_M = 1.0
+"""Added to the distance of triangles that face another way."""
 MAX_MATCH_M = 0.003
+"""Distance up to which a nearest point counts."""
 MEDIANS = 4.0
-"""A nearest point counts up to this distance, or this many times the median of all."""
+"""And up to this many times the median of all."""
 TANGENTIAL_WEIGHT = 0.1
 PUPIL_WEIGHT = 30.0
 IDENTITY_DEVIATION_M = 0.002

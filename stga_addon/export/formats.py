@@ -110,7 +110,7 @@ class Format:
     """A row of FORMATS: what menus and the command line need to know of a format, and its writer.
 
     label, description  in menus
-    suffixes  of the file, the usual one first; none: a folder
+    suffixes  of the file, the standard one first; none: a folder
     source    "frame": the avatar on one posed mesh; "range": on several; "motion": the avatar and
               its FLAME parameters
     write     writes a `Content`, of splats without a rig also a `WorldContent`, to a path: returns

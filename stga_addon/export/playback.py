@@ -13,9 +13,11 @@ from ..errors import StgaError
 from .rig import ShapeControls
 
 DEFAULT_FPS = 25.0
+"""Frame rate where none is known."""
 MIN_FPS = 0.01
+"""Least frame rate that videos, USD files and the web player (player/data.js) take."""
 MAX_FPS = 1000.0
-"""Frame rates that videos, USD files and the web player (player/data.js) take."""
+"""Largest frame rate that they take."""
 MAX_VIEWS = 32
 """Cameras that a page offers."""
 

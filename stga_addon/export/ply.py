@@ -27,6 +27,7 @@ from ..progress import Say, warn
 MAX_SPLAT_BYTES = 16 << 30
 READ_FILES = "the folder of a run, an avatar (.npz), or splats (.ply, .spz, .splat)"
 COLOR_NAMES = (("red", "green", "blue"), ("r", "g", "b"))
+
 FRAME_NAME = re.compile(r"(\d{5,}|-\d{4,})\.ply")
 """Name of a frame of a sequence: 00012.ply."""
 REST_COEFFICIENTS = 3 * ((MAX_SH_DEGREE + 1) ** 2 - 1)

@@ -25,10 +25,13 @@ from .spz import smallest_three
 EXTRA = "stga_splats"
 """Key of the splats in the document's `extras`."""
 VERSION = 1
+
 MAX_PLANES = 4
+"""Bytes of a number at most, each in a plane of its own."""
 MAX_STEPS = 1 << 31
 """Largest number of steps from zero: what four planes hold."""
 GZIP_LEVEL = 9
+
 AXES = "_axes"
 """Suffix of the axes (n, n), columns, along which rows of an array of n numbers are stored."""
 TURNED = ("color", "sh", "strain_color", "normal_color")
@@ -98,8 +101,9 @@ def _entry(name: str, array: np.ndarray, step: float | None) -> tuple[dict[str, 
 
 
 POSITION_STEP_M = 2.5e-5
+"""Step of splats' positions."""
 MOVED_STEP_M = 4e-5
-"""Of splats, and of how far a driven offset moves them with a unit of its signal."""
+"""Step of how far a driven offset moves them with a unit of its signal."""
 OFFSET_STEP = 2.0**-7
 """Of other driven offsets."""
 PLAYER_SIGNALS = ("smoothed_strain", "normal")
@@ -127,8 +131,9 @@ IRRADIANCE_STEPS = 1023
 """Steps to the largest irradiance of the capture, whose level is any."""
 
 MIN_SLIDER_RANGE = 1.0
+"""Sliders reach ±this at least."""
 SLIDER_HEADROOM = 1.5
-"""Sliders reach beyond the motion by this factor, and to ±1 at least."""
+"""And beyond the motion by this factor."""
 
 
 def skinned_glb(rigged: RiggedAvatar, playback: Playback, exact: bool = False) -> bytes:

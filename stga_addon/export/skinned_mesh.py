@@ -10,8 +10,10 @@ from .gltf import COMPONENTS, VERTICES, Accessors, accessor_of, little_endian, r
 from .rig import Rig
 
 QUANTIZATION = "KHR_mesh_quantization"
+
 SHAPE_STEP_M = 4e-5
-"""Of what a shape moves a vertex by; larger where one moves farther than a short integer holds."""
+"""Step of what a shape moves a vertex by; larger where one moves farther than a short integer
+holds."""
 MIN_SHAPE_M = 8e-5
 """What a shape moves by less is left where it is."""
 BASE_STEP_M = 2.0**-20

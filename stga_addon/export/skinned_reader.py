@@ -27,6 +27,7 @@ from .spz import of_smallest_three
 AVATAR_FILE = "avatar.npz"
 MODEL_FILE = "flame_model.npz"
 MOTION_FILE = "motion.npz"
+
 KNOWN_ARRAYS = (
     *("splats_per_face", "unbound", "xyz", "log_scale", "opacity", "rotation", "rotation_largest"),
     *("color", "sh", "neutral", "joint_basis", "correctives", "strain_range", *OFFSETS),
@@ -42,6 +43,7 @@ MAX_SKIPPED_BYTES = 1 << 28
 BLOCK_BYTES = 1 << 20
 """Bytes of an array that is not read which are unpacked at a time."""
 MAX_PLANES = 8
+"""Bytes of a number at most."""
 MAX_MOVED_NUMBERS = 1 << 27
 """Coordinates that shapes without a name move in all frames: half a gigabyte."""
 BIND_TOLERANCE = 1e-6

@@ -14,6 +14,7 @@ from .ply import MAX_SPLAT_BYTES, READ_FILES, read_ply
 from .spz import read_spz
 
 CONVERTED = "are not read; save them as .ply, for example with SuperSplat"
+
 UNREAD_SUFFIXES = {
     ".ksplat": "mkkellogg's splats",
     ".sog": "PlayCanvas' SOG",

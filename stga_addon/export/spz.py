@@ -17,6 +17,7 @@ from ..progress import Say, warn
 from .ply import READ_FILES
 
 MAGIC = b"NGSP"
+
 VERSION = 3
 """The last packed by gzip: version 4 needs Zstandard, which Blender's Python lacks."""
 READ_VERSIONS = 1, 2, 3
@@ -27,12 +28,15 @@ MAX_SPZ_BYTES = 2 << 30
 MAX_SPZ_SPLATS = 10_000_000
 MAX_SPZ_DEGREE = 4
 ANTIALIASED = 1
+
 MAX_FRACTION_BITS = 16
 """Resolution of positions: 2⁻¹⁶ m = 15 µm, within ±128 m; coarser where splats are farther away."""
 COORDINATE_BITS = 24
+
 MAX_COORDINATE = (1 << (COORDINATE_BITS - 1)) - 1
-"""Largest coordinate, in meters or in units of its resolution."""
+"""Largest coordinate in units of its resolution."""
 COLOR_SCALE = 0.15
+"""Scale of the constant coefficient in a byte."""
 OTHERS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
 """Part of a quaternion -> the other three."""
 

@@ -15,6 +15,7 @@ from ..files import replacing
 
 PRIM_TYPE = "ParticleField3DGaussianSplat"
 COEFFICIENTS = "radiance:sphericalHarmonicsCoefficients"
+
 EXTENT_DEVIATIONS = 3.0
 """Standard deviations that count as a splat's extent, as for USD's Gaussian kernel."""
 

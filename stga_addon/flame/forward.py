@@ -9,8 +9,9 @@ from .model import JOINTS, FlameModel
 from .quaternions import from_axis_angle, from_matrices, multiply, to_axis_angle, to_matrices
 
 POSE_SIZE = 3 * len(JOINTS)
+"""Axis-angles of the joints at the end of a frame's parameters, after the expression."""
 TRANSLATION_SIZE = 3
-"""At the end of a frame's parameters, after the expression: the joints' axis-angles; a shift."""
+"""Coordinates of the shift that ends a frame's parameters."""
 RIGID_SIZE = POSE_SIZE + TRANSLATION_SIZE
 MAX_UNWOUND_RAD = 1.5 * np.pi  # At a whole turn, an axis-angle's change may turn nothing
 SMALL_ANGLE = 1e-4  # Radians, below which a quotient by the squared angle is its limit

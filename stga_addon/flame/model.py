@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from ..errors import StgaError
-from ..files import converted, npz_outlines, read_npz
+from ..files import NpzFile, converted, file_digest, open_npz
 from .unpickle import read_pickled_arrays
 
 Arrays = Mapping[str, np.ndarray]
@@ -17,8 +17,11 @@ POSE_FEATURES = 9 * (len(JOINTS) - 1)
 # FLAME 2020 and 2023: 300 identity then 100 expression components
 FULL_COMPONENTS = 400
 FULL_IDENTITY = 300
+
 MASK_FILE = "FLAME_masks.pkl"
-MASK_PREFIX = "masks/"  # an npz model may carry its vertex masks itself
+
+MASK_PREFIX = "masks/"
+"""Prefix of the vertex masks that an npz model may carry itself."""
 MAX_MODEL_NUMBERS = 1 << 25
 """Numbers of a head model with all that is filled in, each 8 bytes in memory: five times FLAME."""
 FILLED_NUMBERS_PER_VERTEX = 3 * POSE_FEATURES + 2 * len(JOINTS)
@@ -26,6 +29,7 @@ FILLED_NUMBERS_PER_VERTEX = 3 * POSE_FEATURES + 2 * len(JOINTS)
 TEMPLATE_KEYS = ("v_template", "mean")
 """Keys of the neutral head, in FLAME's form and in a linear model's."""
 MODEL_KEYS = ("v_template", "shapedirs", "posedirs", "J_regressor", "kintree_table", "weights", "f")
+"""Arrays of a FLAME model."""
 BUNDLED_HEAD = Path(__file__).with_name("head.npz")
 """The head model of this package: ICT-FaceKit (MIT License, Copyright (c) 2020 USC Institute for
 Creative Technologies) in FLAME's form, made by `development/bundled_head.py`."""
@@ -56,6 +60,7 @@ class FlameModel:
     has_found_masks  whether these are of no file, but found on the mesh
     expression_names  ARKit's name of each expression, whose coefficient is then a weight from 0 to
                       1; else ()
+    file_digest  SHA-256 of the file; "": of none
     """
 
     v_template: np.ndarray
@@ -69,6 +74,7 @@ class FlameModel:
     masks: Mapping[str, np.ndarray] = field(default_factory=dict)
     expression_names: tuple[str, ...] = ()
     has_found_masks: bool = False
+    file_digest: str = ""
 
     @property
     def n_expression(self) -> int:
@@ -85,9 +91,10 @@ def read_flame(path: Path) -> FlameModel:
     posedirs. Raises StgaError naming the file and key that is missing, of the wrong shape or not
     finite, and any class in a pickle that is not an array.
     """
-    arrays = _model_arrays(path)
+    arrays, digest = _model_arrays(path)
     model = model_of(path, arrays)
-    return replace(model, masks=_masks(path, arrays, len(model.v_template)))
+    masks = _masks(path, arrays, len(model.v_template))
+    return replace(model, masks=masks, file_digest=digest)
 
 
 def model_of(path: Path, arrays: Arrays) -> FlameModel:
@@ -116,28 +123,31 @@ def model_of(path: Path, arrays: Arrays) -> FlameModel:
     )
 
 
-def _model_arrays(path: Path) -> Arrays:
-    """Those of MODEL_KEYS, and what else the file has of a model."""
+def _model_arrays(path: Path) -> tuple[Arrays, str]:
+    """Those of MODEL_KEYS, what else the file has of a model, and the file's digest."""
     if path.suffix.lower() == ".npz":
         own = (*MODEL_KEYS, "n_identity", "shape_steps", EXPRESSION_NAMES)
-        arrays = read_model_npz(path, own)
+        with open_npz(path) as file:
+            digest = file.digest()
+            arrays = model_arrays(file, own)
         if "shape_steps" in arrays and "v_template" in arrays:
             steps = finite(path, arrays, "shape_steps", (None, len(arrays["v_template"]), 3))
             arrays["shapedirs"] = np.moveaxis(SHAPE_STEP_M * steps, 0, -1)
         if "v_template" in arrays:
             arrays.setdefault("posedirs", np.zeros((len(arrays["v_template"]), 3, POSE_FEATURES)))
     else:
-        arrays = read_pickled_arrays(path, (*MODEL_KEYS, "n_identity"))
-    return arrays
+        arrays = read_pickled_arrays(path, (*MODEL_KEYS, "n_identity"))  # which refuses pipes
+        digest = file_digest(path)
+    return arrays, digest
 
 
-def read_model_npz(path: Path, names: Collection[str]) -> dict[str, np.ndarray]:
+def model_arrays(file: NpzFile, names: Collection[str]) -> dict[str, np.ndarray]:
     """Arrays of a head model, `names` and vertex masks. Raises StgaError before it is unpacked
     where a model of these would have more than MAX_MODEL_NUMBERS."""
-    outlines = npz_outlines(path)
+    outlines = file.outlines()
     chosen = [name for name in outlines if name in names or name.startswith(MASK_PREFIX)]
-    _check_size(path, {name: outlines[name] for name in chosen})
-    return read_npz(path, chosen)
+    _check_size(file.path, {name: outlines[name] for name in chosen})
+    return file.arrays(chosen)
 
 
 def _check_size(path: Path, arrays: Arrays) -> None:

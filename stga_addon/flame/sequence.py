@@ -50,6 +50,7 @@ FIELD_ALIASES = {
     "jaw_params": "jaw_pose",
     "shape_params": "shape",
 }
+"""Field as other programs name it -> as it is read."""
 JOINT_COUNTS = {"rotation": 1, "neck_pose": 1, "jaw_pose": 1, "eyes_pose": 2}
 """Fields that are rotations -> how many of them."""
 # Numbers of a rotation by two rows of its matrix, or the matrix
@@ -147,21 +148,25 @@ def joint_angles(frames: Sequence[FlameFrame]) -> np.ndarray:
     return np.degrees(angles.max(axis=0))
 
 
-def read_frame(path: Path, model: FlameModel) -> FlameFrame:
+def read_frame(path: Path, model: FlameModel, arrays: Arrays | None = None) -> FlameFrame:
     """Read one timestep's `flame_param/*.npz` (VHAP and GaussianAvatars captures), with or without
     a leading 1. Neck, jaw, eyes and dynamic offset may be missing (zero); fewer expression
     coefficients than the model has, and offsets without the parts' vertices, are filled up with
-    zeros. Raises StgaError naming the file and the field."""
-    arrays = read_npz(path)
+    zeros. Raises StgaError naming the file and the field.
+
+    arrays: of the file, where they were read already.
+    """
+    arrays = read_npz(path) if arrays is None else arrays
     for name in ("expr", "rotation", "translation"):
         if name not in arrays:
             raise StgaError(f"{path}: has no {name}, which a FLAME frame needs")
     return _frame(path, arrays, model)
 
 
-def read_identity(path: Path, model: FlameModel) -> Identity:
-    """Shape (I,) and static offset (V, 3) or None of a file. Errors as in `read_frame`."""
-    return _identity(path, read_npz(path), model)
+def read_identity(path: Path, model: FlameModel, arrays: Arrays | None = None) -> Identity:
+    """Shape (I,) and static offset (V, 3) or None of a file. Arguments and errors as in
+    `read_frame`."""
+    return _identity(path, read_npz(path) if arrays is None else arrays, model)
 
 
 def torso_shapes(model: FlameModel) -> np.ndarray:

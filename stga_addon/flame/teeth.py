@@ -34,10 +34,13 @@ TEETH_STRIPS = {
 }
 # Sizes as shares of the width between the corners of the mouth, about 50 mm.
 ARCH_WIDTH = 0.85
-CLEARANCE = 0.03  # Between the lips' inner surface and the teeth
+"""Width of the arch as a fraction of the mouth's."""
+CLEARANCE = 0.03
+"""Gap between the lips' inner surface and the teeth."""
 OVERBITE = 0.06
+"""How far the upper edge reaches below the lower one."""
 OVERJET = 0.02
-"""How far the upper edge reaches below the lower one, and stands in front of it."""
+"""How far the upper edge stands in front of the lower one."""
 EDGE_THICKNESS = 0.05
 ROOT_THICKNESS = 0.1
 MAX_MOUTH_RINGS = 12

@@ -45,10 +45,11 @@ from .track import MAX_MISFIT, WRITER, Track, track
 from .train import Train
 
 SHAPES_SUFFIX = ".csv"
+"""Suffix of a performance."""
 TRACKING_SUFFIX = ".tracking"
+"""Suffix of the folder beside the result in which an avatar tracks."""
 CHECK_SUFFIX = ".check"
-"""Of the folders beside the result, in which an avatar tracks, and in which it does a few
-timesteps first."""
+"""Suffix of that in which it tracks a few timesteps first."""
 CHECKED_TIMESTEPS = 8
 """Spread over the footage, which show whether the avatar is the performer's."""
 

@@ -38,8 +38,9 @@ from . import avatar_source
 from .train import Train
 
 RATED = " and ".join(name for name, format in FORMATS.items() if format.has_rate)
+"""Names of the formats with a frame rate, for help."""
 RIGGED = " and ".join(name for name, format in FORMATS.items() if format.has_rig)
-"""Names of formats, for help."""
+"""Names of the formats with a rig, for help."""
 
 
 def _formats(test: Callable[[Format], bool]) -> When:
@@ -119,7 +120,7 @@ class Export:
         "leave out the capture's light: colors are the albedo (docs/light.md)", False
     )
     filmed_only: bool = option(
-        "leave out what is plausible only: splats that no camera saw, colors from aside", False
+        "leave out what is plausible only: splats that no camera saw, off-axis colors", False
     )
 
     def check(self) -> None:

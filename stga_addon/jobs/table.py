@@ -37,13 +37,11 @@ from .train import (
     Refine,
     Resume,
     Selected,
-    SelectForTake,
     Train,
     avatar_file,
     refuse_run,
     require_run,
     resumed,
-    select_for_take,
     train_and_finish,
 )
 
@@ -53,7 +51,6 @@ Request = (
     | Refine
     | Extend
     | Select
-    | SelectForTake
     | Track
     | MakeAvatar
     | SolveAgain
@@ -69,6 +66,7 @@ Request = (
     | MakeExact
 )
 Result = Written | Selected | Analyzed
+
 Work = Callable[..., Result]
 """Called with a request, a `Report` and a `Say`; raises what `perform` does."""
 
@@ -80,7 +78,6 @@ class Kind(StrEnum):
     TRACKING = "tracking"
     AVATAR = "avatar"
     ANALYSIS = "analysis"
-    SELECTION = "selection"
     PERFORMANCE = "performance"
     LIGHT = "light"
     EXACT = "exact"
@@ -122,12 +119,12 @@ _NEW_RUN = Job(
     output="run",
     files=avatar_file,
 )
+
 JOBS: dict[type[Any], Job] = {
     Train: _NEW_RUN,
     Refine: _NEW_RUN,
     Extend: _NEW_RUN,
     Resume: Job(train_and_finish, Kind.TRAINING, "run", check=require_run),
-    SelectForTake: Job(select_for_take, Kind.SELECTION, "capture"),
     Track: Job(track, Kind.TRACKING, "out", check=refuse_tracked, left=untracked, output="out"),
     SolveAgain: Job(solve_again, Kind.TRACKING, "capture", check=require_tracked),
     MakeAvatar: Job(make_avatar, Kind.AVATAR, "out", check=check_avatar),
@@ -203,9 +200,6 @@ KINDS = {
     ),
     Kind.ANALYSIS: RequestKind(
         "The analysis", "Stop the analysis; earlier results stay", is_transient=True
-    ),
-    Kind.SELECTION: RequestKind(
-        "The selection", "Stop selecting; the groups stay as they are", is_transient=True
     ),
     Kind.PERFORMANCE: RequestKind(
         "The performance of the video",

@@ -34,19 +34,22 @@ WORLDS = {
     "head": "in meters, y up, the head near the origin",
     "keep": "that of the cameras",
 }
+"""Choice of the world's axes and scale -> what it is."""
 SYNC = {
     "none": "the given offsets alone",
     "auto": "by the videos' sound where all have it, else by what moves",
     "sound": "by the videos' sound",
     "motion": "by what moves in them",
 }
+"""Choice of how several videos are aligned in time -> what it is."""
 MATTES = {"auto": "made for frames without a mask", "none": "only those of the footage"}
 """What `Track.mattes` may be but a folder of masks."""
 CAPTURE_FOLDER = "capture"
 RUN_FOLDER = "run"
+
 INPUTS = "inputs.json"
-"""In the folder of `MakeAvatar`: capture, run, and what was asked for when they began, which alone
-continues."""
+"""File in the folder of `MakeAvatar`: capture, run, and what was asked for when they began, which
+alone continues."""
 
 
 def _parsed_mattes(text: str) -> str:
@@ -180,9 +183,10 @@ QUICK: Mapping[str, Any] = {"step": 3, "size": 0.5}
 """Fields of `Track` for a first look at an avatar."""
 QUICK_S = 30.0
 """Of training, for one."""
-WRITER = "tracking is writing this capture"  # Who holds its lock
+WRITER = "tracking is writing this capture"
+"""Who holds the lock of a capture that is being tracked."""
 MAX_MISFIT = 0.5
-"""Median share of the head's pixels, beyond which the avatar is another person's."""
+"""Median fraction of the head's pixels beyond which the avatar is another person's."""
 TRACKING_SHARE = 0.5
 """Of the progress, before an avatar tracks or is trained."""
 

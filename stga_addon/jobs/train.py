@@ -4,11 +4,11 @@ import math
 from collections.abc import Mapping
 from dataclasses import KW_ONLY, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..avatar.file import read_avatar
+from ..avatar.file import Avatar, read_avatar
 from ..capture import model as capture_model
 from ..capture.meshes import SELECTED_WEIGHT, find_region, is_region_file
 from ..capture.model import Capture
@@ -25,16 +25,19 @@ from ..report import CurveUpdater, report_run
 from ..schema import setting
 from ..training.effect_catalog import RELIGHT, WORLD
 from ..training.run import folder as run_folder
-from ..training.run.folder import AVATAR, Continuation, OpenedRun, Run
+from ..training.run.folder import AVATAR, Continuation, Run
 from ..training.run.identity import identity_of
 from ..training.settings import MAX_GROWTH, TrainingSettings, with_budget
 
-MAX_NAMED_VIEWS = 6  # Views that a warning names
+if TYPE_CHECKING:
+    from ..training.run.session import Trained
+
 AFTERWARDS = (StgaError, Cancelled, MemoryError)
 """What may end the work after a training, whose avatar is whole without it."""
 AFTER_S = 20.0
+"""Seconds that light and world take after a training, about."""
 AFTER_SHARE = 0.05
-"""Of light and of world, about: seconds, and share of the progress."""
+"""Fraction of the progress that they take."""
 Selection = Mapping[int, np.ndarray]  # timestep -> (F,) bool: triangles to train
 
 
@@ -179,35 +182,31 @@ class Selected:
     selection: Selection
 
 
-@dataclass(frozen=True)
-class SelectForTake:
-    """Find out which triangles extending a run by a take would train."""
-
-    parent: Path
-    capture: Path
-    flame: Path | None = None
-
-
 Training = Train | Resume | Refine | Extend
 
 
 @dataclass(frozen=True)
 class Prepared:
-    """A run that can be trained: the capture of all its takes, and what each timestep trains."""
+    """A run that can be trained: the capture of all its takes, and what each timestep trains.
+
+    parent  the avatar that it continues, which is held so that `read_avatar` reads its file once
+    """
 
     request: Training
     run: Run
     capture: Capture
     selection: Selection | None = None
+    parent: Avatar | None = None
 
-    def train_as_asked(self, report: Report) -> Path:
-        """Train on the device of the request, or the one chosen for it; the path of the avatar.
-        Raises as `training.run.session.train_run`."""
-        from ..training.run.session import train_more, train_run, train_run_or_fall_back
+    def train_as_asked(self, report: Report) -> "Trained":
+        """Train on the device of the request, or the one chosen for it. Raises as
+        `training.run.session.train_and_measure`."""
+        from ..training.run.session import train_and_measure, train_more, train_run_or_fall_back
 
         if isinstance(self.request, Resume) and self.request.more_s is not None:
             return train_more(self.capture, self.request.run, self.run, self.request.more_s, report)
-        train = train_run_or_fall_back if self.request.device == "auto" else train_run
+        is_auto = self.request.device == "auto"
+        train = train_run_or_fall_back if is_auto else train_and_measure
         resumes = isinstance(self.request, Resume)
         return train(self.capture, self.request.run, self.run, self.selection, resumes, report)
 
@@ -239,7 +238,7 @@ def train_and_finish(request: Training, report: Report, say: Say) -> Written:
 
     def report_training(progress: Progress) -> bool:
         nonlocal latest, is_stopped
-        draw()
+        draw(progress.metrics)
         latest = progress
         is_stopped = tell(progress, 0.0)
         return is_stopped
@@ -250,9 +249,10 @@ def train_and_finish(request: Training, report: Report, say: Say) -> Written:
     def report_world(progress: Progress) -> bool:
         return tell(progress, after[0] + progress.share)
 
-    avatar = prepared.train_as_asked(report_training)
+    trained = prepared.train_as_asked(report_training)
+    avatar = trained.path
     tell(Progress(stage="Drawing the curve"), 0.0)
-    lines = report_run(folder)
+    lines = report_run(folder, latest.metrics)
     # whoever stops a training does not wait; `stga relight` finds the light out later
     if not is_stopped:
         lines += _light_of(prepared, avatar, report_light)
@@ -335,20 +335,6 @@ def prepare(request: Training, report: Report, say: Say) -> Prepared:
     return replace(prepared, run=replace(prepared.run, device=device))
 
 
-def select_for_take(request: SelectForTake, report: Report, say: Say) -> Selected:
-    """timestep -> (F,) bool: what extending the run by the take would train. Raises StgaError."""
-    report(Progress(stage="Comparing the avatar with the images"))
-    parent = request.parent
-    takes = (request.capture,)
-    wanted = Extend(parent, parent, takes, iterations=1, flame=request.flame)
-    _, _, selection, run = _joined_takes(wanted, say)
-    start = run.takes[-1].start
-    selection = {timestep - start: faces for timestep, faces in selection.items()}
-    for timestep, faces in selection.items():
-        say(f"{timestep:5d}  {faces.mean():6.1%}")
-    return Selected(selection)
-
-
 def _new_run(request: Train, report: Report, say: Say) -> Prepared:
     from ..raster.cpu.precompile import begin_compiling
     from ..training.effects.plan import plan_effects
@@ -388,7 +374,8 @@ def _refinement(request: Refine, report: Report, say: Say) -> Prepared:
         name = "painted"
     else:
         raise StgaError(f"weights: expected one for each triangle ({count},), got {weights.shape}")
-    face = read_avatar(parent / AVATAR).splats.face
+    avatar = read_avatar(parent / AVATAR)
+    face = avatar.splats.face
     if not region[face].any():
         raise StgaError(f"region '{name}': the avatar has no splats there")
     growth = request.growth * float(region[face].mean())
@@ -404,39 +391,33 @@ def _refinement(request: Refine, report: Report, say: Say) -> Prepared:
         raise StgaError(f"region '{name}': faces no training camera {between}")
     continuation = Continuation(parent.resolve(), file_digest(parent / AVATAR), first, last)
     run = replace(opened.run, settings=settings, identity=None, continuation=continuation)
-    return Prepared(request, run, capture, {capture.timesteps[0]: region})
+    return Prepared(request, run, capture, {capture.timesteps[0]: region}, avatar)
 
 
 def _extension(request: Extend, report: Report, say: Say) -> Prepared:
     from ..training.effects.plan import add_effects
     from ..training.run.continuation import continued_settings
 
-    report(Progress(stage="Comparing the avatar with the images"))
-    opened, capture, selection, run = _joined_takes(request, say)
-    needed = np.any(list(selection.values()), axis=0)
-    face = read_avatar(request.parent / AVATAR).splats.face
-    growth = request.growth * float(needed[face].mean())
-    settings = continued_settings(
-        opened.run.settings, "extend", growth, request.seconds, request.iterations, request.seed
-    )
-    say(f"takes: {1 + len(run.takes)}; the new ones need {needed.mean():.0%} of the triangles")
+    report(Progress(stage="Opening the takes"))
+    avatar = read_avatar(request.parent / AVATAR)
+    capture, run = _joined_takes(request)
+    budget = (request.seconds, request.iterations)
+    settings = continued_settings(run.settings, "extend", request.growth, *budget, request.seed)
+    say(f"takes: {1 + len(run.takes)}")
     settings, plan = add_effects(capture, settings, run.effect_plan)
     for old, new in zip(run.effect_plan, plan, strict=True):
         if new.on != old.on:
             say(f"{new.effect}  {new}")
     run = replace(run, settings=settings, effect_plan=plan)
-    return Prepared(request, run, capture, selection)
+    return Prepared(request, run, capture, {}, avatar)
 
 
-def _joined_takes(request: Extend, say: Say) -> tuple[OpenedRun, Capture, Selection, Run]:
-    """The run, its capture joined with the new takes, what these train, and the run with them.
+def _joined_takes(request: Extend) -> tuple[Capture, Run]:
+    """The capture of the run joined with the new takes, and the run with them.
 
     Raises StgaError where the run or a take does not exist, or a take is of another head, has no
-    training views or is in the run already. Says which views do not show the head as the avatar
-    does.
+    training views or is in the run already.
     """
-    from ..training.run.continuation import select_for_takes
-
     opened = run_folder.open_run(request.parent, flame=request.flame)
     run = opened.run
     new = list[Capture]()
@@ -464,9 +445,5 @@ def _joined_takes(request: Extend, say: Say) -> tuple[OpenedRun, Capture, Select
     parent = request.parent
     last = max(capture.timesteps)
     continuation = Continuation(parent.resolve(), file_digest(parent / AVATAR), starts[0], last)
-    selection, unlike = select_for_takes(continuation, capture, run.settings, starts)
-    if unlike:
-        names = ", ".join(view.name for view in unlike[:MAX_NAMED_VIEWS])
-        say(f"warning: {names}: does not look like the head from this camera; are images swapped?")
     run = replace(run, identity=None, takes=(*run.takes, *added), continuation=continuation)
-    return opened, capture, selection, run
+    return capture, run

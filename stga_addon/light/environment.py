@@ -13,11 +13,14 @@ from ..schema import from_json, setting
 from .harmonics import basis, rotated, uniform
 from .values import KINDS, SHAPES, SKIN_ROUGHNESS, Light, Lighting
 
-MIN_ROWS = 128  # Of a larger environment, to which it is made smaller
+MIN_ROWS = 128
+"""Rows to which a larger environment is shrunk."""
 MAX_SUNS = 4
+"""Suns that are taken out of an environment."""
 SUN_CONTRAST = 12.0
 """How much brighter than the mean of the environment a pixel must be to belong to a sun."""
-SUN_RADIUS = np.radians(12)  # Bright pixels within this angle of the brightest one are one sun
+SUN_RADIUS = np.radians(12)
+"""Angle from the brightest pixel within which bright ones are the same sun."""
 UPRIGHT = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 """From Blender's axes (z up) to those of a capture that is shown upright (y up, face along z)."""
 

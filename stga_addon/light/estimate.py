@@ -18,17 +18,21 @@ from .surface import Bounce, transfer_of
 from .values import Light
 
 MAX_TIMESTEPS = 10
+"""Timesteps, evenly spread, whose images are read."""
 MAX_CAMERAS = 12
+"""Cameras, evenly spread, whose images are read."""
 MAX_SIDE_PX = 800
-"""Views that are looked at, evenly spread, and the size that larger images are reduced to."""
+"""Size that larger images are reduced to."""
 MIN_FACING = 0.35
 """Least cosine between a triangle's normal and the direction to the camera."""
-HIDDEN_M = 0.003  # A triangle is hidden by what is nearer to the camera by as much
+HIDDEN_M = 0.003
+"""A triangle is hidden by what is nearer to the camera by as much."""
 POINTS = (np.eye(3) + 1 / 3) / 2
 """(3, 3) barycentric coordinates of the points of a triangle whose pixels are read."""
 SATURATED_LEVEL = 252
+"""Level of 255 from which a channel holds no information."""
 DARK_LEVEL = 4
-"""Levels of 255 from which on, and up to which, a channel says nothing."""
+"""Level of 255 up to which it holds none."""
 
 
 def observe(
@@ -84,26 +88,38 @@ def _view_colors(
 
 
 ITERATIONS = 40
-PRIOR = 0.7  # Weight of alike albedos, in observations of a triangle seen at every timestep
-POSED_DIRECTIONS = 96  # By which the transfer of a posed mesh is found, at each timestep
-UNSEEN_WEIGHT = 1e-3  # Of a timestep at which no camera sees a vertex, where each camera counts 1
+"""Reweighted least squares fits of light and albedo."""
+PRIOR = 0.7
+"""Weight of alike albedos, in observations of a triangle at every timestep."""
+POSED_DIRECTIONS = 96
+"""Directions by which the transfer of a posed mesh is found, at each timestep."""
+UNSEEN_WEIGHT = 1e-3
+"""Weight of a timestep at which no camera observes a vertex, where each camera counts 1."""
 MIN_OPEN_TRANSFER = 0.35 * np.pi * 0.28209479177387814
-"""Transfer of the constant harmonic below which a triangle lies in its own shadow."""
-LOSS_SCALE = 3.0  # Residual at which an observation's weight has halved, in medians
+"""Transfer of the constant harmonic below which a triangle lies in its shadow."""
+LOSS_SCALE = 3.0
+"""Residual at which an observation's weight has halved, in medians."""
 RIDGE = 1e-4
-MIN_ARRIVING = 0.02  # Least irradiance that a color is divided by, as a share of the mean
-TYPICAL_ALBEDO = 0.36  # Of skin (green): the level of an estimated light, until it is corrected
+
+MIN_ARRIVING = 0.02
+"""Least irradiance that a color is divided by, as a fraction of the mean."""
+TYPICAL_ALBEDO = 0.36
+"""Albedo of skin (green): the level of an estimated light, until it is corrected."""
 HARD_RESIDUAL = 0.12
+"""Residual from which the light is too hard to be removed."""
 VERY_HARD_RESIDUAL = 0.25
-"""Residuals from which on the light is too hard to be taken away, and albedo is damped most."""
+"""Residual from which albedo is damped most."""
 MAX_DAMPING = 0.6
 CARD_REFLECTANCE = 0.18
 
-EYE_ROUGHNESS = 0.2  # Of highlights on eyes: as sharp as splats of half a millimeter can show
+EYE_ROUGHNESS = 0.2
+"""Roughness of eyes, whose highlights are as sharp as splats of half a millimeter can show."""
 MIN_RADIUS_M = 0.007
+"""Least radius of an eyeball."""
 MAX_RADIUS_M = 0.017
+"""Largest radius of an eyeball."""
 MAX_DEVIATION = 0.12
-"""Share of the radius by which the vertices of an eyeball may leave the sphere, on average."""
+"""Fraction of the radius by which the vertices of an eyeball may leave the sphere, on average."""
 MIN_VERTICES = 24
 
 

@@ -13,12 +13,15 @@ from .array_kernels import toward_light
 from .harmonics import COUNT, basis
 from .values import KINDS, Caster, Light, Lighting
 
-MAP_SIZE = 512  # Texels a side of a light's shadow map, which just holds the head
-LIFT_M = 0.001  # Points are lifted off the surface by it, so that it does not shade itself
+MAP_SIZE = 512
+"""Texels a side of a light's shadow map, which just holds the head."""
+LIFT_M = 0.001
+"""How far points are lifted off the surface, so that it does not shade itself."""
 BIAS_M = 0.001
+"""A surface shades what lies deeper by this, and on slopes by what its depth changes within the
+taps."""
 MAX_BIAS_M = 0.006
-"""A surface shades what lies deeper by BIAS_M, and on slopes by what its depth changes within the
-taps, at most MAX_BIAS_M."""
+"""Largest bias on a slope."""
 TAP_STEP = 1.0  # Texels between the 3 × 3 places that are looked up: splats soften edges already
 
 
@@ -150,9 +153,11 @@ def kernels(name: str) -> Any:
 
 
 FEW = 1
+"""Points a side of an area light that is small for its distance."""
 SOME = 2
+"""Points a side of a larger one."""
 MANY = 3
-"""Points a side by which an area light is represented, by its size over its distance."""
+"""Points a side of the largest ones."""
 MIN_FADE = 1e-4
 
 

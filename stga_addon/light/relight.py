@@ -18,11 +18,13 @@ from .lamps import LIFT_M, Lamps, distant_light
 from .surface import Bounce, Lashes, at_splats, find_lashes, row_dot, surface_points
 from .values import SKIN_ROUGHNESS, Caster, Lighting
 
-UNLIKE_LIGHT = 0.2  # Difference of two lights from which on nothing is kept, as a share
+UNLIKE_LIGHT = 0.2
+"""Relative difference of two lights from which on nothing is kept."""
 ALIKE_AT_SPLAT = 0.25
+"""Difference between what arrives at a splat, now and in the capture, up to which all is kept:
+other objects' shadows."""
 UNLIKE_AT_SPLAT = 0.75
-"""Difference between what arrives at a splat, now and in the capture, up to which all is kept and
-from which on nothing: other objects' shadows."""
+"""The same from which on nothing is kept."""
 RIDGE = 1e-6  # For meshes without light in some harmonics
 
 
@@ -68,13 +70,17 @@ def _unit(vectors: np.ndarray) -> np.ndarray:
     return vectors / np.maximum(length, np.float32(1e-12))[:, None]
 
 
-REFLECTANCE = 0.04  # Of skin, eyes and teeth seen straight on: a refractive index of 1.5
-MIN_IRRADIANCE = 0.15  # Least irradiance that color is divided by, as a share of its mean: noise
+REFLECTANCE = 0.04
+"""Reflectance of skin, eyes and teeth seen straight on: a refractive index of 1.5."""
+MIN_IRRADIANCE = 0.15
+"""Least irradiance that color is divided by, as a fraction of its mean: noise."""
 HIGHLIGHT_SHARE = 0.034
+"""Fraction of what arrived in the capture that came back as highlights from skin; it is taken from
+recorded colors."""
 WET_HIGHLIGHT_SHARE = 0.14
+"""The same from wet eyes."""
 MIN_DIFFUSE_SHARE = 0.1
-"""Part of what arrived in the capture that came back as highlights, from skin and from wet eyes; it
-is taken from recorded colors, of which at least MIN_DIFFUSE_SHARE remains."""
+"""Fraction of recorded colors that remains at least."""
 VIEW_MEANS = (1.0, 0.65, 0.195, -0.089375)
 """By degree, harmonics' mean over directions that see a surface (cosine above 0.3), over their
 value straight from the front: what recorded colors are."""

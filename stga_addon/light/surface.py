@@ -44,12 +44,15 @@ def transfer_of(
     return transfer.astype(np.float32), (open_sky / np.maximum(whole_sky, 1e-9)).astype(np.float32)
 
 
-CELL_M = 0.02  # Side of the cells in which irradiance is averaged, with the 26 around a vertex's
+CELL_M = 0.02
+"""Side of the cells in which irradiance is averaged, with the 26 around a vertex's."""
 MAX_CELLS = 40
-"""Along an axis; a mesh that is larger, as one in centimeters, has larger cells."""
-SKIN = np.array([0.5, 0.33, 0.25])  # Albedo of the skin that light is reflected by
+"""Cells along an axis; a mesh that is larger, as one in centimeters, has larger cells."""
+SKIN = np.array([0.5, 0.33, 0.25])
+"""Albedo of the skin that light is reflected by."""
 MIN_OPEN = 0.3
-"""Share of the sky that a vertex must see to count as lit skin: those inside the head do not."""
+"""Fraction of the sky that a vertex must face to count as lit skin: those inside the head do
+not."""
 
 
 class Bounce:
@@ -155,9 +158,10 @@ def at_splats(values: np.ndarray, faces: np.ndarray, weights: np.ndarray) -> np.
     return found
 
 
-REACH_M = 0.025  # From the middle of an eyeball
+REACH_M = 0.025
+"""Distance from the middle of an eye within which dark splats are its lashes."""
 MIN_HEIGHT_M = 0.002
-"""Above the mesh: shadow maps have a bias, and splats of skin lie within 1.5 mm."""
+"""Height above the mesh: shadow maps have a bias, and splats of skin lie within 1.5 mm."""
 MIN_OPACITY = 0.3
 MAX_ALBEDO = 0.15
 EXTENT = 2.0  # A lash's half length in standard deviations of the splat: gaps close

@@ -20,11 +20,15 @@ from ..raster.cpu.rasterize import BufferPool, frames_in_camera, render_backward
 from .render import render
 
 STEPS = 120
+"""Steps of Adam."""
 MAX_VIEWS = 24
+"""Views that are fitted, at most."""
 MAX_SIDE_PX = 240
+"""Larger side to which they are shrunk."""
 RATES = np.array((0.01, 0.01, 0.01, 0.04), np.float32)
-"""Adam's first, of colors in sRGB and of logits; they fall to 0."""
+"""Adam's first rates, of colors in sRGB and of logits; they fall to 0."""
 BETAS = 0.9, 0.999
+
 FINENESS = 2
 """Parts of a pixel, in each direction, that are averaged in linear light: other renderers average
 samples, and do not blur what is thinner than a pixel, as ours does."""

@@ -19,13 +19,15 @@ from .client import pack_camera, pack_layers, receive, send, unpack_camera, unpa
 from .device import Composer
 
 CODEC = "libx264"
+"""H.264, which browsers, phones and editors play."""
 PIXEL_FORMAT = "yuv420p"
-"""H.264 with halved color resolution: what browsers, phones and editors play."""
+"""Halved color resolution, which they expect."""
 QUALITY = {"crf": "16", "preset": "medium"}
 """Constant rate factor of x264: 18 is called visually lossless, lower is better."""
 BT709 = 1
+"""Value of FFmpeg's AVCOL_* for BT.709, which players assume of untagged HD video."""
 LIMITED_RANGE = 1
-"""Of FFmpeg's AVCOL_* enumerations: what players assume of untagged HD video."""
+"""Value of FFmpeg's AVCOL_RANGE for levels of 16 to 235, which they assume as well."""
 IMAGE_NAME = re.compile(r"\d{4,}\.png", re.IGNORECASE)
 """Name of an image of a sequence: 0012.png."""
 

@@ -15,6 +15,7 @@ from ..errors import StgaError
 from . import tags
 
 HELPER = "STGA evaluation"
+"""Name of the object that keeps others evaluated."""
 _kept: list[int] = []
 """Session ids of the objects that `kept_evaluated` keeps now."""
 

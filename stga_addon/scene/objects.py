@@ -225,8 +225,7 @@ class Identity:
 
     def __init__(self, block: Any) -> None:
         self.uid = block.session_uid
-        self.name = block.name
-        """As it was last found."""
+        self.name = block.name  # when it was last found
         self._is_scene = block.id_type == "SCENE"
 
     def find(self) -> Any:

@@ -15,6 +15,7 @@ import bpy
 from . import tags
 
 PATH_TAGS = (tags.CAPTURE, tags.FLAME_MODEL, tags.RUN, tags.AVATAR, tags.WORLD)
+"""Properties of a head, or of the world's splats, that are paths."""
 SCENE_PATHS = ("training_run", "tracking_capture", "avatar_folder")
 """Properties of a scene's settings: what its last requests were about."""
 MAX_FOLDERS_UP = 2

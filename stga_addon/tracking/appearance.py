@@ -9,47 +9,65 @@ import numpy as np
 
 from ..capture.camera import Camera
 
-LEVELS_M = (0.0012, 0.0024, 0.0048, 0.0096)  # Pixel sizes of the pyramid at the head
-BLUR_PX = 0.8  # Standard deviation of the blur, by which differences of neighbors are derivatives
-DETAIL_PX = 2.5  # Of the neighborhood whose mean is taken off the luma, against lighting
+LEVELS_M = (0.0012, 0.0024, 0.0048, 0.0096)
+"""Size at the head of the pixels of each level of the pyramid, in meters."""
+BLUR_PX = 0.8
+"""Standard deviation of the blur, by which differences of neighbors are derivatives."""
+DETAIL_PX = 2.5
+"""Standard deviation of the neighborhood whose mean is taken off the luma, against lighting."""
 COLORS = np.array([[0.299, 0.587, 0.114], [0.8, -0.8, 0.0]], np.float32)
-"""Luma, and redness, in which lips differ from skin."""
-CHANNEL_WEIGHTS = np.array([0.5, 1.5, 0.7])  # Of luma, detail and redness
+"""Weights of red, green and blue in luma and in redness, in which lips differ from skin."""
+CHANNEL_WEIGHTS = np.array([0.5, 1.5, 0.7])
+"""Weights of luma, detail and redness."""
 NOISE_LEVELS = 6.0
 """Standard deviation, of 255, of a pixel from the texture on skin that is followed exactly."""
 LIGHT_PRIOR = 0.02
 """Weight of the camera's usual lighting in a view's, as a share of the points' information."""
 LIGHT_ITERATIONS = 2
+"""Reweighted least squares fits of the light."""
 TEXTURE_ITERATIONS = 4
+"""Reweighted averages of the texture."""
 MEAN_ITERATIONS = 3
+"""Reweighted averages of a mean."""
 ALBEDO_SCALE = 6 * NOISE_LEVELS
+"""Difference from skin of one color, in levels, beyond which pixels are outliers."""
 TEXTURE_SCALE = 4 * NOISE_LEVELS
+"""The same from the texture while it is being averaged."""
 LIGHT_SCALE = 2 * NOISE_LEVELS
+"""The same from the texture where the light is fitted."""
 MEAN_SCALE = 3 * NOISE_LEVELS
-"""Differences, in levels, beyond which pixels are outliers: against skin of one color, the texture
-as it is found, the texture, and the mean."""
+"""The same from a mean."""
 MIN_SHADING = 0.2
+"""Least factor of the light on a texture."""
 MAX_SHADING = 4.0
+"""Largest factor of the light on a texture."""
 OWN_VIEW_PRIOR = 6.0
-"""Observations of all cameras beside a camera's own: skin shines differently to each side."""
+"""Observations by all cameras that weigh as much as a camera's own: skin shines differently to each
+side."""
 MAX_DEVIATION_LEVELS = 60.0
-MAX_SAMPLES = 1 << 14  # Of an image at a time: OpenCV takes less than 2^15
-POINT_SHARE = 0.25  # Weight of a point in a view: neighboring points share pixels
+"""Largest difference, in levels, that counts in a texture's mean deviation."""
+MAX_SAMPLES = 1 << 14
+"""Samples of an image at a time: OpenCV takes fewer than 2^15."""
+POINT_SHARE = 0.25
+"""Weight of a point in a view: neighboring points share pixels."""
 OUTLIER_SQUARED = 4.0, 4.0, 16.0, 16.0
-"""By level: squared difference in NOISE_LEVELS at which a point is explained by half."""
+"""Squared difference in NOISE_LEVELS at which a point is explained by half, for each level."""
 FLOW_LEVEL = 1
+"""Level of the pyramid whose images optical flow compares."""
 FLOW_POINTS = 2
+"""Level of the pyramid whose points optical flow moves."""
 FLOW_ITERATIONS = 4
-"""Pyramid level of the images of optical flow, level of the points that it moves, and Gauss–Newton
-steps."""
+"""Gauss–Newton steps with a flow."""
 FLOW_SHARE = 0.3
+"""Weight of a point's flow of 1 pixel."""
 FLOW_SCALE_PX = 2.0
-"""Weight of a point's flow of 1 pixel, and the distance in pixels beyond which it is an outlier."""
-MIN_FLOW_SIDE_PX = 32  # Smaller images are too small for the patches of DIS
+"""Distance beyond which a point's flow is an outlier."""
+MIN_FLOW_SIDE_PX = 32
+"""Side below which an image is too small for the patches of DIS."""
 FAR_WEIGHT = 1e-3
+"""Weight of the wider neighborhood in a mean over two."""
 MIN_NEIGHBORHOOD_PX = 2.0
-"""Weight of the wider neighborhood in a mean over two; standard deviation of the smaller one, in
-pixels of the image of the means."""
+"""Standard deviation of the smaller neighborhood, in pixels of the image of the means."""
 MIN_OBSERVATIONS = 1.0  # Sum of its views' weights, below which a point's texture is not known
 
 

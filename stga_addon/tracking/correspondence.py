@@ -18,29 +18,41 @@ from .posed_points import SurfacePoints
 from .seen_surface import large_parts
 
 SKIN_RGB = np.array([0.78, 0.58, 0.48])
+"""Color of the drawn head."""
 BACKGROUND = 0.45
+"""Gray behind it, 0…1."""
 KEY_LIGHT = np.array([0.35, 0.55, 0.75])
 """Direction towards the light in camera axes: x right, y up, z towards the camera."""
 AMBIENT = 0.38
+"""Fraction of the light that comes from everywhere."""
 VIEWS_DEG = (0, 0), (-25, 0), (25, 0), (-50, 0), (50, 0), (0, 20), (0, -20), (-30, 15), (30, 15)
 """Azimuth and elevation of the pictures."""
 PICTURE_SIZE = 512
+"""Side of the pictures in pixels."""
 PICTURE_DISTANCE = 3.5
+"""Distance of their camera in extents of the head: there is little perspective."""
 PICTURE_FOCAL = 3.0
-"""In extents of the head, and in image widths: the head fills most of the picture, with little
-perspective."""
+"""Focal length in image widths: the head fills most of the picture."""
 MIN_PICTURES = 3
+"""Pictures that a landmark must be found in."""
 OPEN_JAW_WEIGHT = 0.4
-OPEN_JAW_RAD = 0.2
-"""Of ARKit's jawOpen, or of the jaw joint, by which lips part: on a closed mouth, the lower lip's
+"""Weight of ARKit's jawOpen by which lips part in the pictures: on a closed mouth, the lower lip's
 inner landmarks are as near to the upper lip."""
+OPEN_JAW_RAD = 0.2
+"""Rotation of the jaw joint that parts the lips of heads without this shape."""
 BLINKS = "eyeBlinkLeft", "eyeBlinkRight"
+
 EYE_JOINTS = JOINTS.index("left_eye"), JOINTS.index("right_eye")
+
 SCLERA_RGB = (0.95, 0.93, 0.9)
+"""Color of the drawn eyeballs."""
 IRIS_RGB = (0.15, 0.09, 0.05)
-IRIS_RADIUS = 0.4  # Share of the eyeball's radius
+"""Color of the drawn irises."""
+IRIS_RADIUS = 0.4
+"""Radius of the iris as a fraction of the eyeball's."""
 MAX_SURFACE_DISTANCE = 0.02
-"""Share of the head's extent: a landmark farther from the surface than this (6 mm) is not used."""
+"""Distance from the surface beyond which a landmark is not used, as a fraction of the head's extent
+(6 mm)."""
 MAX_RESIDUAL = 0.013
 """Share of the head's extent: a landmark whose rays miss each other by more (4 mm) is not used."""
 CANDIDATES = 48  # Triangles of the nearest centers, among which the nearest one is looked for

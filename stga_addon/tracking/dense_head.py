@@ -28,29 +28,42 @@ from .solve import prior_terms
 HEAD_POINTS = 5000
 """Points over the whole head, of which those near landmarks are used; the landmarks' places come on
 top, because they are dense at eyes and lips."""
-FACE_RADIUS_M = 0.035  # Distance from the landmarks beyond which there is hair and clothes
-LID_DISTANCE_M = 0.005  # From an eyeball, up to which a landmark is one of the lids' edges
-HELD_OUT = 8  # One point of so many is not fitted, and tells whether the fit is better
-STEPS = (1, 2, 2, 3)  # By level: one point of so many is fitted
+FACE_RADIUS_M = 0.035
+"""Distance from the landmarks beyond which there is hair and clothes."""
+LID_DISTANCE_M = 0.005
+"""Distance from an eyeball up to which a landmark is one of the lids' edges."""
+HELD_OUT = 8
+"""One point of so many is not fitted, and tells whether the fit is better."""
+STEPS = (1, 2, 2, 3)
+"""One point of so many is fitted, for each level."""
 REGIONS = ("lower face", "middle face", "eyes", "brows")
-REGION_EDGES = (0.4, 0.62, 0.735)  # Of the landmarks' height on the neutral head
-UPPER_FACE = 2  # Regions from this one on stay where they are when the mouth opens
-CHIN_SHARE = 0.12  # Landmarks in this lowest share of the landmarks' height are the chin's
-CHIN_DIRECTION = np.array([0.0, -1.0, -0.4])  # In which an opening jaw moves it, in the head's axes
+
+REGION_EDGES = (0.4, 0.62, 0.735)
+"""Edges of the REGIONS, in the landmarks' height on the neutral head."""
+UPPER_FACE = 2
+"""Regions from this one on stay where they are when the mouth opens."""
+CHIN_SHARE = 0.12
+"""Landmarks in this lowest fraction of the landmarks' height are the chin's."""
+CHIN_DIRECTION = np.array([0.0, -1.0, -0.4])
+"""Direction in which an opening jaw moves the chin, in the head's axes."""
 OPENING_SIGMA_M = 0.002
-MIN_COSINE = 0.25  # Of the angle between normal and camera, below which a point is not compared
-VISIBILITY_SIDE_PX = 110  # Size of the depth image that hidden points are found in
+"""Standard deviation of the chin's height from the one that is asked for."""
+MIN_COSINE = 0.25
+"""Cosine between normal and camera below which a point is not compared."""
+VISIBILITY_SIDE_PX = 110
+"""Side of the depth image that hidden points are found in."""
 DIRECTIONS = 8
+"""Steps of a direction's coordinates within which a head hides the same of itself."""
 OPENING_STEP_M = 0.008
-"""Steps of a direction's coordinates, and of the chin's height, within which a head hides the same
-of itself."""
+"""Step of the chin's height within which a head hides the same of itself."""
 REST_QUANTILE = 0.2
+"""Fraction of the timesteps at which a region moves so little that it is at rest."""
 REST_SCALE_M = 0.002
-"""A region is at rest when it moves as little as at this share of the timesteps, within that
-distance."""
+"""How much farther than in these a region at rest may move."""
 HELD_OUT_LEVEL = len(appearance.LEVELS_M)
+"""Stands for the points that are not fitted, where a level is asked for."""
 ALL_POINTS = HELD_OUT_LEVEL + 1
-"""Stand for the points that are not fitted, and for all, where a level is asked for."""
+"""Stands for all points, where a level is asked for."""
 
 NO_TEXTURE = Texture({}, {}, np.zeros(0))
 
@@ -89,8 +102,8 @@ class DenseHead:
         eyeballs = model.weights[:, [JOINTS.index(f"{side}_eye") for side in ("left", "right")]]
         balls = template[(eyeballs > EYEBALL_WEIGHT).any(1)]
         on_lids = cKDTree(balls).query(at)[0] < LID_DISTANCE_M if len(balls) else False
+        # (L,) bool: landmarks on eyeballs and teeth, and at what covers and uncovers eyeballs
         self.inner = ~skin | on_lids
-        """(L,) bool: landmarks on eyeballs and teeth, and at what covers and uncovers eyeballs."""
         used = reliable & skin
         used = used if used.any() else reliable
         points = surface_points(head, HEAD_POINTS)

@@ -19,33 +19,46 @@ from ..errors import StgaError
 from ..files import read_bytes
 
 FOLDER = Path(__file__).with_name("networks")
+
 FACE_FILE = FOLDER / "face_landmarker.task"
 PERSON_FILE = FOLDER / "selfie_segmentation.tflite"
-MIN_DETECTION_SCORE = 0.3  # MediaPipe's default, 0.5, misses near-profile views
-MIN_PRESENCE = 0.5  # Of a face in the crop, as the landmarks' network sees it
-MAX_FACES = 2  # Faces that are looked for: a second one in a frame is reported
-MAX_BOX_OVERLAP = 0.5  # Intersection over union beyond which two detected boxes are of one face
-CROP_SCALE = 1.5  # Side of the landmarks' crop, in sides of the detected box
-NEAR_SCALE = 4.0  # Side of the part around another frame's face, in that of its landmarks
+
+MIN_DETECTION_SCORE = 0.3
+"""MediaPipe's default, 0.5, misses near-profile views."""
+MIN_PRESENCE = 0.5
+"""Least probability of a face in the crop, as the landmarks' network estimates it."""
+MAX_FACES = 2
+"""Faces that are looked for: a second one in a frame is reported."""
+MAX_BOX_OVERLAP = 0.5
+"""Intersection over union beyond which two detected boxes are of one face."""
+CROP_SCALE = 1.5
+"""Side of the landmarks' crop, in sides of the detected box."""
+NEAR_SCALE = 4.0
+"""Side of the part around another frame's face, in that of its landmarks."""
 PART_SHARES = (0.5, 0.25)
+"""Sides of the parts of an image that are searched for small faces, as fractions of its longer
+side: the detector finds faces from an eighth of its input on."""
 MIN_PART_PX = 160
-"""Sides of parts of an image, of its longer side, that are searched for small faces; below
-MIN_PART_PX, landmarks would be guesses. The detector sees faces from an eighth of its side on."""
+"""Side of a part below which landmarks would be guesses."""
 DETECTOR_SIZE_PX = 128
 CROP_SIZE_PX = 256
 PERSON_SIZE_PX = 256
+
 ANCHOR_GRIDS = ((16, 2), (8, 6))
 """Cells along a side of the detector's grids, and anchors of each, which are its center."""
 MAX_SMALL_SHARE = 0.18
+"""Size of a small face as a fraction of the image's longer side."""
 SETTLING_STEPS = 2
-"""Size of a small face, of the image's longer side; crops around its landmarks, as its box is a few
-of the detector's pixels wide, by which eyes were taken to be on the nose."""
+"""Crops around a small face's landmarks: its box is a few of the detector's pixels wide, and eyes
+were taken to be on the nose."""
 OUTER_EYE_CORNERS = (33, 263)
 """Landmarks of right and left eye."""
 IRIS_CENTERS = (468, 473)
+"""Numbers of the landmarks in the middle of an iris, each before its other four."""
 FIRST_IRIS_POINT = 468
+"""Number of the first landmark of an iris; those before are the skin's."""
 MESH_POINTS = 478
-"""Landmarks: 468 of the skin, and five an iris of which the first is its center."""
+"""Landmarks of a face."""
 SCORE_POINTS = np.array([
     0, 1, 4, 5, 6, 7, 8, 10, 13, 14, 17, 21, 33, 37, 39, 40, 46, 52, 53, 54, 55, 58, 61, 63, 65, 66,
     67, 70, 78, 80, 81, 82, 84, 87, 88, 91, 93, 95, 103, 105, 107, 109, 127, 132, 133, 136, 144,

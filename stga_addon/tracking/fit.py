@@ -31,24 +31,28 @@ Images = Callable[..., Pictures]
 spread over the rig."""
 
 ITERATIONS = 15
-OUTLIER_SCALE = (
-    1.5  # Distances from a ray, in the landmark's medians, at which its weight is a quarter
-)
+"""Reweighted least squares fits of a landmark's position."""
+OUTLIER_SCALE = 1.5
+"""Distance from a ray, in the landmark's medians, at which its weight is a quarter."""
 MIN_DISTANCE_SHARE = 1e-5
-"""Of outliers' scale, as a share of the distance to the cameras; below is rounding."""
+"""Least scale of outliers as a fraction of the distance to the cameras; below is rounding."""
 RANK_GUARD = 1e-9
-IDENTITY_TIMESTEPS = 12  # Timesteps, spread over the take, that identity is solved from
+"""Weight of the first guess: a single ray leaves the position along it open."""
+IDENTITY_TIMESTEPS = 12
+"""Timesteps, spread over the take, that identity is solved from."""
 ROUNDS = 3
+"""Alternations between the solution of identity and of the take."""
 MAX_HEAD_SCALE = 1.25
 """Size of a head, or its inverse, relative to the average one, beyond which the cameras' world is
 not in meters."""
 MIN_VISIBILITY = 1e-3
 """Weight of a landmark that a camera cannot see; what no camera sees is still better guessed than
 left open."""
-RESIDUAL_SCALE_M = 0.004  # Landmarks whose rays miss each other by much more are not used
+RESIDUAL_SCALE_M = 0.004
+"""Landmarks whose rays miss each other by much more are not used."""
 MAX_RESIDUALS = 25.0
-"""In RESIDUAL_SCALE_M, beyond which a landmark's weight no longer falls: it would vanish below the
-smallest number."""
+"""Residual in RESIDUAL_SCALE_M beyond which a landmark's weight no longer falls: it would vanish
+below the smallest number."""
 MIN_LANDMARKS = 4  # Of a timestep that the head is fitted to: fewer do not determine a pose
 MIN_FACE_M = 0.01  # Extent of the landmarks on the head, below which they are but a point
 POSIT_ITERATIONS = 20

@@ -18,15 +18,19 @@ SHEET_FILE = "contact_sheet.png"
 MATTES_FILE = "mattes.json"
 LANDMARKS_FOLDER = "landmarks"
 PLACES_FILE = "head_model.npz"
+
 FOOTAGE_FILE = f"{LANDMARKS_FOLDER}/footage.json"
-"""What landmarks are of."""
+"""What the landmarks were found in."""
 KEPT_FOLDER = "unfinished"
 """Of results of parts, with which an interrupted tracking goes on; removed at its end."""
 LOCK_FILE = "tracking.lock"
 """Held while the capture is written."""
 SPLIT_FILES = ("transforms_train.json", "transforms_val.json", "transforms_test.json")
+
 MOTIONS = {"head": "turns with the head", "still": "keeps its direction", "own": "turns on its own"}
-TORSO_KEY = "torso"  # Of the report; null where the motion could not be told
+"""How a torso can move -> its description."""
+TORSO_KEY = "torso"
+"""Key of the report; null where the torso's motion could not be determined."""
 FOCAL_KEYS = {
     "pixels": "focal_length_px",
     "source": "focal_length_from",
@@ -43,9 +47,10 @@ FOCAL_SOURCES = {
 """Where the focal length of a camera without calibration is from (`Footage.focal`), and what a
 person reads of it."""
 POINTS_FILE = "torso_points.npz"
+
 AVATAR_MISFIT = "avatar"
-"""Beside the regions of the face in the report's `image_misfit`: what the avatar that tracked does
-not explain."""
+"""Entry beside the regions of the face in the report's `image_misfit`: what the avatar that tracked
+does not explain."""
 
 
 def image_name(timestep: int, camera: int, suffix: str = ".png") -> str:

@@ -18,8 +18,9 @@ from .solve import (
 )
 
 ITERATIONS = 4
+
 IRIS_SIGMA_M = 0.0005
-"""Standard deviation of the middle of an iris, which is seen sharply."""
+"""Standard deviation of the middle of an iris, which images show sharply."""
 MAX_GAZE_RAD = 0.7
 """Up, down or aside; no eye turns farther."""
 CONSTANT_GAZE_SIGMA_RAD = 0.25

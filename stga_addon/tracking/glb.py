@@ -19,8 +19,10 @@ from ..files import read_bytes
 from ..flame.quaternions import to_matrices
 
 TRIANGLES = 4
+"""Mode of a primitive in glTF."""
 PRIMITIVE_NUMBERS = 100
-"""That each primitive counts for besides its own: it takes time even where it is small."""
+"""Numbers that each primitive counts for besides its content: it takes time even where it is
+small."""
 Placed = tuple[Json, list[tuple[str, Json]], np.ndarray]
 """A primitive, its morph targets with their names, and the transform (4, 4) of its node."""
 READABLE_EXTENSIONS = {"KHR_mesh_quantization", "KHR_materials_unlit", "KHR_texture_transform"}

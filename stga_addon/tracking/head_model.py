@@ -9,8 +9,8 @@ import numpy as np
 
 from ..capture.camera import MAX_COORDINATE_M
 from ..errors import StgaError
-from ..files import write_npz
-from ..flame.model import JOINTS, POSE_FEATURES, FlameModel, finite, read_model_npz
+from ..files import open_npz, write_npz
+from ..flame.model import JOINTS, POSE_FEATURES, FlameModel, finite, model_arrays
 from ..flame.parts import flame_model
 from .glb import read_glb
 
@@ -18,9 +18,11 @@ IDENTITY_PREFIX = "identity"
 """Begins the names of shapes that make another person; all others are expressions."""
 LINEAR_KEYS = ("mean", "faces")
 LINEAR_MODEL_KEYS = (*LINEAR_KEYS, "identity", "expression", "J_regressor", "weights")
+
 MIN_EXTENT_M = 0.1
+"""Least extent of a head model along its longest axis; below, the file is in other units."""
 MAX_EXTENT_M = 2.0
-"""Extent of a head model along its longest axis; outside of it, the file is in other units."""
+"""Largest extent of a head model along its longest axis."""
 MAX_COMPONENT_M = 100.0
 """Displacement of a vertex by a component at coefficient 1; scales of components differ from model
 to model."""
@@ -64,7 +66,8 @@ def read_head_model(path: Path | None) -> HeadModel:
         mesh = read_glb(path)
         arrays = shape_arrays(mesh.positions, mesh.faces, mesh.names, mesh.targets)
     elif suffix == ".npz":
-        arrays = read_model_npz(path, LINEAR_MODEL_KEYS)
+        with open_npz(path) as file:
+            arrays = model_arrays(file, LINEAR_MODEL_KEYS)
     if "mean" in arrays:
         return checked(path, HeadModel(linear_model(path, arrays), "mesh"))
     return checked(path, HeadModel(flame_model(path), "flame"))

@@ -14,9 +14,10 @@ from .posed_points import PosedPoints, face_size, split
 from .stages import Crew, Stage
 
 BIAS_ROUNDS = 3
-BIAS_TIMESTEPS = 12
 """Rounds in which the networks' bias is measured, each on heads fitted without that of the round
-before, and timesteps at which the avatar is drawn for that."""
+before."""
+BIAS_TIMESTEPS = 12
+"""Timesteps at which the avatar is drawn to measure it."""
 
 
 @dataclass(frozen=True)

@@ -21,11 +21,13 @@ from .posed_points import SurfacePoints
 from .stages import Crew, Stage
 
 MIN_BARYCENTRIC = -1e-3
+"""Least barycentric coordinate of a landmark's place."""
 MAX_SUM_ERROR = 1e-3
+"""Largest difference of their sum from 1."""
 MAX_PIXELS = 1e5
+"""Largest coordinate of a landmark, three times as far as the largest image reaches."""
 MAX_CONFIDENCE = 1e6
-"""Bounds of landmarks, three times as far as the largest image reaches, and of their confidence:
-some detectors write scores in place of shares."""
+"""Largest confidence of a landmark: some detectors write scores instead of 0…1."""
 MAX_TWO_FACES_SHARE = 0.34
 """Share of a camera's frames with a second face, beyond which the footage is not of one person."""
 MIN_PART_TIMESTEPS = 50

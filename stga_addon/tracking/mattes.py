@@ -25,29 +25,41 @@ from .folder import MATTES_FILE, mask_name
 from .footage.model import Footage, FootageCamera, write_png
 from .stages import Crew, Stage
 
-PART_TIMESTEPS = 24  # At most, of the parts of a camera that are worked on at once
+PART_TIMESTEPS = 24
+"""Timesteps of a camera that are worked on at once, at most."""
 MIN_HEAD_PROBABILITY = 0.5
-"""Median over the tracked head, below which the network does not see the person there."""
+"""Median over the tracked head below which the network does not find the person there."""
 # Probabilities of a person
 LIKELY = 0.5
+"""Probability from which a pixel is likely the person's."""
 SURE = 0.9
+"""Probability from which it certainly is."""
 UNLIKELY = 0.1
+"""Probability below which it certainly is not."""
 MAX_CUT_SIDE_PX = 400
-"""Of the images that GrabCut works on, whose time grows with the pixels; the band's is full."""
+"""Side of the images that GrabCut works on, whose time grows with the pixels; the band has all of
+them."""
 CUT_ITERATIONS = 1
+"""Iterations of GrabCut."""
 CUT_MARGIN_SHARE = 0.04
-"""Error of the network's outline, as a share of the head's size (root of its area in the image)."""
+"""Error of the network's outline as a fraction of the head's size (root of its area in the
+image)."""
 HEAD_MARGIN_SHARE = 0.06
 """Error of the tracked head's outline, of the head's size: further inside are surely persons."""
-BAND_SHARE = 0.018  # Half of the soft band's width, as a share of the head's size
+BAND_SHARE = 0.018
+"""Half of the soft band's width as a fraction of the head's size."""
 NEIGHBORHOOD_SHARES = (0.03, 0.12)
-"""Standard deviations of the neighborhoods that colors are means of, of the head's size."""
-REACH_SHARE = 1.0  # From the head, of its size, that hair reaches; clothes reach farther, below
+"""Standard deviations of the neighborhoods that colors are means of, as fractions of the head's
+size."""
+REACH_SHARE = 1.0
+"""Distance from the head that hair reaches, as a fraction of its size; clothes reach farther,
+below."""
 SIMILAR_COLORS_LEVELS = 30.0
 """Difference of both sides' colors at which half of the coverage is a smooth edge's."""
 PLATE_NOISE_LEVELS = 10.0
+"""Difference from a clean plate, of 255, that noise makes."""
 PLATE_SURE_LEVELS = 40.0
-"""Differences from a clean plate, of 255, that noise makes, and that only a person does."""
+"""Difference from a clean plate, of 255, that only a person makes."""
 MAX_HOLE_SHARE = 0.01
 """Area of a hole in the person, of the head's, that is filled: highlights, patterned cloth."""
 

@@ -20,10 +20,12 @@ from .fit import HeadFit, RecordedTake, TimestepLandmarks, determines_pose, fit_
 from .footage.model import Footage
 from .head_model import HeadModel
 
-SIZE = 256  # Width and height of a picture in pixels: Blender's icons are square
+SIZE = 256
+"""Width and height of a picture in pixels: Blender's icons are square."""
 FIRST_CAMERAS = 3
+"""Cameras in the picture of the first frame's fit, at most."""
 SHOWN_FRAMES = 4
-"""Most cameras of the first frame's fit; most frames of a picture, two in each direction."""
+"""Frames of a picture at most, two in each direction."""
 # Of the contact sheet
 COLUMNS = 4
 ROWS = 5
@@ -43,8 +45,9 @@ MATTE_OPACITY = 0.75
 BACKGROUND = (24, 26, 30)
 TEXT = (225, 228, 232)
 NO_FACE = (70, 74, 80)
+
 ERROR_COLORS = np.array([(38, 130, 110), (240, 200, 70), (215, 50, 45)], float)
-"""Of no error, half of the color scale and its end."""
+"""Colors of no error, half of the color scale and its end."""
 COLOR_SCALE_END = 3.0  # In medians of all errors
 
 Errors = Mapping[str, Mapping[int, float]]

@@ -8,9 +8,10 @@ from .footage.model import Footage
 from .posed_points import PosedPoints, face_size, split
 
 OUTLIER_FACTOR = 4.0
+"""A camera is at fault whose landmarks miss the fitted head by this many times those of the
+others."""
 MIN_OUTLIER_SHARE = 0.03
-"""A camera is at fault whose landmarks miss the fitted head by this many times those of the others,
-and by this share of the face's size."""
+"""And by this fraction of the face's size."""
 MAX_USUAL_SHARE = 0.04
 """Median over the cameras, beyond which they do not see one head: up to 0.016 on sound footage; the
 demo's gives 0.06 where no camera is in step with another, and 0.2 mirrored."""

@@ -21,32 +21,48 @@ from .fit import HeadFit, Pictures, RecordedTake, posed_mesh
 from .head_model import HeadModel
 from .posed_points import SurfacePoints, head_rotation
 
-PATCH_SAMPLES = 9  # Samples along each side of a patch
-MAX_CAMERAS = 6  # Cameras that a patch is compared in: those that see it most squarely
-MIN_COSINE = 0.35  # Of the angle between normal and camera: patches beyond 70° are foreshortened
+PATCH_SAMPLES = 9
+"""Samples along each side of a patch."""
+MAX_CAMERAS = 6
+"""Cameras that a patch is compared in: those that face it most squarely."""
+MIN_COSINE = 0.35
+"""Cosine between normal and camera below which a patch is too foreshortened (70°)."""
 MIN_CORRELATION = 0.5
-NOISE_LEVELS = 2.0  # Standard deviation of noise, of 255: patches of less contrast do not correlate
-OCCLUSION_M = 0.004  # A point this far behind the nearest surface is hidden
+"""Correlation of two cameras' patches that counts."""
+NOISE_LEVELS = 2.0
+"""Standard deviation of noise, of 255: patches of less contrast do not correlate."""
+OCCLUSION_M = 0.004
+"""A point this far behind the nearest surface is hidden."""
 DEPTH_IMAGE_SIDE = 300
 LUMA = np.array([0.299, 0.587, 0.114], np.float32)
-POINT_SHARE = 0.25  # Weight of a surface point, whose patch shares most pixels with its neighbors
-DIRECTIONS = 6  # Steps of a direction's coordinates, about 10°
+
+POINT_SHARE = 0.25
+"""Weight of a surface point, whose patch has most pixels in common with its neighbors."""
+DIRECTIONS = 6
+"""Steps of a direction's coordinates, about 10°."""
 MIN_PART_SHARE = 0.33
-"""Connected parts smaller than this share of the head (eyeballs, teeth) have no surface points."""
+"""Connected parts smaller than this fraction of the head (eyeballs, teeth) have no surface
+points."""
 MAX_OUTLINE_DISTANCE_M = 0.0005
 """Median distance of the masks' outlines from the surface in the images, beyond which they are not
 those of the skin: mattes are often a pixel or two too wide, and hair hangs over faces."""
 MIN_OUTLINE_POINTS = 100
+"""Points of an outline without which it is not used."""
 OUTLINE_RADIUS_M = 0.01
 """Distance from the landmarks beyond which outlines are those of hair, ears and clothes."""
-MAX_COSINE = 0.25  # Of the angle between normal and camera: those within 15° of the outline move it
-RIM_COSINE = 0.5  # The same of a triangle: those farther from the outline are not drawn
+MAX_COSINE = 0.25
+"""Cosine between normal and camera up to which a point moves the outline (15°)."""
+RIM_COSINE = 0.5
+"""The same of a triangle: those farther from the outline are not drawn."""
 PICTURE_SIDE = 600
+"""Side in pixels with which the mesh's mask is drawn, since it has no soft edge."""
 MAX_ENLARGEMENT = 2
-"""The mesh's own mask is drawn with about so many pixels, since it has no soft edge."""
+"""Largest factor by which that enlarges an image."""
 SAMPLES_PER_PIXEL = 4
+"""Samples along the line on which an edge is looked for."""
 MAX_REACH_PX = 40.0
-"""Pixels on either side of a point in which an edge is looked for; a close camera's are many."""
+"""Distance on either side of a point in which an edge is looked for; a close camera's pixels are
+many."""
 
 
 @dataclass(frozen=True)

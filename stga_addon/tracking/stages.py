@@ -24,16 +24,21 @@ class Stage(Enum):
     FOCAL_LENGTH = ("Focal length", 0.115, 0.12)
     FIT = ("Fit", 0.12, 0.225)
     DENSE = ("Dense tracking", 0.225, 0.33)
+
     SURFACE = ("Surface", 0.33, 0.355)
+
     REFINEMENT = ("Refinement", 0.355, 0.465)
+
     ONLY_DENSE = ("Dense tracking", 0.225, 0.465)
-    """Where one camera does not see the surface, so that there is nothing to refine."""
+    """In place of surface and refinement where one camera does not show the surface."""
     MATTES = ("Mattes", 0.465, 0.695)
+
     TORSO = ("Torso", 0.695, 0.83)
     CLOTH = ("Cloth", 0.83, 0.96)
     CONTACT_SHEET = ("Contact sheet", 0.96, 0.975)
     IMAGES = ("Images", 0.975, 0.98)
     HEADS = ("Heads", 0.98, 1.0)
+
     AVATAR = ("Avatar", 1.0, 2.0)
     """Of a known person, whose avatar is posed in the capture."""
     CORRECTION = ("Solve", 0.0, 0.9)
@@ -49,9 +54,10 @@ ReportStage = Callable[[Stage, int, int], None]
 """Stage, steps done and steps in all. May raise to cancel: whole cameras stay on disk, and are not
 detected again."""
 Draw = Callable[[], Mapping[str, np.ndarray] | None]
+"""Draws a picture (`Progress.picture`) for those who watch; None: there is nothing to draw."""
 Show = Callable[[Draw, Mapping[str, float]], None]
-"""Called with what draws a picture (`Progress.picture`) for those who watch, None: there is nothing
-to see; and with figures of how well the head fits (`format.describe_figures`)."""
+"""Called with what draws a picture, and with figures of how well the head fits
+(`format.describe_figures`)."""
 
 
 def unreported(stage: Stage, done: int, total: int) -> None:

@@ -34,13 +34,15 @@ IDENTITY_SWEEPS = (
     Sweep(0.004, 0.0005, 0.001),
     Sweep(0.003, 0.0005, 0.001),
 )
+"""Sweeps in which identity is solved from the surface."""
 OUTLINE_SWEEPS = Sweep(0.003, 0.0005, 0.001), Sweep(0.003, 0.0005, 0.001)
-"""After the others, where the masks' outlines are those of the skin."""
+"""Sweeps after the others where the masks' outlines are those of the skin."""
 TAKE_SWEEPS = (Sweep(0.004, 0.0005, 0.001), 300), (Sweep(0.0015, 0.0005, 0.001), 1000)
 """At every timestep, and how many of the points that are usually found are looked for. The first
 starts at the pose of the landmarks, from which patches do not lie on the skin that they are of
 yet."""
-SURFACE_POINTS = 2000  # Points over the whole head
+SURFACE_POINTS = 2000
+"""Points over the whole head."""
 SURFACE_TIMESTEPS = 6
 """Timesteps, spread over the take, whose surfaces identity and offsets are solved from."""
 LANDMARK_SHARE = 0.1
@@ -57,9 +59,10 @@ evidence."""
 MIN_SEEN_SHARE = 0.5
 """Share of the timesteps in which a point must be found to be looked for at every timestep."""
 
-PART_TIMESTEPS = 24  # At most, of the parts of a take that are searched at once
+PART_TIMESTEPS = 24
+"""Timesteps of a take that are searched at once, at most."""
 FEW_CAMERAS = 3
-"""Median over the timesteps of the cameras that see a face, up to which expressions and poses of
+"""Median over the timesteps of the cameras that show a face, up to which expressions and poses of
 dense tracking are nearer to the truth than those of the surface."""
 OFFSET_DENSITY = 1.5e10
 """Weight of SURFACE_POINTS points over a head, in 1/m⁴: the two priors below are relative to it."""

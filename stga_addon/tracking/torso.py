@@ -28,26 +28,36 @@ from .torso_cloth import Bending, found_bending
 from .torso_take import NECK, Motion, PosedTorso, TorsoPose, TorsoTake, axis_angle, head_turn
 
 MIN_TIMESTEPS = 4
+"""Timesteps without which there is no motion to distinguish."""
 MAX_CAMERAS = 4
-"""Below it, there is no motion to tell apart; cameras over the rig, whose images are compared."""
-TIE = 1e-3  # Difference in the trace of rotations that time decides
-MIN_POINTS = 200  # Of all cameras together, below which the torso is not seen
-START_LEVEL = 2  # Level of the pyramid in which starts are compared
+"""Cameras, spread over the rig, whose images are compared."""
+TIE = 1e-3
+"""Difference in the trace of rotations that time decides."""
+MIN_POINTS = 200
+"""Points of all cameras together without which the torso is not visible."""
+START_LEVEL = 2
+"""Level of the pyramid in which starts are compared."""
 COARSE_STEPS = ((3, 3), (2, 3))
+"""Levels of the pyramid and Gauss–Newton steps in each, for every start."""
 FINE_STEPS = ((1, 4), (0, 2))
-"""Levels and Gauss–Newton steps in each, for every start, and for the best one."""
+"""The same for the best start."""
 CHANGE_SIGMA_RAD = 0.1
+"""Standard deviation of the torso's rotation from one timestep to the next."""
 CHANGE_SIGMA_M = 0.01
-"""Standard deviations of the torso's rotation and shift from one timestep to the next."""
+"""Standard deviation of the torso's shift from one timestep to the next."""
 # Radians, meters
 MAX_STEP = 0.15
+"""Largest step of a motion's parameters, in radians or meters."""
 CONVERGED_STEP = 1e-4
+"""Step below which the motion has converged."""
 COMPARED_TIMESTEPS = 24
-"""Spread over the take, at which motions are compared; depths are found at some of them."""
+"""Timesteps, spread over the take, at which motions are compared; depths are found at some of
+them."""
 MIN_GAIN = 0.1
+"""Fraction by which the misfit has to fall for the torso not to move with the head."""
 MIN_OWN_GAIN = 0.05
-"""Share by which the misfit has to fall for the torso not to ride on the head, and to move instead
-of being still, or to be shifted as well."""
+"""Fraction by which it has to fall for the torso to move instead of being still, or to be shifted
+as well."""
 
 Plan = Sequence[tuple[int, int]]
 

@@ -26,37 +26,51 @@ from .folder import TorsoPoints
 from .posed_points import head_rotation
 from .torso_take import HELD_OUT, BothWays, Motion, Rows, TorsoShot, TorsoTake, states_along
 
-BLOCK_PX = 12  # Of blocks of pixels; one in HELD_OUT is not fitted, and tells whether to bend
+BLOCK_PX = 12
+"""Side of blocks of pixels; one in HELD_OUT is not fitted, and tells whether to bend."""
 ROUGHNESS_M = 0.0005
+"""Standard deviation of a vertex from the mean of its neighbors."""
 BEND_SIGMA_M = 0.02
-"""Standard deviations of a vertex from the mean of its neighbors, and from the rigid torso."""
+"""Standard deviation of a vertex from the rigid torso."""
 FLOW_SIGMA_PX = 0.5
+"""Standard deviation of optical flow."""
 FLOW_SHARE = 0.3
-"""Of optical flow, and the share of the fitted pixels that are independent of each other."""
+"""Fraction of the fitted pixels that are independent of each other."""
 FLOW_OUTLIER_PX = 4.0
+"""Distance beyond which flow is wrong."""
 CHANGE_OUTLIER_LEVELS = 5 * NOISE_LEVELS
-"""Distance, and difference of what flow matches, beyond which flow is wrong."""
-FLOW_MARGIN_PX = 32  # Around the sheet in the images of optical flow
-PIXEL_STEP = 6  # One of so many pixels is fitted
-MIN_GAIN = 0.05  # Share by which the misfit has to fall for the torso to bend
+"""Difference of what flow matches beyond which it is wrong."""
+FLOW_MARGIN_PX = 32
+"""Margin around the sheet in the images of optical flow."""
+PIXEL_STEP = 6
+"""One of so many pixels is fitted."""
+MIN_GAIN = 0.05
+"""Fraction by which the misfit has to fall for the torso to bend."""
 MAX_STEPS = 4
+"""Gauss–Newton steps for each timestep."""
 CONVERGED_STEP_M = 0.0004
-"""Gauss–Newton steps for each timestep; root mean square of a step after which there is none: such
-ones follow the noise of optical flow."""
-HELD = 1e10  # Precision that holds a vertex
+"""Root mean square of a step after which there is none: smaller ones follow the noise of optical
+flow."""
+HELD = 1e10
+"""Precision that holds a vertex."""
 DEPTH_SIGMA_M = 0.02
+"""Distance over which points' depths are averaged."""
 MIN_WEIGHT = 0.5
-"""Over which points' depths are averaged; sum of weights from which the surface is seen."""
+"""Sum of weights from which the surface is observed."""
 DIRECTIONS_RAD = np.radians(np.arange(-80, 81, 5))
 """From the base of the neck, as seen from the front: from straight down to the person's left."""
-SLOPE = 0.8  # Of the angle around the neck: shoulders slope down
+SLOPE = 0.8
+"""Factor on the angle around the neck, because shoulders slope down."""
 REACH_RAD = np.radians(10)
+"""Angle of a direction to both sides."""
 DIRECTION_SIGMA = 1.0
-"""Of a direction to both sides; smoothing of what is found in them, in steps."""
+"""Standard deviation, in steps, of the smoothing of what is found in the directions."""
 MIN_POINTS = 5
+"""Points without which a direction is not observed."""
 FARTHEST_SHARE = 0.98
+"""Fraction of a direction's points that the mesh reaches."""
 BEYOND_M = 0.015
-"""Of a direction: points from which it is seen, share that the mesh reaches, how far beyond."""
+"""How far beyond these the mesh reaches."""
 FULL_HEIGHT = 0.5  # Height (see `TorsoSheet`) from which vertices lie on the surface alone
 
 

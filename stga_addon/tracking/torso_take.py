@@ -25,27 +25,38 @@ from .stages import Crew, Stage
 
 ROOT = JOINTS.index("root")
 NECK = JOINTS.index("neck")
-HEAD_MARGIN = 0.03  # Share of the image's height around the head, where hair and chin may be
-PLAIN_LEVEL = 128  # Gray that stands for everything outside the mask
-OFFSET_STEPS = 6  # After which offsets, which move joints, which move vertices, are those wanted
-EVIDENCE_LEVEL = 1  # Level of the pyramid in which motions are compared
+
+HEAD_MARGIN = 0.03
+"""Margin around the head, where hair and chin may be, as a fraction of the image's height."""
+PLAIN_LEVEL = 128
+"""Gray that stands for everything outside the mask."""
+OFFSET_STEPS = 6
+"""Steps after which offsets, which move joints, which move vertices, are those wanted."""
+EVIDENCE_LEVEL = 1
+"""Level of the pyramid in which motions are compared."""
 POINT_STEP_M = 0.005
+"""Distance between points at the torso."""
 MAX_POINTS = 800
-"""Distance between points at the torso, and how many of them a camera has at most."""
+"""Points of a camera at most."""
 BLOCK_POINTS = 4
+"""Side of a block in points."""
 HELD_OUT = 3
-"""Side of blocks in points; one of so many is not fitted, and tells which motion is right."""
-MASK_MARGIN = 0.01  # Around the mask, whose edge is compared as well; share of the image's height
+"""One block of so many is not fitted, and tells which motion is right."""
+MASK_MARGIN = 0.01
+"""Margin around the mask, whose edge is compared as well, as a fraction of the image's height."""
 DEPTHS_M = tuple(np.linspace(-0.12, 0.06, 19).tolist())
-"""Along a ray, from the mesh's depth beside it, that are tried: a chest is before the neck."""
+"""Depths along a ray that are tried, from the mesh's beside it: a chest is before the neck."""
 DEPTH_TIMESTEPS = 8
+"""Timesteps at which depths are compared."""
 NEIGHBORS = 25
+"""Points whose evidence counts for each other."""
 UNSEEN_COST = 0.5
-"""Timesteps at which depths are compared; points that count for each other; cost unseen."""
+"""Cost of a depth at which a point is not visible."""
 REACH_M = 0.2
+"""Reach of the torso from its joint."""
 MAX_UNEVENNESS_M = 0.001
-"""Of the torso from its joint; by which positions may miss the mean of those at the timesteps
-beside: what is followed scatters by as much, and means explain held-out points as well."""
+"""Distance by which positions may miss the mean of those at the timesteps beside: following them
+scatters by as much, and means explain held-out points as well."""
 ALONG_CAMERAS = appearance.CHANNEL_WEIGHTS * [0, 1, 1]
 """Weights of channels between cameras, from which surfaces are not equally bright."""
 

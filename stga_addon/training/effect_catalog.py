@@ -38,7 +38,9 @@ WORLD = "world"
 """What stands still behind the person becomes splats of its own, after training."""
 _SHAPES = "shape keys and drivers in Blender"
 _STRAIN = "and the strain of every frame"
+
 _LIMITS = {"scale_limit": 1.5, "stray_limit": 0.5, "stray_reset_interval": 20, "adam_epsilon": 0.03}
+"""Settings with which splats stay small and near their triangles."""
 _EFFECTS = (
     Effect(
         "view-color",
@@ -68,7 +70,7 @@ _EFFECTS = (
     ),
     Effect(
         "depth-limits",
-        "No stray splats",
+        "No outliers",
         "free",
         "none: splats are smaller and nearer to their triangles",
         on=_LIMITS,
@@ -141,8 +143,9 @@ _EFFECTS = (
         "tracking",
     ),
 )
+
 EFFECTS = {effect.name: effect for effect in _EFFECTS}
-"""By name, in display order."""
+"""Effects by name, in display order."""
 CHOICES = ("auto", "on", "off")
 
 

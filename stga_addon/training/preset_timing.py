@@ -78,7 +78,7 @@ def seconds_per_iteration(
     selective = settings.strategy == "selective"
     selection = select_capture(capture, settings.selection) if selective else {}
     trainer = Trainer(capture, settings, selection, device=device)
-    trainer.prepare_turns()
+    trainer.prepare_hooks()
     # shares of the run at which splats are split: by its own count, this one hardly ever would
     (start, end) = settings.density_span
     interval = settings.density_interval
@@ -87,7 +87,7 @@ def seconds_per_iteration(
     left = deque(turns)
     split_s = list[float]()
     density = density_control(settings)
-    trainer.changes["density"] = replace(density, interval=0)
+    trainer.hooks["density"] = replace(density, interval=0)
     scales = image_scales(settings, capture.views["train"])
     loaded = _loaded_views(capture, settings, scales)
     times: list[float] = []
@@ -95,11 +95,11 @@ def seconds_per_iteration(
         progress = min(1.0, sum(times[WARM_UP_ITERATIONS:]) / seconds)
         view, image, mask, mesh = next(loaded[scales[progress >= settings.coarse_share]])
         while left and left[0] <= progress:
-            trainer.changes["density"] = replace(density, interval=1)
+            trainer.hooks["density"] = replace(density, interval=1)
             begin = perf_counter()
             trainer.step(view, image, left.popleft(), mask, mesh)
             split_s.append(perf_counter() - begin)
-            trainer.changes["density"] = replace(density, interval=0)
+            trainer.hooks["density"] = replace(density, interval=0)
             trainer.step(view, image, progress, mask, mesh)  # not measured: it allocates memory
         begin = perf_counter()
         trainer.step(view, image, progress, mask, mesh)

@@ -9,10 +9,11 @@ from ..capture.model import View, views_by_timestep
 from .settings import Rates, TrainingSettings
 
 COARSE_SCALE = 0.5
+"""Size of the images during `TrainingSettings.coarse_share`, as a fraction of the size trained at
+afterwards."""
 MIN_COARSE_SIDE_PX = 200
-"""Size of the images during `TrainingSettings.coarse_share`, as a share of the size trained at
-afterwards; not where their shorter side would be less than MIN_COARSE_SIDE_PX: splats are what
-takes time there, and half of so few pixels show too little."""
+"""Shorter side below which images are not shrunk: splats take the time there, and half of so few
+pixels show too little."""
 
 
 def view_order(views: Sequence[View], per_visit: int, seed: int, start: int = 0) -> Iterator[View]:

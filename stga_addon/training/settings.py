@@ -19,6 +19,7 @@ STRATEGIES = {
     "selective": "local iterations train the triangles selected in each frame; global ones, all",
     "gaussian-avatars": "the binding, losses and learning rates of GaussianAvatars",
 }
+"""Strategies that a training can be asked for -> what they do."""
 CONTINUATIONS = ("refine", "extend")
 """Strategies of runs that continue a finished one (`run.continuation`)."""
 BACKDROPS = ("plain", "masked", "mesh")
@@ -282,6 +283,7 @@ _PUBLISHED = {
     "split_share": 0.02,
     "coarse_share": 0.0,
 }
+"""Settings of published methods that differ from the defaults."""
 PAPER_SETTINGS = {
     **_PUBLISHED,
     "views_per_visit": 0,
@@ -294,7 +296,8 @@ PAPER_SETTINGS = {
     "lattice": 4,
     "selection": SelectionOptions(threshold=0.01, zero_pose="all"),
 }
-"""Where they differ from the defaults, which measured best (docs/benchmarks.md)."""
+"""Settings of the paper where they differ from the defaults, which measured best
+(docs/benchmarks.md)."""
 
 GAUSSIAN_AVATARS_SETTINGS = {
     **_PUBLISHED,

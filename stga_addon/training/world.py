@@ -29,39 +29,46 @@ MATTE_MARGIN_SHARE = 0.008
 PERSON = 256
 """Above every level of a pixel: sorts behind them."""
 RADII = 24
+"""Shells that are tried."""
 NEAREST_RADIUS = 0.3
+"""Radius of the smallest shell, in distances of the cameras from the person."""
 FARTHEST_RADIUS = 12.0
-"""Shells that are tried, smallest and largest in distances of the cameras from the person."""
+"""Radius of the largest shell, in the same unit."""
 DEFAULT_RADIUS = 3.0
 """Where the plates do not tell, because a wall is of one color or a single camera sees it."""
 SAMPLED_POINTS = 4000
 """Pixels of each plate by which shells are compared."""
 MIN_SHARED = 0.1
+"""Fraction of the sampled pixels that another plate must contain for a shell to tell the world's
+distance."""
 MIN_LIKENESS = 0.3
-"""A shell tells how far away the world is where at least this share of the sampled pixels lies in
-another plate as well, and what both show there correlates at least so much."""
+"""Correlation of what both plates show there at least."""
 DETAIL_SHARES = 0.003, 0.03
 """Filters between which lie the details that plates are compared by; of the image's height."""
 LARGEST_BLOCK = 16
+"""Side of the largest block of the image that one splat stands for, in pixels."""
 SMALLEST_BLOCK = 2
-"""Pixels."""
+"""Side of the smallest one, in pixels."""
 FLAT_LEVELS = 1.5
+"""Standard deviation of a block's colors, of 255, up to which one splat stands for it."""
 MAX_FIRST_SPLATS = 60_000
-"""A block whose colors deviate less from their mean (standard deviation, of 255) is one splat; by
-more, twice as much and so on, where there would be too many."""
+"""Splats that training begins with at most; above, FLAT_LEVELS is doubled until they fit."""
 SAME_LEVELS = 8.0
 """A block is left out whose color another plate shows there, to so many of 255 levels."""
 BLOCK_WIDTH = 0.8
 """Standard deviation of a block's splat, in sides of the block."""
 THICKNESS_SHARE = 0.2
+"""Thickness of a splat as a fraction of its block's side."""
 START_OPACITY = 5.0
-"""A logit."""
+"""Logit of the opacity that splats begin with."""
 MIN_STEPS = 200
+"""Optimization steps at least."""
 STEPS_PER_CAMERA = 25
+"""Optimization steps for each camera."""
 RATES = Rates(
     xyz=1e-6, rotation=1e-3, log_scale=0.01, opacity=0.02, sh=0.02, sh_rest=0.004, end=0.1
 )
-"""Blocks begin where they belong."""
+"""Learning rates; positions hardly move, because blocks begin where they belong."""
 TRIANGLE = np.array([[-1.0, -1.0, 0.0], [1.0, -1.0, 0.0], [0.0, 1.0, 0.0]])
 """Meters: what the splats are bound to, around the person."""
 SH_DEGREE = 1
@@ -164,7 +171,7 @@ def trained_on(plates: Sequence[CleanPlate], center: np.ndarray, report: Report 
     frames = face_frames(mesh, faces, mesh)
     face = np.zeros(len(start), np.int32)
     trainer = Trainer(capture, settings, {}, Start(new_state(to_local(start, frames, face))))
-    trainer.changes.clear()  # what stands still has neither dust around it nor unseen sides
+    trainer.hooks.clear()  # what stands still has neither floaters around it nor unseen sides
     targets = [np.rint(255 * plate.image).astype(np.uint8) for plate in plates]
     for target in targets:
         # as in training: Numba would compile again for writable arrays

@@ -53,8 +53,8 @@ class Helpers:
 
     def __init__(self, limit: int | None = None, folder: Path | None = None) -> None:
         threads = os.environ.get(THREADS_VARIABLE, "")
-        usual = min(int(threads) if threads.isdecimal() else processors(), MAX_HELPERS)
-        self._count = usual if limit is None else limit
+        default = min(int(threads) if threads.isdecimal() else processors(), MAX_HELPERS)
+        self._count = default if limit is None else limit
         self._folder = folder
         self._processes: list[subprocess.Popen[bytes]] = []
 

@@ -19,19 +19,22 @@ CACHE_VARIABLE = "STGA_CACHE"
 """Environment variable that names the folder. Blender's extension sets it to one that uninstalling
 removes."""
 KERNELS = "kernels"
+"""Folder of the cache: of Numba."""
 BUNDLED = "bundled kernels"
+"""Folder of kernels that an edition brings, where this processor is faster with its own
+(`raster.cpu.bundled`)."""
 BYTECODE = "bytecode"
+"""Folder of Python (`PYTHONPYCACHEPREFIX`)."""
 CHARTS = "matplotlib"
-"""Folders in it: of Numba; of kernels that an edition brings, where this processor is faster with
-its own (`raster.cpu.bundled`); of Python (`PYTHONPYCACHEPREFIX`) and of matplotlib."""
+"""Folder of matplotlib."""
 PREPARING = "preparing.lock"
 """Held in it by the process that compiles ahead of a training (`jobs.compile_ahead`)."""
 PACKAGES_FOLDER = Path(__file__).resolve().parents[2]
 """The folder that holds `stga_addon`, for a worker's import path."""
 NICENESS = 5
+"""Added to the nice value of a worker, so that Blender has precedence."""
 BACKGROUND_NICENESS = 15
-"""Added to the nice value of a worker, so that Blender has precedence, and of what runs in the
-background, so that workers have."""
+"""Added to that of what runs in the background, so that workers have."""
 PR_SET_PDEATHSIG = 1  # Of prctl(2)
 # Windows: own process group, so that closing the console does not end the worker; no console
 # window; and BELOW_NORMAL_PRIORITY_CLASS. Elsewhere: an own session.

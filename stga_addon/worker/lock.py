@@ -13,16 +13,19 @@ from filelock import FileLock, SoftFileLease, Timeout
 from ..errors import StgaError
 from ..files import file_size
 
-ACQUIRE_TIMEOUT_S = 0.3  # For a lock, which a process that only asks has for a moment
-PROBE_TIMEOUT_S = 0.03  # The same between processes that only ask, as Blender's timer does
+ACQUIRE_TIMEOUT_S = 0.3
+"""Patience for a lock that a process which only asks has for a moment."""
+PROBE_TIMEOUT_S = 0.03
+"""The same between processes that only ask, as Blender's timer does."""
 RETRY_INTERVAL_S = 0.002
+
 NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP)
 """What a file system without working locks answers: some NFS and parallel file systems."""
 BEAT_S = 5.0
+"""Seconds between two renewals of a lease."""
 EXPIRY_S = 30.0
-"""Seconds between two renewals of a lease, and without one until another process takes it: from a
-holder that was killed on another machine, or stands still (a suspended machine, storage that
-hangs)."""
+"""Seconds without one until another process takes the lease: from a holder that was killed on
+another machine, or stands still (a suspended machine, storage that hangs)."""
 LOOK_INTERVAL_S = 0.2
 OWNER_OFFSET = 1  # Of the process number: Windows locks the first byte, which nobody can read
 

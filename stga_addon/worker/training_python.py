@@ -22,6 +22,7 @@ REQUIREMENTS = {  # Module -> requirement of tracking and training, as in `pypro
     "av": "av>=14,<19",
     "cv2": "opencv-python-headless>=4.12,<5",
 }
+"""Module -> requirement of tracking and training, as in `pyproject.toml`."""
 GPU_REQUIREMENT = "wgpu>=0.32,<1"
 """Trains on a GPU; without it, or where it has no driver, the CPU trains."""
 PYTHON_VARIABLE = "STGA_PYTHON"  # Names the training Python, above every other choice: for farms

@@ -208,8 +208,10 @@ def test_wrong_sources_change_nothing(scene, tmp_path):
 
 def test_the_dialog_shows_what_people_need(extension):
     """Catches a dialog of twenty-five options, and one that lacks any of them."""
-    operator = extension.operators.apply_motion.ApplyMotion
-    options = [name for name in operator.__annotations__ if name not in UNDRAWN]
+    module = extension.operators.apply_motion
+    operator = module.ApplyMotion
+    names = {*operator.__annotations__, *module.MotionProperties.__annotations__}
+    options = names - UNDRAWN
     for is_open, expected in ((False, 4), (True, len(options))):
         values = SimpleNamespace(layout=Layout(), is_open=is_open)
         operator.draw(values, bpy.context)

@@ -1,7 +1,5 @@
 """Refine and Extend from Blender: what is painted or selected reaches the worker."""
 
-import tempfile
-
 import bpy
 import numpy as np
 import pytest
@@ -114,88 +112,24 @@ def test_residuals_are_shown_on_the_head(head, run, extension):
         ops.heat_map(of="RESIDUAL", directory=run.parent)
 
 
-def answer(extension, tmp_path, selection):
-    """The body of a stand-in for a worker that selects these triangles."""
-    given = tmp_path / "given"
-    given.mkdir(exist_ok=True)
-    jobs = extension.stga_addon.jobs
-    jobs.perform.write_result(given, jobs.train.Selected(selection))
-    return f"shutil.copytree({str(given)!r}, FOLDER, dirs_exist_ok=True)\nend('finished')"
-
-
-def test_what_an_extension_would_train_is_selected(head, run, extension, stand_in, tmp_path):
-    """Catches other frames or triangles than the worker found, and a silent failure."""
-    selection = {timestep: np.arange(len(head.data.polygons)) < 40 for timestep in (0, 3)}
-    selection[3] = ~selection[3]
-    stand_in(answer(extension, tmp_path, selection))
-    ops.select_extension(directory=run)
-    shown = extension.stga_addon.scene.vertex_groups.read_selection(head)
-    for timestep, faces in selection.items():
-        assert shown[timestep][faces].all()
-        assert shown[timestep].mean() < 0.9 or timestep
-    assert not shown[1].any()
-    rows = panel().selected_frames
-    assert [row.frame for row in rows if row.triangles] == [0, 3]
-    stand_in("end('failed', 'no such run')")
-    with failure("no such run"):
-        ops.select_extension(directory=run)
-    assert state_of(Kind.SELECTION).error == "no such run"
-
-
-def test_selection_of_another_head_or_cancelled_changes_nothing(
-    head, run, extension, stand_in, monkeypatch, tmp_path
-):
-    """Catches a selection of a head imported meanwhile, and files that a cancel leaves."""
-    temporary = tmp_path / "temporary"
-    temporary.mkdir()
-    monkeypatch.setattr(tempfile, "tempdir", str(temporary))
-    given = answer(extension, tmp_path, {0: np.ones(len(head.data.polygons), bool)})
-    wait = f"while not pathlib.Path({str(tmp_path / 'go')!r}).exists(): time.sleep(0.02)\n"
-    stand_in(wait + given)
-    settings = panel()
-    monkeypatch.setattr(extension.operators.timers, "has_timer", lambda: True)
-    ops.select_extension(directory=run)
-    assert any(temporary.iterdir())
-    assert not ops.select_extension.poll()
-    ops.cancel(request="selection")
-    assert not any(temporary.iterdir())
-    ops.select_extension(directory=run)
-    ops.import_capture(directory=write_mesh_capture(tmp_path / "other"))
-    (tmp_path / "go").touch()
-    tick_until_done(extension, Kind.SELECTION)
-    assert state_of(Kind.SELECTION).error.endswith("its head is no longer that of the scene")
-    assert "stga_0" not in head.vertex_groups
-    assert "stga_0" not in settings.head.vertex_groups
-    assert not any(temporary.iterdir())
-
-
-def test_selection_waits_for_the_end_of_edit_mode(
-    head, run, extension, stand_in, monkeypatch, tmp_path
-):
-    """Catches a result lost in Edit Mode, a failure held back, and an old error."""
-    stand_in(answer(extension, tmp_path, {0: np.ones(len(head.data.polygons), bool)}))
+def test_a_result_waits_for_the_end_of_edit_mode(head, extension, monkeypatch, tmp_path):
+    """Catches a result lost or put into a mesh in Edit Mode, and an error of last time."""
     monitor = extension.operators.monitor
     monkeypatch.setattr(extension.operators.timers, "has_timer", lambda: True)
+    state = RequestState(Kind.PERFORMANCE, error="of last time")
+    monitor._states[bpy.context.scene.session_uid, Kind.PERFORMANCE] = state
+    folder = tmp_path / "request"
+    monitor.follow(bpy.context.scene, Kind.PERFORMANCE, tmp_path / "gone.csv", folder)
+    assert state_of(Kind.PERFORMANCE).error == ""
+    with extension.stga_addon.worker.status.status_writer(folder) as writer:
+        writer.finish(extension.stga_addon.worker.status.WorkerState.FINISHED)
     bpy.context.view_layer.objects.active = head
     bpy.ops.object.mode_set(mode="EDIT")
-    state = RequestState(Kind.SELECTION, error="of last time")
-    monitor._states[bpy.context.scene.session_uid, Kind.SELECTION] = state
-    ops.select_extension(directory=run)
-    assert state_of(Kind.SELECTION).error == ""
-    monitor._processes[state_of(Kind.SELECTION).folder].wait(60)
     assert monitor.tick() is not None
-    assert state_of(Kind.SELECTION).loading is not None
-    assert "stga_0" not in head.vertex_groups
+    assert state_of(Kind.PERFORMANCE).loading is not None
     bpy.ops.object.mode_set(mode="OBJECT")
-    tick_until_done(extension, Kind.SELECTION)
-    assert state_of(Kind.SELECTION).error == ""
-    assert extension.stga_addon.scene.vertex_groups.read_selection(head)[0].all()
-    bpy.ops.object.mode_set(mode="EDIT")
-    stand_in("end('failed', 'no such run')")
-    ops.select_extension(directory=run)
-    tick_until_done(extension, Kind.SELECTION)
-    assert state_of(Kind.SELECTION).error == "no such run"
-    bpy.ops.object.mode_set(mode="OBJECT")
+    tick_until_done(extension, Kind.PERFORMANCE)
+    assert "gone.csv" in state_of(Kind.PERFORMANCE).error
 
 
 @pytest.mark.slow
@@ -212,7 +146,6 @@ def test_refine_and_extend_end_to_end(head, tmp_path):
     assert same[before.face >= 80].all()
     take = write_mesh_capture(tmp_path / "take")
     ops.import_capture(directory=take)
-    ops.select_extension(directory=tmp_path / "run_2")
     ops.extend(directory=tmp_path / "run_2", take=take, iterations=4)
     assert len(read_run(tmp_path / "run_3").takes) == 1
     assert panel().avatar == str(tmp_path / "run_3" / "avatar.npz")

@@ -14,7 +14,7 @@ ALWAYS = """
 --albedo --avatar --background --budget --cameras --capture --device --dry-run --effect
 --filmed-only --flame --focal --footage --format --fps --frames --gray-card --growth --iterations
 --knobs --landmarks --light --mattes --meshes --model --neutral --no-blend --offset --only --out
---preset --principal-point --quick --region --resume --schedule --seed --seeds --select-only
+--preset --principal-point --quick --region --resume --schedule --seed --seeds
 --size --split --start --step --stop --stop-when-flat --strategy --strength --sync --target-psnr
 --threads --threshold --turntable --video --world --zero-pose
 """
@@ -23,7 +23,7 @@ VALUES = """
 --address x:1 --budget 9 --camera 1 --capture c --device cpu --effect jaw=on --engine local
 --exchange jaw --flame f.npz --fps 9 --frames 1:2 --gain jaw=2 --growth 0.1 --head c --iterations 9
 --light l.hdr --light-turn 9 --motion m.csv --neutral quiet --out o --preset draft
---principal-point opencv --region mouth --seconds 9 --seed 1 --select-only s.npz --smooth 1
+--principal-point opencv --region mouth --seconds 9 --seed 1 --smooth 1
 --strength 2 --timestep 1
 """
 GIVEN = {flag: f"{flag} {value}" for flag, value in zip(*[iter(VALUES.split())] * 2, strict=True)}
@@ -56,8 +56,7 @@ batch . --dry-run               | .                             | --commands
 batch . --commands              | .                             | --engine
 batch . --engine local          | . --engine ray                | --address
 refine r --resume               | r                             | --out --growth --budget --iterations --seed --region --frames
-extend r --resume               | r c                           | --out --growth --budget --iterations --seed --select-only
-extend r c --select-only s.npz  | r c                           | --out --growth --budget --iterations --seed --device
+extend r --resume               | r c                           | --out --growth --budget --iterations --seed
 """  # noqa: E501
 """Command without the effect, with it (nothing: nowhere), and the options that this is about."""
 ROWS = [[part.strip() for part in row.split("|")] for row in SERVES.strip().splitlines()]

@@ -195,7 +195,7 @@ COMMANDS = {
     ]),
     "extend": (0.5, [
         "@splats run", [[TAKE], [TAKE], [TAKE], [TAKE, TAKE], []],
-        [[(1, "--select-only", "@new.npz")], CONTINUE, CONTINUE],
+        *CONTINUE,
     ]),
     "exact": (0.5, ["@splats run"]),
     "relight": (0.5, [

@@ -106,7 +106,6 @@ def requests_about(case):
         ask.Resume(run, capture, device="cpu"),
         ask.Refine(case / "refined", run, weights=np.linspace(0, 1, 320, dtype=np.float32), **once),
         ask.Extend(case / "extended", run, (case / "take",), **once),
-        ask.SelectForTake(run, case / "take"),
         tracking,
         ask.MakeAvatar(
             replace(tracking, out=capture_of_avatar),

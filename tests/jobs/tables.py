@@ -15,7 +15,7 @@ from stga_addon.jobs.export import Export
 from stga_addon.jobs.finished_run import Evaluate, MakeExact, Relight
 from stga_addon.jobs.render import Render
 from stga_addon.jobs.track import MakeAvatar, SolveAgain, Track
-from stga_addon.jobs.train import Extend, Refine, Resume, Selected, SelectForTake, Train
+from stga_addon.jobs.train import Extend, Refine, Resume, Selected, Train
 from stga_addon.progress import Written
 from stga_addon.training.effect_catalog import EffectDecision
 from stga_addon.training.settings import make_settings
@@ -43,7 +43,6 @@ REQUESTS = (
     ),
     Extend(Path("r_2"), Path("r"), (Path("/smile"), Path("/frown")), iterations=3),
     Select(HEAD, Path("flame.pkl"), threshold=0.01, zero_pose="all"),
-    SelectForTake(Path("r"), Path("/smile")),
     Track(
         Path("f"),
         Path("m.glb"),

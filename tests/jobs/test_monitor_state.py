@@ -39,7 +39,7 @@ JOB = RUN / "job"
 PREVIEW = JOB / "preview.npz"
 AVATAR = RUN / "avatar.npz"
 START = Started(RUN, JOB)
-TRANSIENT = Kind.ANALYSIS, Kind.SELECTION, Kind.PERFORMANCE, Kind.LIGHT, Kind.EXACT
+TRANSIENT = Kind.ANALYSIS, Kind.PERFORMANCE, Kind.LIGHT, Kind.EXACT
 """What leaves nothing but its result in the scene."""
 ENDS = (WorkerState.FINISHED, WorkerState.CANCELLED, WorkerState.FAILED, WorkerState.LOST)
 TRAINING = RequestState(Kind.TRAINING)
@@ -215,7 +215,7 @@ def test_undo():
     _, effects = after(Dismissed(), SceneRead(RUN, True), state=state)
     assert effects == [Store(None, False)]
     events = START, status(WorkerState.FINISHED), Shown(undoable=True)
-    _, effects = after(*events, state=RequestState(Kind.SELECTION))
+    _, effects = after(*events, state=RequestState(Kind.PERFORMANCE))
     assert effects == [PushUndo(), RemoveFiles(JOB), Redraw()]
 
 

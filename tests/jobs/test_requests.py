@@ -279,15 +279,15 @@ def test_what_follows_training_is_told_ahead(tmp_path, monkeypatch):
             report(Progress(0.0, "Placing splats"))
             report(Progress(0.5, "Training", figures=lambda: {"left_s": 30.0}))
             report(Progress(1.0, "Finished", figures=lambda: {"left_s": 1.0}))
-            return tmp_path / "avatar.npz"
+            return SimpleNamespace(path=tmp_path / "avatar.npz")
 
     def half(prepared, *others):
         others[-1](Progress(0.5, "Halfway"))
         return ("done",) if len(others) == 2 else "done"
 
     monkeypatch.setattr(train, "prepare", lambda *_: Prepared())
-    monkeypatch.setattr(train, "report_run", lambda _: [])
-    monkeypatch.setattr(train, "CurveUpdater", lambda _: lambda: None)
+    monkeypatch.setattr(train, "report_run", lambda *_: [])
+    monkeypatch.setattr(train, "CurveUpdater", lambda _: lambda _: None)
     for name in ("_light_of", "_world_of"):
         monkeypatch.setattr(train, name, half)
     told = []

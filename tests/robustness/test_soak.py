@@ -14,7 +14,7 @@ from stga_addon.training.optimize.trainer import Trainer
 
 pytestmark = pytest.mark.nightly
 ITERATIONS = int(os.environ.get("STGA_SOAK", 1500))
-STRAYS = 30
+OUTLIERS = 30
 DENSITY = 40
 MARK = 250
 """Iterations between two looks at the whole state."""
@@ -38,7 +38,7 @@ def soak(capture):
         iterations=ITERATIONS,
         lattice=1,
         warm_up_share=0.02,
-        stray_reset_interval=STRAYS,
+        stray_reset_interval=OUTLIERS,
         stray_limit=0.5,
         density_interval=DENSITY,
         density_span=(0.0, 1.0),
@@ -63,8 +63,8 @@ def soak(capture):
             found.losses.append(loss)
         else:
             found.local += 1
-            # strays and density may touch every row
-            if trainer.iteration % STRAYS and trainer.iteration % DENSITY:
+            # outliers and density may touch every row
+            if trainer.iteration % OUTLIERS and trainer.iteration % DENSITY:
                 frozen = ~chosen[view.timestep][face]
                 now = bits(trainer.state)
                 kept = (np.array_equal(before[n][frozen], now[n][frozen]) for n in before)

@@ -40,7 +40,7 @@ def trained(capture):
     changes = {"density_interval": 3, "density_span": (0.0, 1.0), "stray_reset_interval": 2}
     settings = quick_settings("global", lattice=1, stray_limit=0.05, growth=0.6, **changes)
     made = Trainer(capture, settings, {})
-    assert set(made.changes) == {"strays", "density", "dust", "outlines", "unseen sides"}
+    assert set(made.hooks) == {"outliers", "density", "floaters", "outlines", "unseen sides"}
     made.iteration = 194
     for view in capture.views["train"] * 2:
         made.step(view, read_image(view), 0.5, read_mask(view))

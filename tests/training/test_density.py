@@ -10,9 +10,9 @@ from scipy.spatial.transform import Rotation
 from stga_addon.capture.camera import Camera
 from stga_addon.raster.cpu.autograd import render_differentiable
 from stga_addon.raster.cpu.layout import Parameters
-from stga_addon.training.optimize.change import Turn
 from stga_addon.training.optimize.density import DensityControl
 from stga_addon.training.optimize.state import arrays_of, keep_rows, new_state
+from stga_addon.training.optimize.step_hook import Schedule
 
 from .toys import Rows, bits, random_state
 
@@ -36,7 +36,7 @@ def busy_state(listed):
 def control(state, budget=1000, share=1.0, seed=0):
     rows = Rows(state)
     density = DensityControl(1, (0.0, 1.0), split_share=share, growth=0.0, seed=seed)
-    density.apply(rows, Turn(0, 0.5, initial_count=len(state) + budget))
+    density.apply(rows, Schedule(0, 0.5, initial_count=len(state) + budget))
     return rows.state
 
 

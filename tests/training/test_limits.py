@@ -1,4 +1,4 @@
-"""Limits that keep a splat near what it covers, against autograd; stray resets."""
+"""Limits that keep a splat near what it covers, against autograd; outlier resets."""
 
 import numpy as np
 import pytest
@@ -6,9 +6,9 @@ import torch
 from numpy.testing import assert_allclose, assert_array_equal
 
 from stga_addon.raster.cpu.optimizer import distance_limit, opacity_weight, scale_limit
-from stga_addon.training.optimize.change import Turn
+from stga_addon.training.optimize.outliers import OutlierReset
 from stga_addon.training.optimize.state import arrays_of
-from stga_addon.training.optimize.strays import StrayReset
+from stga_addon.training.optimize.step_hook import Schedule
 
 from .toys import Rows, random_splats, random_state
 
@@ -70,7 +70,7 @@ def test_limits_and_weights_are_autograds(scene):
 
 
 @pytest.mark.parametrize("to", [0.0, 0.5, 1.0])
-def test_stray_resets(to):
+def test_outlier_resets(to):
     """Catches a limit of another triangle, unbound splats pulled home, and momentum kept."""
     state = random_state(60, FACES)
     state.unbound[:] = np.arange(60) % 4 == 0
@@ -79,16 +79,16 @@ def test_stray_resets(to):
     length = np.linalg.norm(xyz, axis=1, keepdims=True)
     wanted = {name: array.copy() for name, array in arrays_of(state).items()}
     far = length[:, 0] > limit[state.face]
-    strays = far & ~state.unbound
-    assert 5 < strays.sum() < 40
+    outliers = far & ~state.unbound
+    assert 5 < outliers.sum() < 40
     assert far[state.unbound].any()
-    pulled = (xyz / length * to * limit[state.face, None])[strays]
-    wanted["parameters/xyz"][strays] = wanted["average/xyz"][strays] = pulled
-    wanted["first/xyz"][strays] = 0
-    reset = StrayReset(1, limit, to)
+    pulled = (xyz / length * to * limit[state.face, None])[outliers]
+    wanted["parameters/xyz"][outliers] = wanted["average/xyz"][outliers] = pulled
+    wanted["first/xyz"][outliers] = 0
+    reset = OutlierReset(1, limit, to)
     for _ in range(2):  # the second time, nothing is left to do
-        reset.apply(Rows(state), Turn(0, 0.5, 60))
+        reset.apply(Rows(state), Schedule(0, 0.5, 60))
         for name, array in arrays_of(state).items():
-            assert_array_equal(array[~strays], wanted[name][~strays], err_msg=name)
+            assert_array_equal(array[~outliers], wanted[name][~outliers], err_msg=name)
             rounded = 1e-5 if name.endswith("xyz") else 0
             assert_allclose(array, wanted[name], rtol=rounded, err_msg=name)

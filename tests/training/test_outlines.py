@@ -13,8 +13,8 @@ from stga_addon.avatar.embedding import face_frames
 from stga_addon.capture.camera import look_at
 from stga_addon.capture.images import read_image
 from stga_addon.capture.open import open_capture
-from stga_addon.training.optimize.change import Turn
 from stga_addon.training.optimize.outlines import Outline, OutlinePruning, read_outlines
+from stga_addon.training.optimize.step_hook import Schedule
 from stga_addon.training.optimize.trainer import Trainer
 
 from .toys import Rows, bits, quick_settings, random_state
@@ -136,7 +136,7 @@ def test_what_is_pruned(region):
     pruning = OutlinePruning(None, 0, lambda timestep, coefficients: frames[timestep])
     pruning.outlines = outlines
     rows = Rows(state)
-    pruning.apply(rows, Turn(0, 0.5, 300, region))
+    pruning.apply(rows, Schedule(0, 0.5, 300, region))
     after = bits(rows.state)
     for name, old in before.items():
         np.testing.assert_array_equal(after[name], old[~pruned], err_msg=name)

@@ -39,16 +39,16 @@ def shares(monkeypatch):
         once_s = 0.0
 
         def __init__(self, *_, **__):
-            self.changes = {}
+            self.hooks = {}
 
-        def prepare_turns(self):
+        def prepare_hooks(self):
             watch.now += self.once_s
 
         def step(self, view, image, share, mask, mesh):
             assert not image.flags.writeable
             assert image.shape[:2] == mask.shape == (view.camera.height, view.camera.width)
             watch.now += 0.01 * image.shape[0] * image.shape[1] / 1000 * self.state / 1000
-            if self.changes["density"].interval == 1:
+            if self.hooks["density"].interval == 1:
                 watch.now += 0.5
                 self.state = min(2000, self.state + 500)
             else:
@@ -136,6 +136,6 @@ def test_one_phones_sides_are_found_before_they_are_timed(toy):
     """Catches one-off work that a trainer would still do in a step."""
     settings = make_settings(iterations=1, hull_points=False, lattice=0)
     trainer = Trainer(one_camera(toy), settings, {})
-    trainer.prepare_turns()
-    assert "outlines" in vars(trainer.changes["outlines"])
+    trainer.prepare_hooks()
+    assert "outlines" in vars(trainer.hooks["outlines"])
     assert "sides" in vars(trainer.frames)

@@ -22,14 +22,14 @@ from stga_addon.flame.model import faces_within
 from stga_addon.flame.parts import flame_model, key_regions
 from stga_addon.flame.quaternions import to_matrices
 from stga_addon.render.render import render
-from stga_addon.training.optimize.change import Turn
 from stga_addon.training.optimize.frames import FrameStore
 from stga_addon.training.optimize.initial_splats import hull_points, voxel_size
 from stga_addon.training.optimize.state import new_state
+from stga_addon.training.optimize.step_hook import Schedule
 from stga_addon.training.optimize.surface import GRAZING_COSINE, Surface
 from stga_addon.training.optimize.surface_prior import (
-    BACKING_OPACITY,
     BEHIND_COSINE,
+    OCCLUSION_OPACITY,
     WELL_SEEN_COSINE,
     SurfacePrior,
     above_unseen_hair,
@@ -248,7 +248,7 @@ def test_what_is_behind_keeps_its_width(filmed, convention):
     layer = hidden_splats(frames, settings)
     state = new_state(joined([layer, splats_behind(frames, settings.sh_degree)]))
     state.parameters.log_scale[: len(layer)] -= 0.7
-    SurfacePrior(frames).apply(Rows(state), Turn(20, 0.5, len(state)))
+    SurfacePrior(frames).apply(Rows(state), Schedule(20, 0.5, len(state)))
     surface = frames.surface
     is_behind = (surface.facing < BEHIND_COSINE)[layer.face]
     hair = is_behind & (surface.hair_height > 0)[layer.face]
@@ -274,7 +274,7 @@ def test_what_hardly_shows_hardly_moves(filmed):
         moments[:] = gradient[:, None] ** 2
     state.second.opacity[:] = gradient**2
     state.second.sh[:] = gradient[:, None, None] ** 2
-    SurfacePrior(frames).apply(Rows(state), Turn(20, 0.5, len(state)))
+    SurfacePrior(frames).apply(Rows(state), Schedule(20, 0.5, len(state)))
     behind = facing < BEHIND_COSINE
     assert behind.sum() > 100
     for moments in (state.second.xyz, state.second.rotation, state.second.log_scale):
@@ -316,7 +316,7 @@ def test_what_views_tell_is_kept(filmed):
     surface = frames.surface
     trainer = Trainer(filmed, quick_settings("global", sh_degree=0, sh_steps=()), {})
     state = trainer.state
-    outer = state.parameters.opacity != BACKING_OPACITY
+    outer = state.parameters.opacity != OCCLUSION_OPACITY
     rng = np.random.default_rng(0)
     told = rng.random(len(state)) < 0.8
     for part in (state.second.sh, state.second.opacity):
@@ -326,7 +326,7 @@ def test_what_views_tell_is_kept(filmed):
     state.parameters.xyz[outer] += rng.normal(0, 0.002, (outer.sum(), 3))
     before = {name: value.copy() for name, value in state.parameters._asdict().items()}
     prior = SurfacePrior(frames)
-    prior.apply(Rows(state), Turn(20, 0.5, len(state)))
+    prior.apply(Rows(state), Schedule(20, 0.5, len(state)))
     grazing = surface.outside & (surface.facing < GRAZING_COSINE) & (surface.facing > 0)
     of_grazing = grazing[state.face] & ~state.unbound & outer
     kept = of_grazing & told & ~frames.sides.triangles[state.face]
@@ -367,7 +367,7 @@ def test_lids_close(filmed):
     rng = np.random.default_rng(0)
     state.parameters.opacity[:] = -4
     state.parameters.log_scale[:] -= rng.uniform(0, 2, state.parameters.log_scale.shape)
-    SurfacePrior(frames).apply(Rows(state), Turn(20, 0.5, len(state)))
+    SurfacePrior(frames).apply(Rows(state), Schedule(20, 0.5, len(state)))
     splats = state.splats()
     splats = splats.rows(lids[splats.face] & ~splats.unbound)
     camera = look_at([0, 0.03, 0.6], [0, 0.03, 0], 320, 200, 900)
@@ -391,7 +391,7 @@ def test_lids_that_views_show_stay(filmed):
     state.parameters.rotation[rows] = rng.normal(size=(len(rows), 4))
     for part in (state.second.sh, state.second.opacity):
         part[:] = 1
-    prior.apply(Rows(state), Turn(20, 0.5, len(state)))
+    prior.apply(Rows(state), Schedule(20, 0.5, len(state)))
     is_layer = (state.parameters.rotation[rows] == [1, 0, 0, 0]).all(1)
     face, count = np.unique(state.face[rows[is_layer]], return_counts=True)
     assert set(face) == set(state.face[rows])
@@ -426,7 +426,7 @@ def test_lids_that_stay_folded_are_skin(filmed, tmp_path):
     state.parameters.sh[:] = -1
     for part in (state.second.sh, state.second.opacity):
         part[:] = 1
-    SurfacePrior(frames).apply(Rows(state), Turn(20, 0.5, len(state)))
+    SurfacePrior(frames).apply(Rows(state), Schedule(20, 0.5, len(state)))
     bound = ~state.unbound
     at = bound & folded[state.face]
     plausible = (sides.color[state.face[at]] - 0.5) / SH_C0
@@ -452,7 +452,7 @@ def test_lids_close_over_eyes(filmed):
         before = rng.normal(0, 1e-3, len(bound)) / meters
         state.parameters.xyz[bound, axis] = before
         state.second.opacity[:] = 1  # as views show them
-        SurfacePrior(frames).apply(Rows(state), Turn(20, 0.5, len(state)))
+        SurfacePrior(frames).apply(Rows(state), Schedule(20, 0.5, len(state)))
         height = state.parameters.xyz[bound, axis] * meters
         of_eyes = eyeballs[state.face[bound]]
         facing = (frames.sides.shown & (frames.surface.facing > 0.9))[state.face[bound]]

@@ -140,7 +140,7 @@ def test_kinds_of_iterations(toy):
         assert counted.state.gradient_count.max() == expected
 
 
-def test_stray_resets_and_density_control_come_when_due(toy):
+def test_outlier_resets_and_density_control_come_when_due(toy):
     """Catches maintenance that never runs, or outside its span, or grows too far."""
     options = {"density_interval": 2, "density_span": (0.2, 0.6), "growth": 0.05}
     options |= {"lattice": 2, "stray_reset_interval": 5}

@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 
 from stga_addon.avatar.embedding import face_areas, points_to_world, to_world
 from stga_addon.avatar.lattice import NORMAL_AXIS, lattice_splats
-from stga_addon.avatar.splats import SH_C0, colored_aside, joined, sh_color
+from stga_addon.avatar.splats import SH_C0, colored_off_axis, joined, sh_color
 from stga_addon.capture.camera import look_at
 from stga_addon.capture.images import read_image
 from stga_addon.capture.mesh_geometry import connected_parts, rasterize, silhouette
@@ -24,15 +24,15 @@ from stga_addon.flame.parts import flame_model, key_regions
 from stga_addon.flame.quaternions import to_matrices
 from stga_addon.render.render import render, render_avatar
 from stga_addon.tracking.torso_cloth import draped, torso_sheet
-from stga_addon.training.optimize.backing import GRAZED_COSINE
-from stga_addon.training.optimize.change import Turn
 from stga_addon.training.optimize.frames import FrameStore
 from stga_addon.training.optimize.initial_splats import flat_points
-from stga_addon.training.optimize.likeness import face_of, head_coordinates
+from stga_addon.training.optimize.occlusion_layer import GRAZED_COSINE
+from stga_addon.training.optimize.semantic_regions import face_of, head_coordinates
 from stga_addon.training.optimize.state import new_state, state_of_avatar
+from stga_addon.training.optimize.step_hook import Schedule
 from stga_addon.training.optimize.surface import GRAZING_COSINE, Surface
 from stga_addon.training.optimize.surface_prior import (
-    BACKING_OPACITY,
+    OCCLUSION_OPACITY,
     SurfacePrior,
     hidden_splats,
     splats_behind,
@@ -41,7 +41,7 @@ from stga_addon.training.optimize.surface_prior import (
 from stga_addon.training.optimize.trainer import Trainer
 from stga_addon.training.optimize.unseen_sides import (
     SOURCE_COSINE,
-    plausible_aside,
+    plausible_off_axis,
     unseen_sides,
 )
 
@@ -130,7 +130,7 @@ def test_restored_colors_are_those_of_the_avatar(from_one_side):
         part.sh[:] = rng.random(part.sh.shape)
     state.unbound[::7] = True
     before = {name: getattr(state, name).sh.copy() for name in ("average", "first", "second")}
-    SurfacePrior(FrameStore(capture, "stga")).apply(Rows(state), Turn(0, 0.5, len(state)))
+    SurfacePrior(FrameStore(capture, "stga")).apply(Rows(state), Schedule(0, 0.5, len(state)))
     far = sides.triangles[state.face] & ~state.unbound
     assert 0 < far.sum() < len(far)
     expected = (sides.color[state.face[far]] - 0.5) / 0.28209479177387814
@@ -252,7 +252,7 @@ def test_hair_goes_round_the_head(angles, height, fringe, hair, bundled, tmp_pat
 @pytest.mark.parametrize("convention", ["stga", "gaussian_avatars"])
 def test_unseen_hair_grows_in_locks(convention, bundled, tmp_path):
     """Catches a helmet of one color, strands across the direction of growth or with gaps, locks
-    that fade, change from turn to turn or reach skin, and light that takes them away from aside."""
+    that fade, change from turn to turn or reach skin, and light that takes them away off-axis."""
     capture = filmed(bundled, painted(bundled, GRAY), TURNS_DEG, 0.0, tmp_path)
     frames = FrameStore(capture, convention)
     surface = frames.surface
@@ -281,9 +281,9 @@ def test_unseen_hair_grows_in_locks(convention, bundled, tmp_path):
     assert alpha_of(layer, camera, frames.neutral)[shown].min() > 0.98
     state = new_state(joined([layer, splats_behind(frames, 0)]))
     prior = SurfacePrior(frames)
-    prior.apply(Rows(state), Turn(20, 0.5, len(state)))
+    prior.apply(Rows(state), Schedule(20, 0.5, len(state)))
     once = state.average.sh.copy()
-    prior.apply(Rows(state), Turn(40, 0.5, len(state)))
+    prior.apply(Rows(state), Schedule(40, 0.5, len(state)))
     assert_allclose(state.average.sh, once, atol=1e-3)
     kept = state.splats(averaged=True).rows(slice(len(layer)))
     assert_allclose(kept.xyz[strands], layer.xyz[strands], atol=1e-3)
@@ -306,8 +306,10 @@ def test_unseen_hair_grows_in_locks(convention, bundled, tmp_path):
     )
     assert near > apart + 0.2
     splats = replace(layer, sh=once[: len(layer)])
-    aside = plausible_aside(splats, np.tile(np.float32([0, 0, 1]), (len(hair), 1)), frames.sides)
-    assert_array_equal(aside.sh[strands, 0], splats.sh[strands, 0])
+    off_axis = plausible_off_axis(
+        splats, np.tile(np.float32([0, 0, 1]), (len(hair), 1)), frames.sides
+    )
+    assert_array_equal(off_axis.sh[strands, 0], splats.sh[strands, 0])
 
 
 def test_the_less_hair_is_unseen_the_fewer_strands(bundled, tmp_path):
@@ -379,7 +381,7 @@ def test_a_lit_and_a_shaded_side_meet_behind_a_neck(bundled, tmp_path):
 def test_what_lips_and_lids_hide(bundled, tmp_path):
     """Catches a closed mouth that is skin inside, or at the throat's end, teeth that are too white
     or train with a slit between lips, lips with a dark rim, an eye that is skin where it looks
-    aside, and folds of ears, or eyes' sockets, that count as the mouth's inside."""
+    off-axis, and folds of ears, or eyes' sockets, that count as the mouth's inside."""
     sides = sides_of(filmed(bundled, painted(bundled), TURNS_DEG, 0.0, tmp_path))
     hidden = sides.triangles & ~Surface(bundled).outside
     behind_lids = eyeballs_of(bundled) & hidden
@@ -419,7 +421,7 @@ def test_splats_behind_closed_lips_stay_small(bundled, tmp_path):
     state = Trainer(capture, quick_settings(iterations=1), {}).state
     state.parameters.log_scale[:] += 1
     before = state.parameters.log_scale.copy()
-    SurfacePrior(frames).apply(Rows(state), Turn(20, 0.5, len(state)))
+    SurfacePrior(frames).apply(Rows(state), Schedule(20, 0.5, len(state)))
     sides = frames.sides
     outside = frames.surface.outside
     lips = capture.regions["mouth"] & (outside | ~sides.triangles)
@@ -456,9 +458,11 @@ def test_what_sticks_out_of_masks_is_not_closed(bundled, tmp_path):
         np.unique(layer.face[surface.hidden[layer.face]]), np.flatnonzero(surface.closed)
     )
     state = Trainer(capture, quick_settings(iterations=1), {}).state
-    bound = ~state.unbound & (state.parameters.opacity != BACKING_OPACITY)
+    bound = ~state.unbound & (state.parameters.opacity != OCCLUSION_OPACITY)
     state.parameters.opacity[:] = -5
-    SurfacePrior(FrameStore(capture, "stga", False)).apply(Rows(state), Turn(20, 0.5, len(state)))
+    SurfacePrior(FrameStore(capture, "stga", False)).apply(
+        Rows(state), Schedule(20, 0.5, len(state))
+    )
     assert (state.parameters.opacity[bound & beyond[state.face]] == -5).all()
     assert (
         state.parameters.opacity[bound & (surface.closed & (surface.facing < -0.1))[state.face]] > 2
@@ -487,7 +491,7 @@ def test_a_chest_below_the_images(bundled, tmp_path):
     before = state.parameters.opacity.copy()
     state.average.sh[:, 0] = 9
     frames = FrameStore(capture, "stga", False)
-    SurfacePrior(frames).apply(Rows(state), Turn(20, 0.5, len(state)))
+    SurfacePrior(frames).apply(Rows(state), Schedule(20, 0.5, len(state)))
     of_chest = below[state.face]
     assert state.parameters.opacity[of_chest].min() > 2
     colors = 0.5 + SH_C0 * state.average.sh[of_chest, 0]
@@ -522,7 +526,7 @@ def test_a_mirrored_cheek_is_in_the_light_of_its_side(bundled, tmp_path):
         assert (away < 0.1 * color[rows] + 4).mean() > 0.9
 
 
-def test_hair_from_aside(bundled, tmp_path):
+def test_hair_off_axis(bundled, tmp_path):
     """Catches an avatar of one camera that does not look from there as it was trained, streaks of
     hair that run around the head as they shine in front, a face that is smoothed with them, hair
     before a neck that turns to skin, a training that goes on with what is plausible only, and views
@@ -543,18 +547,18 @@ def test_hair_from_aside(bundled, tmp_path):
     centers, level = middles(capture)
     towards = centers - view.camera.position
     assert_allclose(along, towards / np.linalg.norm(towards, axis=1)[:, None], atol=1e-5)
-    aside = sh_color(splats.sh, np.array([[1.0, 0, 0]]))
+    off_axis = sh_color(splats.sh, np.array([[1.0, 0, 0]]))
     facing = Surface(capture).facing[splats.face]
     shown = ~splats.unbound & (facing > 0.6)
     hair = ~splats.unbound & (facing > 0.2) & (level[splats.face] > 1.2)
     assert hair.sum() > 20
-    assert aside[hair].std(0).max() < 0.5 * seen[hair].std(0).max()
+    assert off_axis[hair].std(0).max() < 0.5 * seen[hair].std(0).max()
     cheeks = shown & (np.abs(level[splats.face]) < 0.5)
-    assert_allclose(aside[cheeks], seen[cheeks], atol=1e-5)
+    assert_allclose(off_axis[cheeks], seen[cheeks], atol=1e-5)
     assert_allclose(state_of_avatar(avatar).parameters.sh, trained.sh, atol=1e-5)
     sides = trainer.frames.sides
     before_neck = (sides.view_dependence > 0.5)[splats.face] & ~sides.is_hair[splats.face]
-    hanging = plausible_aside(replace(trained, unbound=before_neck), along, sides)
+    hanging = plausible_off_axis(replace(trained, unbound=before_neck), along, sides)
     assert before_neck.sum() > 100
     assert not hanging.sh[before_neck, 1:].any()
     assert splats.sh[before_neck, 1:].any()
@@ -562,7 +566,7 @@ def test_hair_from_aside(bundled, tmp_path):
     assert Trainer(around, trainer.settings, {}).avatar("", None).filmed_along is None
 
 
-def test_colors_aside_by_the_squared_sine():
+def test_colors_off_axis_by_the_squared_sine():
     """Catches coefficients of other signs or directions than those that splats are drawn with."""
     rng = np.random.default_rng(0)
     splats = lattice_splats(rng.normal(size=(4, 3)), np.array([[0, 1, 2], [1, 2, 3]]), 1, 0)
@@ -572,7 +576,7 @@ def test_colors_aside_by_the_squared_sine():
     axes = np.linalg.qr(rng.normal(size=(len(splats), 3, 3)))[0]
     direction = axes[:, 0]
     away = axes[:, 1]
-    colored = colored_aside(splats, direction, share, color)
+    colored = colored_off_axis(splats, direction, share, color)
     seen = sh_color(splats.sh, direction)
     for angle in (0, 0.3, 1.1, np.pi / 2, 2.5, np.pi):
         looked = np.cos(angle) * direction + np.sin(angle) * away
@@ -604,7 +608,7 @@ def behind(capture):
     """The layer behind what views graze, and the frames that it is drawn in."""
     frames = FrameStore(capture, "stga")
     layer = splats_behind(frames, 0)
-    return layer.rows(frames.backing.triangles[layer.face]), frames.of(0)
+    return layer.rows(frames.occlusion_layer.triangles[layer.face]), frames.of(0)
 
 
 def beside_masks(capture, layer, frames):
@@ -646,15 +650,15 @@ def test_the_end_behind_a_bust_stays(bundled, tmp_path):
     before = [array[rows].copy() for array in state.parameters[:3]]
     for array in state.parameters[:3]:
         array[rows] += np.random.default_rng(0).normal(0, 0.01, array[rows].shape)
-    for name in ("strays", "unseen sides"):
-        trainer.changes[name].apply(trainer._backend, Turn(20, 0.1, len(state)))
+    for name in ("outliers", "unseen sides"):
+        trainer.hooks[name].apply(trainer._backend, Schedule(20, 0.1, len(state)))
     for array, kept in zip(trainer.state.parameters[:3], before, strict=True):
         assert_allclose(array[rows], kept, atol=1e-6)
 
 
 def test_nobody_looks_through_what_a_collar_hides(bundled, tmp_path):
     """Catches a neck and clothes that are opaque for the cameras only, which see a collar before
-    them, so that from aside the background shows through; and a layer that reaches beyond the end
+    them, so that off-axis the background shows through; and a layer that reaches beyond the end
     of the mesh."""
     capture = filmed(bundled, painted(bundled), TURNS_DEG, 0.0, tmp_path)
     layer, frames = behind(capture)
@@ -677,7 +681,7 @@ def test_nobody_looks_into_the_mouth_past_a_cheek(angles, has_layer, bundled, tm
     centers, level = middles(capture)
     angle = np.degrees(np.arctan2(abs(centers[:, 0]), centers[:, 2] + 0.009))
     cheek = (abs(level + 0.5) < 0.5) & (abs(angle - 37) < 5)
-    assert FrameStore(capture, "stga").backing.triangles[cheek].any() == has_layer
+    assert FrameStore(capture, "stga").occlusion_layer.triangles[cheek].any() == has_layer
 
 
 def test_what_is_beside_the_jaw_lies_behind_the_face(bundled, tmp_path):

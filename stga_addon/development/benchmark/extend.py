@@ -175,14 +175,10 @@ def extend_arms(prepared: Prepared, seed: int) -> dict[str, Arm]:
     capture = prepared.capture
     parent = read_run(continuation.parent).settings
     views = capture.views["train"]
-    new = [view for view in views if continuation.includes(view.timestep)]
-    old = [view for view in views if not continuation.includes(view.timestep)]
-    first = Strategy(settings, prepared.selection)
     every = Strategy(replace(settings, strategy="global"), {})
     anew = replace(parent, driven_offsets=settings.driven_offsets)
     return {
-        "extend": Arm(settings, continued_order(continuation, capture, None, seed), first),
-        "all-in-turn": Arm(settings, alternating(old, new, seed), every),
+        "extend": Arm(settings, continued_order(continuation, capture, None, seed), every),
         "anew": Arm(anew, view_order(views, 1, seed), every, anew=True),
     }
 
@@ -208,15 +204,6 @@ def refine_arms(prepared: Prepared, seed: int) -> dict[str, Arm]:
         ),
         "all": Arm(settings, every, Strategy(replace(settings, strategy="global"), {})),
     }
-
-
-def alternating(old: list[View], new: list[View], seed: int) -> Iterator[View]:
-    """All views of both takes, in turn."""
-    first = view_order(new, 1, seed)
-    second = view_order(old, 1, seed + 1)
-    while True:
-        yield next(first)
-        yield next(second)
 
 
 def compare(name: str, prepared: Prepared, arm: Arm, options: argparse.Namespace) -> list[Line]:
@@ -290,17 +277,13 @@ def table(runs: dict[str, list[list[Line]]]) -> list[str]:
     """Markdown: PSNR at the end of each arm, mean ± standard deviation over seeds, and the seconds
     to two levels.
 
-    *same*: until the moving region of the new take (or the region) is as good as all-in-turn (or
-    all) leaves it. *98 %*: until both takes together reach 98 % of the PSNR that training anew ends
-    with.
+    *same*: until the region is as good as all leaves it. *98 %*: until both takes together reach
+    98 % of the PSNR that training anew ends with.
     """
     figures = [name for name in FIGURES if f"psnr_{name}" in next(iter(runs.values()))[0][-1]]
-    measured, rival = (
-        ("psnr_region", "all") if "region" in figures else ("psnr_moving_take_2", "all-in-turn")
-    )
     goals = {"98 %": ("psnr", runs.get("anew"), 0.98)}
-    if measured.removeprefix("psnr_") in figures:
-        goals = {"same": (measured, runs.get(rival), 1.0), **goals}
+    if "region" in figures:
+        goals = {"same": ("psnr_region", runs.get("all"), 1.0), **goals}
     rows = [["arm", "iterations", "ms", *figures, *(f"s to {goal}" for goal in goals)]]
     for of_seeds in [of_seeds for name, of_seeds in runs.items() if name != "anew"][:1]:
         before = (spread([lines[0][f"psnr_{name}"] for lines in of_seeds]) for name in figures)

@@ -85,7 +85,7 @@ def work(folder: Path, requests: IO[str], replies: IO[str], fits_exposure: bool 
         prepared = prepare(request, ignore, partial(print, file=sys.stderr))
         capture = prepared.capture
         seconds_per_iteration(capture, prepared.run.settings, 1, WARM_UP_S)
-        avatar = read_avatar(prepared.train_as_asked(turns.report))
+        avatar = read_avatar(prepared.train_as_asked(turns.report).path)
         if not turns.stopped:
             splits = [split for split in ("val", "test") if capture.views.get(split)]
             quality = {}

@@ -22,13 +22,15 @@ from ..performance import (
 
 VERSION = 6
 MAX_TEXT_BYTES = 512
-ROTATIONS = 9  # Yaw, pitch and roll of the head and of both eyes, after the shapes
+
+ROTATIONS = 9
+"""Yaw, pitch and roll of the head and of both eyes, after the shapes."""
 PACKET_SHAPES = tuple(
     mirrored_name(name) if re.fullmatch("(jaw|mouth)(Left|Right)", name) else name
     for name in ARKIT_SHAPES
 )
-"""In the order of the packets, which have the left of jaw and mouth first, unlike the app's CSV
-files."""
+"""Shapes in the order of the packets, which have the left of jaw and mouth first, unlike the app's
+CSV files."""
 
 
 def decode_live_link_face(data: bytes) -> FacePacket | None:

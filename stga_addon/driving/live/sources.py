@@ -27,7 +27,7 @@ Decoded = tuple[FacePacket | None, Any]
 class Source:
     """A protocol on UDP.
 
-    port     usual port
+    port     standard port
     decode   datagram and what is known of its sender (None at first) -> `Decoded`; None for bytes
              of another kind
     request  what is sent to the phone to make it send, on the same port; b"" for sources that send
@@ -73,8 +73,9 @@ SOURCES = {
 
 
 LOOPBACK = "127.0.0.1"
+
 MAX_DATAGRAM_BYTES = 1 << 14
-"""Of a frame of a source; more is foreign."""
+"""Size of a source's frame; larger packets are foreign."""
 MAX_DATAGRAMS = 256
 """Read at once, more than a socket keeps."""
 MAX_READ_BYTES = 1 << 15
@@ -88,7 +89,7 @@ class Receiver:
     def __init__(
         self, source: Source, address: str = LOOPBACK, port: int = 0, phone: str = ""
     ) -> None:
-        """Listen on `address` and `port` (0: the usual one); phone: whom a source with a request
+        """Listen on `address` and `port` (0: the standard one); phone: whom a source with a request
         asks. Raises StgaError for no address, or a port that cannot be opened."""
         self.source = source
         self.port = port or source.port
@@ -150,14 +151,18 @@ def leaves_this_machine(source: Source, address: str, phone: str) -> bool:
 
 Sender = tuple[str, str]  # Address and subject: two phones may share either
 
-MAX_SENDERS = 8  # Kept in memory; of more, those silent for longest are forgotten
-SILENCE_S = 2.0  # Without a packet, after which another sender is followed
+MAX_SENDERS = 8
+"""Senders kept in memory; of more, those silent for longest are forgotten."""
+SILENCE_S = 2.0
+"""Silence after which another sender is followed."""
 RESTART_S = 1.0
 """A clock set back by more is a source that started anew; by less, a packet that came late."""
-PAUSE_S = 2.0  # Longer gaps are pauses of the source, not lost packets
-GAP = 1.5  # Packets farther apart than this many usual steps have lost some between them
+PAUSE_S = 2.0
+"""Longer gaps are pauses of the source, not lost packets."""
+GAP = 1.5
+"""Packets farther apart than this many median steps have lost some between them."""
 MIN_CLOCK_STEP_S = 1e-4
-"""Between packets by the source's clock; less is the same moment."""
+"""Time between packets by the source's clock below which they are of the same moment."""
 # Steps of the source's clock, and arrivals, that are remembered
 STEPS = 31
 ARRIVALS = 240
@@ -274,11 +279,12 @@ def _remember(table: dict[Any, Any], key: Any, value: Any) -> None:
         del table[next(iter(table))]
 
 
-RESTING_PACKETS = 15  # Whose mean is the resting face: a quarter of a second
+RESTING_PACKETS = 15
+"""Packets whose mean is the resting face: a quarter of a second."""
 MIN_STEP_S = 2 / MAX_FPS
-"""Between rows: a file's times are rounded, and rows at MAX_FPS could be refused."""
+"""Time between rows: a file's times are rounded, and rows at MAX_FPS could be refused."""
 MAX_LEAD_S = 5.0
-"""By which a source's clock may be ahead of the packets' arrival: a usual socket keeps packets for
+"""By which a source's clock may be ahead of the packets' arrival: a socket keeps packets for
 4 s while Blender is busy. Beyond it, the clock was set, or is another's."""
 
 

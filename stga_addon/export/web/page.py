@@ -17,11 +17,15 @@ from ..rig import RiggedAvatar
 from ..skinned_gltf import glb_of, in_planes
 
 PLAYER = Path(__file__).parent / "player"
+"""Folder of the JavaScript modules."""
 ELEMENT = "stga-avatar.js"
+"""Module of the custom element."""
 PAGE = "page.js"
-"""Modules of the custom element, and of the page around it."""
+"""Module of the page around it."""
 IMPORT = re.compile(r"^import\b[^;]*?'\./([\w-]+\.js)';\n", re.MULTILINE)
+"""Imports of the modules, which are one in a page."""
 EXPORT = re.compile(r"^export (?=class|function|const|async)", re.MULTILINE)
+"""Their exports."""
 TYPES = re.compile(
     r"^// @ts-check\n|^ */\*\*\n(?: *\* @.*\n)+ *\*/\n|^ */\*\* @.*\*/\n|^ *\* @.*\n|"
     r"/\*\* @type \{.*?\} \*/ ",
@@ -72,9 +76,11 @@ def page(title: str, notice: str, data: bytes) -> str:
 
 
 PAGE_BYTES = 700_000
+"""Size of a page without splats, about."""
 BYTES_PER_SPLAT = 20
+"""Size of a splat in it, about."""
 BYTES_PER_COEFFICIENT = 0.45
-"""About what a page takes without splats; a splat; a coefficient of a driven offset."""
+"""Size of a coefficient of a driven offset in it, about."""
 
 
 def write_web(path: Path, rigged: RiggedAvatar, playback: Playback) -> list[Path]:

@@ -27,7 +27,7 @@ MAX_THREADS = 1024
 
 
 def kind_name(kind: type[Any]) -> str:
-    """ "select-for-take" for SelectForTake."""
+    """ "render-blend" for RenderBlend."""
     return "".join(f"-{c.lower()}" if c.isupper() else c for c in kind.__name__).lstrip("-")
 
 
@@ -163,6 +163,7 @@ def job_command(job: Job) -> list[str]:
 # Plans
 
 PLAN_KEYS = ("out", "resources", "job")
+"""Keys of a plan's top level."""
 TABLE_KEYS = ("request", "after", "resources", "minutes")
 """Keys of a job's table that are not fields of its request."""
 REPLACED = "replaced"  # Folder of the batch that keeps what changed jobs wrote before

@@ -19,11 +19,14 @@ from ...worker.status import LOG_FILE, inspect_worker, read_status
 from ...worker.training_python import PYTHON_VARIABLE
 from .plan import Ended, Engine, Job, job_command
 
-MAX_WAITING = 1000  # Tasks that are submitted at once: more wait here, not in Ray's memory
-NODE_RETRIES = 5  # How often Ray begins a task again elsewhere whose machine has gone
+MAX_WAITING = 1000
+"""Tasks that are submitted at once: more wait here, not in Ray's memory."""
+NODE_RETRIES = 5
+"""How often Ray begins a task again elsewhere whose machine has gone."""
 TOKEN_MODE = "RAY_AUTH_MODE"
+"""Environment variable by which a cluster asks for a token (Ray 2.52)."""
 TOKEN = "RAY_AUTH_TOKEN"
-"""Environment variables by which only who has the token may use a cluster (Ray 2.52)."""
+"""Environment variable of the token."""
 
 
 class RayEngine(Engine):

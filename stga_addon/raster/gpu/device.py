@@ -30,6 +30,7 @@ _TABLE = re.compile(r"^var<(uniform|storage)> (\w+)(.*)$", re.M)
 _FUNCTION = re.compile(r"(?:^@compute[^\n]*\n)?^fn (\w+)(.*?)^\}", re.M | re.S)
 _WRITTEN = re.compile(r"^\s*(\w+)\[[^=;\n]*\][.\w]* [-+*|]?=\s|&(\w+)", re.M)
 NONE: Mapping[str, Any] = {}
+
 Groups = tuple[int, int, int] | tuple[Any, int]
 """Workgroups of a dispatch; or the buffer that holds them as three u32, and the offset in bytes."""
 

@@ -13,32 +13,45 @@ from ..shader_constants import printed_constants
 WORKGROUP = 256
 """Threads of a workgroup: a tile's pixels, and the largest size that every adapter has."""
 HIDDEN = 0xFFFFFFFF
+"""Marks splats that no pixel shows."""
 WANTED = 0x80000000
 """Marks the pairs of wanted splats in `slot_splat`, beside the splat's number."""
 MAX_GROUPS = 65535
 """Workgroups along one dimension of a dispatch."""
 DIGIT_BITS = 11
+
 SORT_BLOCK = 1024
 """Keys that a workgroup sorts."""
 SEGMENT_PAIRS = 512
 """Pairs of a tile that a workgroup looks at on the way back; a multiple of WORKGROUP."""
 SORT_GROUPS = 0
+"""Words of `counts`: workgroups to sort the pairs."""
 PAIR_GROUPS = 3
+"""Words of `counts`: workgroups to visit each pair."""
 PAIRS = 6
+"""Word of `counts`: pairs in the lists."""
 NEEDED = 7
+"""Word of `counts`: pairs found."""
 OVERFLOWED = 8
+"""Word of `counts`: 1 if they did not fit since the host last cleared it."""
 COUNTS = 9
-"""Words of `counts`: workgroups to sort the pairs and to visit each; pairs in the lists, found, and
-1 if they did not fit since the host last cleared it."""
+"""Words of `counts`."""
 XYZ = 0
+"""First column of a splat's position."""
 ROTATION = 3
+"""First column of its rotation."""
 LOG_SCALE = 7
+"""First column of its scales."""
 OPACITY_LOGIT = 10
+"""Column of its opacity."""
 SH = 11
-"""Columns of a splat."""
+"""First column of its harmonics."""
 FRAME_ORIGIN = 0
+"""First column of a triangle's frame: its origin."""
 FRAME_MATRIX = 3
+"""First column of its rotation and scale."""
 FRAME_COLOR = 12
+"""First column of its color."""
 FRAME_STRIDE = 15
 """Columns of a triangle's frame."""
 

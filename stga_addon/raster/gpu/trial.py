@@ -20,9 +20,10 @@ SIZE = 20_000, 400
 SOFTWARE_SIZE = 1_000, 80
 """For adapters that compute on the CPU, whose speed is no question."""
 DEGREE = 1
+
 MAX_ERROR = 1e-3
-"""Of a wrong device's gradient, as a share of the gradient's length; rounding makes 1e-5 of it, a
-lost pair 1e-2."""
+"""Error of a wrong device's gradient, as a fraction of the gradient's length; rounding makes 1e-5
+of it, a lost pair 1e-2."""
 SECONDS = 0.3
 """For each of the two, after the first image, which is not timed."""
 

@@ -118,6 +118,7 @@ PLACED: dict[str | None, NodeGroup] = {
     name: _meshes(f"Place Splats ({name})", partial(_placed_splats, name), "Splats", "Frames")
     for name in CONVENTIONS
 }
+
 PLACED[None] = _meshes("Place Splats (world)", partial(_placed_splats, None), "Splats")
 """Splats (and the mesh with frames) -> splats in object space; None: in world space."""
 
@@ -200,12 +201,13 @@ def _in_range(nodes: Nodes, vector: Any, ends: tuple[str, str]) -> Any:
 
 
 DEFORMED = _meshes("Triangle Deformation", _deformed, "Posed", "Neutral")
+"""Posed and neutral mesh -> the mesh with its triangles' deformation."""
 SIGNALS = {
     "smoothed_strain": _meshes("Smoothed Strain", _with_smoothed_strain, "Deformed"),
     "normal": _meshes("Normal Change", _with_normal_change, "Deformed"),
 }
-"""By name, as in `avatar.offsets.SIGNALS`: mesh from DEFORMED -> the same with the signal's three
-components. What follows others is displayed as trained only."""
+"""Name, as in `avatar.offsets.SIGNALS` -> mesh from DEFORMED to the same with the signal's three
+components. Offsets of any other signal are displayed as trained only."""
 
 
 @cache

@@ -9,16 +9,20 @@ from . import splat_attributes as stored
 from .node_builder import NodeGroup, Nodes, kept_material
 
 RECORDED = "Recorded"
+
 SCENE_LIGHT = "Scene Light"
+
 LIGHTS = {
     RECORDED: "Native splats shine in the colors of the capture",
     SCENE_LIGHT: "Native splats are lit by the scene's lights and world, and shadowed",
 }
-"""What native splats show, in EEVEE and Cycles."""
-ALBEDO = "albedo"  # of native splats, and in its fourth channel roughness
+"""What native splats can show in EEVEE and Cycles -> its description."""
+ALBEDO = "albedo"
+"""Attribute of native splats; roughness is its fourth channel."""
 NORMAL = "surface_normal"
+
 SHRINKAGE_M = 0.006
-"""By which the mesh that throws shadows lies below the head's: splats would lie in its shadow."""
+"""How far the mesh that throws shadows lies below the head's: splats would lie in its shadow."""
 FOLD_M = 0.03
 """Skin that sees other skin within this, as in mouth, nostrils and between lids, throws none: below
 its surface is the other one."""

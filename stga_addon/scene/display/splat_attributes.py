@@ -35,14 +35,19 @@ FACE = "stga_face"
 UNSEEN = "stga_unseen"  # on a triangle of `UNSEEN_REGION`, where the avatar knows it
 NEUTRAL_AREA = "stga_neutral_area"  # of its triangle, m²; also on faces with driven offsets
 
-DISPLAY_COLOR = "stga_display_color"  # scene-linear, stored by the nodes
+DISPLAY_COLOR = "stga_display_color"
+"""Scene-linear color, stored by the nodes."""
 WORLD_ROTATION = "rotation"
+"""Posed rotation, by the name that Blender's native splats use."""
 WORLD_SCALE = "scale"
-"""As posed by the nodes, by the names that Blender's native splats have."""
+"""Posed scale, by the name that Blender's native splats use."""
 # What else those are drawn from.
-RADIANCE = "radiance:base"  # coefficient of degree 0, and opacity
-RADIANCE_SH = "radiance:sh_{}"  # coefficients of degrees 1 to 3
-MIN_OPACITY = 1e-6  # and at most 1 less that, of what becomes a logit
+RADIANCE = "radiance:base"
+"""Coefficient of degree 0, and opacity."""
+RADIANCE_SH = "radiance:sh_{}"
+"""Coefficients of degrees 1 to 3."""
+MIN_OPACITY = 1e-6
+"""Least opacity, and least transparency, of what becomes a logit."""
 _FIELDS = {
     "FLOAT": ("value", 1),
     "INT": ("value", 1),

@@ -105,8 +105,10 @@ SH_BANDS = tuple(
 )
 
 
-DISK = 0.7  # radius of the disk that an octahedron of radius 1 shows whole
-DOT_SIZE = 1.8  # radius of a dot in mean standard deviations, at which dots leave no holes
+DISK = 0.7
+"""Radius of the disk that an octahedron of radius 1 shows whole."""
+DOT_SIZE = 1.8
+"""Radius of a dot in mean standard deviations, at which dots leave no holes."""
 EXTENT = 3.0
 """Standard deviations from a quad's center to its sides; a Gaussian is below 1.2 % there."""
 
@@ -163,6 +165,7 @@ AS_TRAINED = "As Trained"
 POINTS = "Points"
 QUADS = "Camera Quads"
 NATIVE = "Native Splats"
+
 LIMITS = {
     AS_TRAINED: "Exact in viewports and by the engine STGA Splats; "
     "EEVEE and Cycles render camera quads",
@@ -171,7 +174,7 @@ LIMITS = {
     NATIVE: "Blender's own splats, for EEVEE and Cycles through any camera; "
     "edges are lighter than trained until Make Exact fits the colors",
 }
-"""What each display is for and what it is not, in its tooltip and in the panel."""
+"""Display -> what it is for and what it is not, in its tooltip and in the panel."""
 
 
 def displayed(nodes: Nodes, mode: Any, splats: Any, visible: Any, size: Any, native: Any) -> Any:
@@ -231,9 +234,10 @@ def _quads(nodes: Nodes, splats: Any, visible: Any, size: Any) -> bpy.types.Node
 
 
 MIN_BASE = (-0.5 / SH_C0,) * 3
+"""Constant coefficients of black."""
 MAX_BASE = (0.62 / SH_C0,) * 3
-"""Constant coefficients from black to a little brighter than white: EEVEE keeps 8 bits over the
-range of all splats, which one of them may make wide."""
+"""Constant coefficients a little brighter than white: EEVEE keeps 8 bits over the range of all
+splats, which one of them may make wide."""
 
 
 class _NativeInputs(NamedTuple):
@@ -294,16 +298,18 @@ MODES = {
     QUADS: NodeGroup("STGA Camera Quads", _INPUTS, "Geometry", _quads),
 }
 _NATIVE_INPUTS = _INPUTS | {"Added": "Vector", "View-Dependent": "Bool", "Painted": "Bool"}
+
 NATIVE_GROUPS = tuple(
     NodeGroup(f"STGA Native Splats {n}", _NATIVE_INPUTS, "Geometry", partial(_native, n))
     for n in range(4)
 )
-"""By the harmonics' degree."""
+"""Node groups of native splats by the harmonics' degree."""
 
 
 _FROZEN = "stga_frozen"
+
 MENUS = {DISPLAY: AS_TRAINED, NATIVE_LIGHT: RECORDED}
-"""Inputs that are menus, and what is chosen in a new file."""
+"""Inputs that are menus -> what is chosen in a new file."""
 
 
 class TreeOptions(NamedTuple):

@@ -7,10 +7,13 @@ import numpy as np
 from mathutils import Vector
 
 NO_BONES = np.zeros((0, 2, 4), np.float32)
-MAX_SHAPES = 256  # bones looked for in each pixel; those of a larger rig are covered by splats
+
+MAX_SHAPES = 256
+"""Bones looked for in each pixel; splats cover those of a larger rig."""
 WIDTH_SHARE = 0.15
+"""Half the width of a bone as a fraction of its length."""
 MARGIN_PX = 6.0
-"""Half the width of a bone as a share of its length, and what is added for outlines."""
+"""What is added to a bone's half width for outlines."""
 
 
 def front_bones(space: Any, region: Any, width: int, height: int) -> np.ndarray:

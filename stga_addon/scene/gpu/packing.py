@@ -16,16 +16,19 @@ from ...light.harmonics import GLOSSY
 from ...light.lamps import LightView, head_bounds, light_rows, light_view
 from ..layers import SceneLayer, random_percentage
 
-NEAR_M = 0.01  # splats nearer to the camera than this are dropped, as by the rasterizer
+NEAR_M = 0.01
+"""Splats nearer to the camera than this are dropped, as by the rasterizer."""
 CLIP_PLANES = 6
 VIEW_TEXELS = 2 + CLIP_PLANES
 LAYER_TEXELS = 5
+
 MAX_INDEX = 1 << 24
 """float32, in which the shader reads indices, holds whole numbers up to here exactly."""
 
 MAX_SHORT_KEY = (1 << 16) - 1
+"""Largest sort key of 16 bits."""
 MAX_LONG_KEY = (1 << 24) - (1 << 8)
-"""Largest sort keys: of 16 bits, and of 24, as many as float32 has, less what rounding may add."""
+"""Largest sort key of 24 bits, as many as float32 has, less what rounding may add."""
 MAX_RELATIVE_STEP = 1e-5
 """Largest step of depth between short keys as a share of the nearest depth: 5 µm at 0.5 m."""
 
@@ -194,10 +197,13 @@ def table(static: StaticSplats, layers: Sequence[SceneLayer], view: View) -> np.
 
 
 SURFACE_TEXELS = 4
+"""Texels of a splat's surface."""
 VERTEX_TEXELS = 3
+"""Texels of a vertex."""
 LIGHT_TEXELS = 4
+"""Texels of a point that stands for a light."""
 MAP_TEXELS = 4
-"""Of a splat, of a vertex, of a point that stands for a light, and of a shadow map."""
+"""Texels of a shadow map."""
 RELIT_TEXELS = 14
 """Of a layer: share and factor of color; roughness, specular, first light and number of lights;
 eye, damping; typical albedo; nine harmonics of the world as highlights show them; gain and share of

@@ -19,12 +19,17 @@ from .relit_textures import RelitTextures
 from .shaders import PROJECTED_TEXTURES
 
 CLEAR = (0.0, 0.0, 0.0, 0.0)
+
 OUTSIDE = 0
+"""Part of the composite that is not near bones, as `composite_shader` numbers it."""
 NEAR_BONES = 1
+"""Part near bones, which are in front of the splats."""
 BEHIND = 2
-"""Parts of what `SplatRenderer.composite` draws, as `composite_shader` numbers them."""
-COMPACT = "RGBA16F"  # format of the color target, beside EXACT
+"""The background near bones, which is subtracted."""
+COMPACT = "RGBA16F"
+"""Format of the color target, beside EXACT."""
 DEPTH_FORMAT = "RG32F"
+
 _problems: dict[str, str] = {}
 """Format of the color target -> what was wrong with the first picture, "" where nothing was."""
 

@@ -48,6 +48,7 @@ from .buffers import TEXTURE_WIDTH
 
 PACKED_TEXTURES = ("orders", "centers", "axes", "colors", "frames", "table")
 PROJECTED_TEXTURES = ("places", "sides", "shades")
+
 BLOCK_SPLATS = 128
 """Splats drawn by one instance: GPUs are slow at instances of four vertices. A divisor of
 TEXTURE_WIDTH: the last instance then reads no further than the last row."""

@@ -20,9 +20,10 @@ ROTATIONS = np.array([[1.0, 0, 0, 0], [0.9, 0.1, -0.2, 0.4], [0.8, -0.3, 0.1, -0
 DEVIATIONS_M = np.array([[0.5, 0.4, 0.3], [0.03, 0.14, 0.08], [0.15, 0.05, 0.09]])
 OPACITIES = np.array([0.5, 0.8, 0.7])
 COLORS = np.array([[0.9, 0.5, 0.1], [0.2, 0.9, 0.4], [0.3, 0.2, 0.8]])
+
 HIDDEN_DEPTH_M = 2.0
-"""Of invisible splats behind the first of the three, so that the second instance of the shader
-draws the others."""
+"""Depth of invisible splats behind the first of the three, so that the second instance of the
+shader draws the others."""
 MAX_ERROR = 0.03
 """Of color and alpha, and of depth in meters; up to 1/255 for each splat is cut off on purpose."""
 

@@ -19,14 +19,19 @@ DATA_VIEWS = ("Raw", "False Color", "Log", "Filmic Log")
 """View transforms that show data instead of colors; they are left alone."""
 # samples along an axis of the table measured, and of its inverse
 GRID = 41
+"""Samples along an axis of the table measured."""
 INVERSE_GRID = 25
-# range of the scene-linear samples, in log2; the first sample is 0
+"""Samples along an axis of its inverse."""
 DARKEST = -14.0
+"""Log2 of the darkest scene-linear sample after 0."""
 BRIGHTEST = 6.0
+"""Log2 of the brightest one."""
 INVERSE_STEPS = 15
+"""Damped Gauss-Newton steps to a color of the inverse."""
 MAX_STEP = 4
+"""Longest of these steps, in samples."""
 DAMPING = 1e-3
-"""Of finding a color of the inverse; steps in samples, damped where colors hardly change."""
+"""Damping of these steps where colors hardly change."""
 CHUNK = 1 << 16  # pixels converted at a time, which bounds the memory
 MAIN_THREAD_TIMEOUT_S = 10.0
 MAX_MEASURED = 8  # inverses that are kept, of a megabyte each

@@ -25,6 +25,7 @@ IDENTITY_SLIDERS = 10
 EXPRESSION_KEY = "expr_"
 IDENTITY_KEY = "identity_"
 OFFSET_KEY = "offset_t"
+
 EXPRESSION_NAMES = "stga_expressions"
 """Property of a head whose expressions have ARKit's names: these, separated by commas."""
 # The joints that each part of a motion (`PARTS`) rotates.
@@ -96,10 +97,12 @@ def bones_of(parts: Sequence[str]) -> list[str]:
     return [bone for part in parts for bone in PART_JOINTS.get(part, ())]
 
 
-UNCHANGED = 1e-6  # change of a slider's value below which it is not keyframed
-MAX_SLIDER = 10.0  # the widest range that Blender allows a shape key's value: -10 to 10
+UNCHANGED = 1e-6
+"""Change of a slider's value below which it is not keyframed."""
+MAX_SLIDER = 10.0
+"""The widest range that Blender allows a shape key's value: -10 to 10."""
 COEFFICIENT_RANGE = (-3.0, 3.0)
-"""Of components without names, as a slider shows them: standard deviations, or near to them."""
+"""Range of a slider of a component without a name: standard deviations, or near to them."""
 
 
 def slider_range(name: str) -> tuple[float, float]:

@@ -54,6 +54,7 @@ def apply_motion(
     count = max(len(used), 1 + max(sliders, default=-1))
     frames = [replace(each, expr=np.pad(each.expr, (0, count - len(each.expr)))) for each in frames]
     keys = head.data.shape_keys
+
     has_expression = "expression" in parts
     offsets = keyframes.offset_keys(head) if has_expression else []
     owners = [rig] if offsets or set(parts) & set(keyframes.PART_JOINTS) else []
@@ -175,8 +176,8 @@ class LivePose:
         self._rig: Any = None if rig is None else Identity(rig)
         self.takes_frames = rig is not None
         keys = head.data.shape_keys.key_blocks
+        # Component, or column of the 52 -> slider
         self._names = keyframes.shape_key_names(head)
-        """Component, or column of the 52 -> slider."""
         still: list[str] = []
         if rig is not None:
             self._names = keyframes.expression_keys(head)

@@ -22,13 +22,16 @@ EXPECTED = (
     "transforms.json, a COLMAP model (sparse/0), Metashape's cameras.xml, "
     "RealityCapture's CSV or XMP files"
 )
+"""What messages say is read."""
 HEAD_BYTES = 4096
+"""Bytes of a file in which UNREAD_MARKS are looked for."""
 UNREAD_NAMES = (
     *("poses_bounds.npy", "cameras_sphere.npz", "reconstruction.json", "cameras.sfm"),
     *("intri.yml", "extri.yml"),
 )
 """Files of LLFF, NeuS, OpenSfM, Meshroom and EasyMocap."""
 OF_JSON = ("transform_matrix", "camera_matrix", "intrinsics", "extrinsics", "world_2_cam")
+"""Keys of a camera in the JSON of several programs."""
 UNREAD_MARKS: dict[str, tuple[str, ...]] = {
     ".out": ("# Bundle file",),
     ".nvm": ("NVM_V3",),

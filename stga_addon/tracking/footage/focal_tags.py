@@ -16,22 +16,32 @@ from ...capture.images import FORMATS
 FULL_FRAME_DIAGONAL_MM = 43.27
 """Of 36 x 24 mm; equivalent lengths have one angle of view over the diagonal (CIPA DCG-001)."""
 MIN_EQUIVALENT_MM = 5.0
+"""Least focal length for 35 mm film that is plausible."""
 MAX_EQUIVALENT_MM = 2000.0
+"""Largest focal length for 35 mm film that is plausible."""
 EXIF = 0x8769
+"""Tag of the directory of EXIF 2.32."""
 EQUIVALENT = 0xA405
+"""Tag of FocalLengthIn35mmFilm."""
 FOCAL = 0x920A
+"""Tag of FocalLength."""
 PER_UNIT = 0xA20E
+"""Tag of FocalPlaneXResolution."""
 UNIT = 0xA210
+"""Tag of FocalPlaneResolutionUnit."""
 WIDTH = 0xA002
+"""Tag of the picture's width as taken."""
 HEIGHT = 0xA003
-"""Tags of EXIF 2.32: the directory, FocalLengthIn35mmFilm, FocalLength, FocalPlaneXResolution and
-its unit; and the size of the picture as taken."""
+"""Tag of the picture's height as taken."""
 UNITS_MM = {2: 25.4, 3: 10.0}
+"""FocalPlaneResolutionUnit -> millimeters."""
 MAX_ASPECT_DIFFERENCE = 0.01
-"""Relative; beyond it, a photo has been cropped, and its tags are those of the whole picture."""
+"""Relative difference of the aspect beyond which a photo has been cropped: its tags are those of
+the whole picture."""
 EQUIVALENT_KEY = b"com.apple.quicktime.camera.focal_length.35mm_equivalent"
+"""Key of the focal length for 35 mm film in QuickTime's metadata."""
 VALUE_FORMATS = {21: ">i", 22: ">I", 23: ">f", 24: ">d", 67: ">i", 77: ">I"}
-"""Well-known types of QuickTime's metadata, but for text."""
+"""Well-known types of QuickTime's metadata, but for text -> format of `struct`."""
 MAX_BOXES = 1000
 MAX_MOVIE_BYTES = 1 << 26
 # Bytes before the entries, and of a picture's before its boxes

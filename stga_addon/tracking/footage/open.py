@@ -38,6 +38,7 @@ from .sources import (
 from .video import Video, VideoFrames, first_frames
 
 ALL_FRAMES = FrameRange()
+
 USUAL_VIEW_DEG = 65.0
 """Angle of view of an unknown camera over the image's diagonal: that of a phone."""
 

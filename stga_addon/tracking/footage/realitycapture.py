@@ -15,6 +15,7 @@ FILM_WIDTH_MM = 36.0
 """Of the 35 mm film that focal lengths are given for; it stands for the image's longer side."""
 REQUIRED_COLUMNS = ("name", "x", "y", "alt", "heading", "pitch", "roll", "f")
 LENS_COLUMNS = ("k1", "k2", "k3", "k4", "t1", "t2")
+
 OTHER_SPELLINGS = {
     "yaw": "heading",
     "f_35mm": "f",
@@ -30,8 +31,8 @@ OTHER_SPELLINGS = {
     "label": "name",
     "camera": "name",
 }
-"""Column as other versions and people name it -> as it is read. That RealityScan's mean the same,
-its users say (nerfstudio's pull request 3758)."""
+"""Column as other versions and people name it -> as it is read. RealityScan's users say that its
+columns mean the same (nerfstudio's pull request 3758)."""
 OF_CALIBRATIONS = {
     *("heading", "pitch", "roll", "f", *LENS_COLUMNS, "px", "py", "fx", "fy", "cx", "cy", "f_pix"),
     *("px_pix", "py_pix", "focal", "focal_length", "tx", "ty", "tz", "rx", "ry", "rz", "qw", "qx"),

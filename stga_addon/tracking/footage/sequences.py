@@ -19,9 +19,13 @@ from .video import Video, VideoFrames, opened_video, read_video
 # Sound is compared by its loudness every 2 ms
 SOUND_RATE_HZ = 16000
 SOUND_HOP = 32
-MIN_OVERLAP_S = 1.0  # Shared time below which two recordings are not compared
-MOTION_SIZE = 32  # Pixels of an image's sides, in which motion is measured
-MIN_CORRELATION = 0.2  # Correlation below which nothing is shared
+
+MIN_OVERLAP_S = 1.0
+"""Common time below which two recordings are not compared."""
+MOTION_SIZE = 32
+"""Side in pixels of the images in which motion is measured."""
+MIN_CORRELATION = 0.2
+"""Correlation below which recordings have nothing in common."""
 MIN_DISTINCTION = 1.5
 """Times that the best lag's score exceeds that of any farther than NEIGHBORHOOD_S away."""
 NEIGHBORHOOD_S = 0.2

@@ -18,15 +18,20 @@ from ...files import read_bytes
 MIN_RADIUS = 1e-9
 """Below it, an angle and its tangent are the same number; and parameters have no effect."""
 ZOOM_RANGE = (0.5, 2.0)
+"""Range of the pinhole's focal length over the lens's: a fisheye's rim leaves few pixels inside."""
 ZOOM_STEPS = 30
-"""Of the pinhole's focal length over the lens's: a fisheye's rim leaves few pixels inside."""
+"""Focal lengths that are tried in this range."""
 BORDER_POINTS = 33
 """Points along a side of the image at which it is checked that all of it was recorded."""
-CACHED_MAPS = 32  # Lenses whose maps are kept: 6 bytes a pixel each
+CACHED_MAPS = 32
+"""Lenses whose maps are kept: 6 bytes a pixel each."""
 NAMES_IN_SENTENCE = 5
-ROTATION_TOLERANCE = 1e-3  # some exports round rotations to a few decimals
+"""Files that a message names at most."""
+ROTATION_TOLERANCE = 1e-3
+"""Some exports round rotations to a few decimals."""
 MAX_POSITION = 1e12
-"""Of a camera, in the calibration's unit: millimeters from the center of the earth are 1e10."""
+"""Largest coordinate of a camera, in the calibration's unit: millimeters from the center of the
+earth are 1e10."""
 Intrinsics = tuple[int, int, float, float, float, float]  # Width, height, fl_x, fl_y, cx, cy
 
 

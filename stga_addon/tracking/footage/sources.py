@@ -16,11 +16,12 @@ VIDEO_SUFFIXES = (
     *(".mpeg", ".m2v", ".vob", ".wmv", ".asf", ".flv", ".f4v", ".3gp", ".3g2", ".ogv", ".dv"),
     ".gif",
 )
+"""Suffixes of videos that are read."""
 UNREAD_SUFFIXES = (
     *(".heic", ".heif", ".avif", ".jxl", ".jp2", ".tga", ".exr", ".hdr", ".psd", ".dng", ".cr2"),
     *(".cr3", ".nef", ".arw", ".raf", ".rw2", ".orf", ".braw", ".r3d", ".ari", ".crm"),
 )
-"""Of pictures and videos that are not read."""
+"""Suffixes of pictures and videos that are not read."""
 CONTAINERS = ("images", "frames", "videos", "input")
 """Folders that gather those of the cameras; their names are no part of a camera's. Of pictures of
 the same names in several, the first are used."""

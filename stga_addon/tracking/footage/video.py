@@ -18,7 +18,8 @@ from ...errors import StgaError
 from ...files import file_address
 from .focal_tags import clean_aperture
 
-MIN_HD_LINES = 720  # From here on, videos without a stated color matrix are in that of HD (BT.709)
+MIN_HD_LINES = 720
+"""From this height on, videos without a stated color matrix use that of HD (BT.709)."""
 TIMED_CONTAINERS = ("mov", "matroska")
 """FFmpeg's names of containers that store when each packet is shown."""
 SEEKABLE_CONTAINERS = (*TIMED_CONTAINERS, "mpegts")
@@ -35,7 +36,8 @@ SEEK_BACK_FRAMES = (0, 16, 64, 256)
 """How far before a frame a seek is tried, in turn, before all is decoded from the beginning."""
 RATE_TOLERANCE = 0.01
 """Relative difference up to which a stated frame rate is that of the frames' times."""
-TURN_TOLERANCE = 0.02  # Of the sine of an angle, beyond which a turn is not by a right angle
+TURN_TOLERANCE = 0.02
+"""Sine of an angle beyond which a turn is not by a right angle."""
 VARIABLE_RATE_FACTOR = 1.5
 """A frame that lasts this many times the median makes the rate a variable one."""
 
@@ -130,6 +132,7 @@ class VideoFrames:
         self.masks = masks
         self._container: Any = None
         self._decoder: Iterator[Any] | None = None
+
         self._decoded = -1
         """Number of the frame that was decoded last."""
 

@@ -13,15 +13,18 @@ from ..optimize.image_preparation import fit_lines
 from .samples import Samples
 
 FOLDS = 4
+"""Parts of the samples, each left out of one fit, which then predicts it."""
 MIN_SAMPLES_PER_TRIANGLE = 6
+"""Samples without which a triangle is left out of the fits."""
 CAMERA_FIT_ITERATIONS = 30
 """Alternations between cameras and triangles, slow as opposite cameras share few triangles."""
 CAMERA_PRIOR_SAMPLES = 5.0
 """Weight, in samples, of the prior that a camera is like the others."""
 LIGHT_RIDGE = 1.0
+"""Weight in samples of an even light."""
 EXPOSURE_RIDGE = 50.0
-"""Weights in samples of an even light, and of an even exposure of each view: where both explain
-what is seen, the one light does."""
+"""Weight in samples of an even exposure of each view: where light and exposure both explain the
+images, the one light does."""
 TYPICAL_LEVEL = 100.0
 """Of a color, in levels of 255; scales the prior of a gain."""
 MIN_EXPOSURE_LEVELS = 1.5
@@ -136,8 +139,8 @@ def fit_drift(samples: Samples, color: np.ndarray) -> np.ndarray:
     for _ in range(CAMERA_FIT_ITERATIONS):
         mean = np.where(known, _mean(color / gain[:, None]), 0)
         gain = (np.where(known, color * mean, 0).sum(1) + prior) / ((mean**2).sum(1) + prior)
-        usual = np.stack([gain[row == camera].mean(0) for camera in range(row.max() + 1)])
-        gain /= usual[row]
+        mean = np.stack([gain[row == camera].mean(0) for camera in range(row.max() + 1)])
+        gain /= mean[row]
     return gain
 
 

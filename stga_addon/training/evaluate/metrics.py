@@ -39,6 +39,7 @@ MATTE_BORDER_SHARE = 0.0075
 PRIOR_SHARE = 1e-3
 """Weight of gain 1, offset 0, of the fitted pixels; decides where a rendering is one color."""
 LUMA = np.array([0.299, 0.587, 0.114], np.float32)
+"""Weights of red, green and blue in a pixel's brightness (BT.601)."""
 PREWITT_SUM = 3
 """Sum of the positive weights of Prewitt's filter."""
 WINDOW_PX = 7

@@ -57,34 +57,41 @@ from .outlines import TOLERANCE_SHARE
 from .state import state_of_avatar
 
 RENDERINGS = 7
+"""Renderings of each view when a timestep is tracked for the first time."""
 RENDERINGS_AGAIN = 3
-"""Of each view of a timestep, at first and once it was tracked so already: more hardly help."""
+"""Renderings of each view when it was tracked before; more hardly help."""
 MAX_VIEWS = 4
+"""Cameras, spread over the rig, whose images are compared."""
 MAX_HEIGHT_PX = 400
-"""Cameras, spread over the rig, whose images are compared; larger images are shrunk."""
+"""Height of the compared images; larger ones are shrunk."""
 PYRAMID_PX = (50, 100, 200)
+"""Heights of the images in which the first timestep of another recording is tracked before: a
+pattern on clothes misleads by more than its width."""
 PYRAMID_RENDERINGS = 20
-"""Heights of the images in which the first timestep of another recording is tracked before, as a
-pattern on clothes leads astray by more than its width, and renderings in each."""
+"""Renderings at each height of the pyramid."""
 TRACKED_SHARE = 0.2
+"""Images that the avatar tracks its head in while it trains, as a fraction of the run's iterations:
+a long take must not track for longer than it trains."""
 MIN_TRACKED_TIMESTEPS = 12
-"""Images that an avatar tracks its head in while it trains, as a share of the run's iterations, so
-that a long take does not track for longer than it trains; and timesteps that are tracked however
-few iterations there are."""
+"""Timesteps that are tracked however few iterations there are."""
 ROOT = JOINTS.index("root")
+
 CACHED_TIMESTEPS = 12
 """FLAME frames kept in memory, with their dynamic offsets."""
 POINTS = 6000
+"""Points sampled on the surface."""
 MIN_COSINE = 0.15
+"""Cosine between normal and direction to the camera below which a point does not count."""
 MESH_IMAGE_SIDE_PX = 160
-"""Points of the surface; of the angle between normal and camera, below which one does not count;
-larger side of the images of the mesh, by which hidden ones, the head's pixels and light are
-known."""
+"""Larger side of the mesh's images, which tell hidden points, the head's pixels and the light."""
 EXPRESSION_SIGMA = 0.3
+"""Standard deviation of an expression coefficient from its start."""
 JOINT_SIGMA_RAD = 0.2
+"""Standard deviation of a joint's rotation from its start."""
 TRANSLATION_SIGMA_M = 0.02
+"""Standard deviation of the head's position from its start."""
 SCALE_SIGMA = 0.02
-"""Standard deviations of a timestep's parameters from those that it starts with."""
+"""Standard deviation of the head's relative size from its start."""
 LEAST_GAIN = 1e-3
 """Share of the loss by which a step has to lower it; one that does not is the last, but not where
 the first timestep of another recording is sought: it leads all others."""

@@ -8,8 +8,8 @@ import numpy as np
 from ...flame.quaternions import to_matrices
 from ...raster.cpu.layout import Parameters
 from .backend import Backend
-from .change import Turn
 from .state import PRUNED_BY, opacity_of, parameters_and_average, prunable
+from .step_hook import Schedule
 
 HALVED = ("xyz", "rotation", "log_scale", "opacity")
 """Parameters of splats that halves have others of, or that these depend on."""
@@ -32,7 +32,7 @@ class DensityControl:
     interval       iterations between turns, 0: never; default 100, as in 3D Gaussian Splatting
                    (Kerbl et al. 2023), 200 with the paper's settings
     span           shares of the budget from and before which it works; default (0.1, 0.6)
-    split_share    largest share of the splats that is split at a turn; default 0.2, ours
+    split_share    largest share of the splats that is split at a time; default 0.2, ours
     growth         most splats that are added, as a share of the whole lattice and the hull points;
                    default 0.25, ours
     seed           of the halves' distances
@@ -60,18 +60,18 @@ class DensityControl:
     def prepare(self) -> None:
         """Nothing is found out once."""
 
-    def apply(self, backend: Backend, turn: Turn) -> None:
+    def apply(self, backend: Backend, schedule: Schedule) -> None:
         start, end = self.span
-        if not start <= turn.progress < end:
+        if not start <= schedule.progress < end:
             return
         columns = backend.columns(READ_COLUMNS)
         face = columns["face"]
-        within = np.ones(len(face), bool) if turn.region is None else turn.region[face]
-        split = self._split(columns, within, turn)
+        within = np.ones(len(face), bool) if schedule.region is None else schedule.region[face]
+        split = self._split(columns, within, schedule)
         faint = opacity_of(columns["parameters/opacity"]) < self.min_opacity
         keep = ~prunable(columns, faint & within)
         keep[split] = False
-        rng = np.random.default_rng([self.seed, turn.iteration])
+        rng = np.random.default_rng([self.seed, schedule.iteration])
         distance = self.distance * (1 + self.jitter * rng.standard_normal((len(split), 1)))
         parents = {name: columns[f"parameters/{name}"][split] for name in HALVED}
         kept = np.flatnonzero(keep)
@@ -93,12 +93,12 @@ class DensityControl:
         return np.asarray(gradient)
 
     def _split(
-        self, columns: Mapping[str, np.ndarray], within: np.ndarray, turn: Turn
+        self, columns: Mapping[str, np.ndarray], within: np.ndarray, schedule: Schedule
     ) -> np.ndarray:
         """Rows of the highest scores among those within (N,) bool, the highest first."""
         score = np.where(within, self.score(columns), 0)
-        share = self.split_share if turn.region is None else self.region_share
-        room = round(turn.initial_count * (1 + self.growth)) - len(score)
+        share = self.split_share if schedule.region is None else self.region_share
+        room = round(schedule.initial_count * (1 + self.growth)) - len(score)
         count = max(0, min(room, int(share * within.sum())))
         rows = np.argsort(-score, kind="stable")[:count]
         return np.asarray(rows[score[rows] > 0])

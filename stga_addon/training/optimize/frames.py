@@ -14,27 +14,30 @@ from ...avatar.strain import strain_basis, trained_range
 from ...capture.model import Capture
 from ...raster.cpu.rasterize import moved_frames
 from ..settings import TrainingSettings
-from .backing import Backing, backing_of
 from .initial_splats import voxel_size
+from .occlusion_layer import OcclusionLayer, occlusion_layer
 from .surface import Surface
 from .unseen_sides import UnseenSides, unseen_sides
 
 CACHE_BYTES = 256e6
+"""Memory for the frames of timesteps: posing a mesh anew takes a seventh of an iteration."""
 BYTES_PER_TRIANGLE = 170
-"""Of the timesteps kept in memory; of a triangle's frame, deformation, signals and corners in one.
-Posing a mesh anew takes a seventh of an iteration."""
+"""Memory of a triangle's frame, deformation, signals and corners in a timestep."""
 
 UNSEEN_LIMIT_SHARE = 0.35
+"""Fraction of the scale limit that remains on triangles that face away from all cameras: a large
+splat that serves an outline floats in the air for other cameras."""
 BORDER_LIMIT_SHARE = 0.2
+"""Fraction of the scale limit that remains where the mesh ends."""
 BORDER_DISTANCE_SHARE = 0.6
-"""Of the scale limits, on triangles that face away from all cameras: a large splat that serves an
-outline hangs in the air for other cameras. Of the limits of scale and distance, where the mesh
-ends."""
+"""Fraction of the distance limit that remains where the mesh ends."""
 LAYER_HEIGHT_SHARE = 0.8
+"""Height of the middle of hair's outer layer as a fraction of the height of hair, before half of
+its thickness is taken off."""
 LAYER_VOXELS = 0.5
+"""What is taken off that height, half of the layer's thickness."""
 SKIN_DEPTH = 0.1
-"""Share of the height of hair at which its outer layer lies, less its own thickness; depth of that
-on skin, in the triangles' units, so that it does not stand out of the surface."""
+"""Depth of the layer on skin, in the triangles' units, so that it does not stand out."""
 HEAD_RADIUS_VOXELS = 22.5
 """By which hair's outer layer is wider than the scalp."""
 
@@ -106,8 +109,8 @@ class FrameStore:
         return unseen_sides(self.surface)
 
     @cached_property
-    def backing(self) -> Backing:
-        return backing_of(self.surface, self.sides)
+    def occlusion_layer(self) -> OcclusionLayer:
+        return occlusion_layer(self.surface, self.sides)
 
     @cached_property
     def layer_height(self) -> np.ndarray:

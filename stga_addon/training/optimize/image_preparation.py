@@ -20,11 +20,14 @@ image's height: the larger one counts where the smaller one holds no backdrop.""
 NO_CORRECTION = np.array([[1.0, 1.0, 1.0], [0.0, 0.0, 0.0]])
 """Gain and offset by channel."""
 MAX_GAIN = 4.0
+"""Largest gain of an image's exposure; the least is its inverse."""
 EXPOSURE_PRIOR = 1e-3
+"""Weight of an unchanged exposure as a fraction of the pixels, which decides where all have one
+color."""
 EXPOSURE_SCALE = 0.08
+"""Difference in 0…1 beyond which pixels are outliers."""
 EXPOSURE_ITERATIONS = 4
-"""Weight of the usual exposure as a share of the pixels, which decides where all have one color;
-and the difference in 0…1 beyond which pixels are outliers."""
+"""Reweighted least squares fits of an exposure."""
 
 
 def image_preparation(capture: Capture, settings: TrainingSettings) -> Preparation | None:
@@ -102,21 +105,21 @@ def _levels(values: np.ndarray) -> np.ndarray:
 def fit_exposure(
     drawn: np.ndarray,
     seen: np.ndarray,
-    usual: np.ndarray | None = None,
+    expected: np.ndarray | None = None,
     share: float = EXPOSURE_PRIOR,
 ) -> np.ndarray:
     """(2, 3) gain and offset of each channel with which colors (3, N) become those of a camera.
 
-    In 0…1; robust (Geman-McClure). usual: what is expected (None: gain 1, offset 0), with the
-    weight of a share of the pixels.
+    In 0…1; robust (Geman-McClure). expected: prior of both (None: gain 1, offset 0), with the
+    weight of a fraction of the pixels.
     """
-    usual = NO_CORRECTION if usual is None else usual
-    found = usual
+    expected = NO_CORRECTION if expected is None else expected
+    found = expected
     for _ in range(EXPOSURE_ITERATIONS if drawn.size else 0):
         gain, offset = found[..., None]
         weight = (1 + ((seen - gain * drawn - offset) / EXPOSURE_SCALE) ** 2) ** -2.0
         prior = share * weight.sum(1) * np.stack([drawn.var(1) + 1e-4, np.ones(3)])
-        found = fit_lines(drawn, seen, prior, usual, weight)
+        found = fit_lines(drawn, seen, prior, expected, weight)
         found[0] = np.clip(found[0], 1 / MAX_GAIN, MAX_GAIN)
     return found
 
@@ -125,18 +128,18 @@ def fit_lines(
     x: np.ndarray,
     y: np.ndarray,
     prior: np.ndarray,
-    usual: np.ndarray = NO_CORRECTION,
+    expected: np.ndarray = NO_CORRECTION,
     weight: np.ndarray | None = None,
 ) -> np.ndarray:
     """(2, 3) gain and offset of each channel by least squares, y ≈ gain · x + offset of samples (3,
     N) with a weight (3, N).
 
-    prior: (2, 3), or what broadcasts to it, the weight in samples of the `usual` (2, 3).
+    prior: (2, 3), or what broadcasts to it, the weight in samples of the `expected` (2, 3).
     """
     system = np.stack([x, np.ones_like(x)], axis=1)
     weighted = system if weight is None else system * weight[:, None]
     prior = np.broadcast_to(np.asarray(prior), (2, 3)).T
-    right = np.einsum("cin,cn->ci", weighted, y) + prior * usual.T
+    right = np.einsum("cin,cn->ci", weighted, y) + prior * expected.T
     inner = weighted @ system.swapaxes(1, 2) + prior[:, :, None] * np.eye(2)
     return np.asarray(np.linalg.solve(inner, right[..., None])[..., 0].T)
 

@@ -27,19 +27,21 @@ from ...flame.parts import PARTS
 from ...flame.sequence import below_neck
 from ...tracking.folder import read_torso_points
 from ..settings import TrainingSettings
-from .likeness import face_of, head_coordinates
+from .semantic_regions import face_of, head_coordinates
 
 SAMPLED_HEIGHT_PIXELS = 400
 """Images higher than this are shrunk to it: triangles are then two or three pixels wide."""
 MASK_EDGE_PIXELS = 3
 """Along the mask's edge, colors are mixed with the background."""
 MAX_LATER_TIMESTEPS = 6
+"""Timesteps that are read after the first."""
 MAX_LATER_VIEWS = 2
-"""Further timesteps that are read, and views of each."""
+"""Views of each of these timesteps."""
 MIDDLE_GRAY = 0.5
+"""Brightness, 0…1, of splats that no view shows."""
 MIN_ONE_SIDED_SHARE = 0.05
-"""Area of the triangles that no view shows, but whose mirror images are shown, as a share of the
-mesh: below it, the cameras stand on both sides of the head."""
+"""Area of the triangles that no view shows, but whose mirror images are visible, as a fraction of
+the mesh; below it, the cameras stand on both sides of the head."""
 MAX_ASYMMETRY_SHARE = 0.015
 """Largest median distance of a symmetric mesh from its mirror image, of its diagonal."""
 VOXEL_SIZE_M = 0.004
@@ -62,12 +64,14 @@ SILHOUETTE_TOLERANCE_SHARE = 0.01
 FEW_CAMERAS = 4
 """Up to which a torso's visual hull bulges by centimeters: `TorsoPoints` are better."""
 CONTINUED_SHARE = 0.4
+"""How far a torso is continued beyond the image of a single camera, as a fraction of the image's
+width."""
 CONTINUED_OPACITY = 3.0
-"""How far a torso is continued beyond the image of a single camera, as a share of the image's
-width; and the logit of these splats' opacity, which may never be trained."""
+"""Logit of these splats' opacity, which may never be trained."""
 SEEN_COPIES = 3
+"""Splats for each of the observed points."""
 SEEN_SPREAD = 0.5
-"""Splats for each of these points, and standard deviation from it, in voxels."""
+"""Standard deviation in voxels of these splats from their point."""
 
 
 def initial_splats(capture: Capture, settings: TrainingSettings) -> Splats:

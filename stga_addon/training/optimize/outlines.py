@@ -15,12 +15,13 @@ from ...capture.model import Capture
 from ...raster.cpu.project import count_marked
 from ...raster.cpu.rasterize import frames_in_camera
 from .backend import Backend
-from .change import Turn
 from .state import PRUNED_BY, prunable
+from .step_hook import Schedule
 
 MAX_OUTLINES = 16
+"""Views whose masks are read."""
 MAX_OUTLINE_HEIGHT_PX = 400
-"""Views whose masks are read; higher masks are shrunk to this."""
+"""Height to which higher masks are shrunk."""
 TOLERANCE_SHARE = 0.01
 """Error of masks and tracking, as a share of the image height."""
 MAX_OUTSIDE_SHARE = 0.5
@@ -84,19 +85,19 @@ class OutlinePruning:
     def prepare(self) -> None:
         self.outlines  # noqa: B018
 
-    def apply(self, backend: Backend, turn: Turn) -> None:
+    def apply(self, backend: Backend, schedule: Schedule) -> None:
         coefficients = backend.coefficients()
         columns = backend.columns(("parameters/xyz", *PRUNED_BY))
         face = columns["face"]
-        stray = is_outside(
+        outside = is_outside(
             columns["parameters/xyz"],
             face,
             lambda timestep: self._frames(timestep, coefficients),
             self.outlines,
         )
-        if turn.region is not None:
-            stray &= turn.region[face]
-        unwanted = prunable(columns, stray)
+        if schedule.region is not None:
+            outside &= schedule.region[face]
+        unwanted = prunable(columns, outside)
         if unwanted.any():
             backend.keep(~unwanted)
 
@@ -112,7 +113,7 @@ def is_outside(
     seen, outside = np.zeros((2, len(face)), np.int32)
     rows = np.arange(len(face), dtype=np.int32)
     for n, outline in enumerate(outlines):
-        left = len(outlines) - n  # without those that all of these could not make a stray
+        left = len(outlines) - n  # without those that all of these could not take for outside
         rows = rows[outside[rows] + left > MAX_OUTSIDE_SHARE * (seen[rows] + left)]
         in_camera = frames_in_camera(frames(outline.timestep), outline.camera)
         count_marked(rows, xyz, face, in_camera, outline.clear, seen, outside)

@@ -24,7 +24,8 @@ from ...flame.model import torso_faces
 from ...flame.quaternions import unit
 from ...tracking.solve import lid_shares
 from .initial_splats import FEW_CAMERAS, SAMPLED_HEIGHT_PIXELS, mirrored, voxel_size
-from .likeness import (
+from .outlines import TOLERANCE_SHARE, clear_of
+from .semantic_regions import (
     JAW_LEVEL,
     TORSO_HEIGHT,
     HeadCoordinates,
@@ -34,51 +35,61 @@ from .likeness import (
     nearest_rows,
     teeth_of,
 )
-from .outlines import TOLERANCE_SHARE, clear_of
 
 FACING_TIMESTEPS = 300
+"""Timesteps of the training views that are examined, spread over all: half a second of a turned
+head counts in a recording of minutes."""
 FACING_MESHES = 48
-"""Timesteps of the training views that are looked at, spread over all, so that a glance of half a
-second counts in a recording of minutes; fewer where each one's mesh is a file, which takes long."""
+"""The same where each mesh is a file, which takes long to read."""
 UNSEEN_COSINE = -0.1
+"""Cosine between a triangle and the camera that it faces most below which not even hair stands in
+an outline."""
 HIDDEN_COSINE = 0.0
+"""Below it, the triangle is hidden."""
 GRAZING_COSINE = 0.2
-"""Of the angle between a triangle and the camera that it faces most: below the first, not even hair
-stands in an outline; below the second, the triangle is hidden; below the third, it fills little of
-any image. Many cameras' outlines tell shapes well enough."""
+"""Below it, the triangle fills little of any image; many outlines tell its shape."""
 OUTLINE_VIEWS = 16
+"""Views, spread over all, whose outlines are measured."""
 OUTLINE_COSINE = 0.2
-"""Views whose outlines are measured, spread over all; the largest cosine of the angle between a
-camera and a triangle that lies in the mesh's outline."""
+"""Largest cosine between a camera and a triangle in the mesh's outline."""
 OUTSIDE_CAMERAS = 15
+"""Cameras that tell the neutral head's outside from its inside."""
 OUTSIDE_DISTANCE = 4.0
+"""Their distance from the head's center, in its radius."""
 OUTSIDE_WIDTH = 2.2
+"""Width of their images, in the head's radius."""
 OUTSIDE_PIXEL_SHARE = 0.7
+"""Side of their pixels, in sides of a square as large as the median triangle."""
 OUTSIDE_SIDES_PX = (240, 2000)
-"""Cameras that tell the neutral head's outside from its inside; their distance and the width of
-what they see, in its radius; a pixel's, in the side of a square as large as the median triangle,
-however far a torso reaches; least and most pixels of a side."""
+"""Least and largest side of their images, however far a torso reaches."""
 STEPS_PER_VOXEL = 4
+"""Heights above a triangle that are tried in each voxel."""
 MAX_HEIGHT_VOXELS = 10
+"""Largest height that is tried."""
 HEIGHTS = 4
+"""Steps between a scalp's hair and its skin at which hair is compared with masks."""
 OUTLINE_VOXELS = 1.5
-"""Heights that are tried above a triangle, and shares of the height of hair; within the last, it
-must come out of the mesh's silhouette."""
+"""Height within which a triangle must come out of the mesh's silhouette."""
 AROUND = 30
 """Measured triangles of whose heights one that is in no outline has the median."""
 BLINKS = ("eyeBlinkLeft", "eyeBlinkRight")
+"""Expressions that pull lids out of their folds."""
 LID_STRETCH = 1.8
+"""Factor by which these lengthen a lid's triangle at least."""
 CLOSED_SHARE = 0.6
+"""Weight of these expressions at which tracked eyes count as closed."""
 MIN_SQUARED_AREA = 1e-28
-"""Expressions that pull lids out of their folds, how much longer they make them, and how far eyes
-are tracked that are closed (`lid_shares`); squared meters, of triangles without area."""
+"""Squared area in m⁴ below which a triangle has none."""
 NECK_LEVEL = -1.1
+"""Height of the neck's middle, as `HeadCoordinates` have it."""
 NECK_HALF_HEIGHT = 0.4
+"""Half the height over which its sides are measured."""
 NECK_SIDE_DEG = 95.0
+"""Angle of the neck's sides from straight ahead."""
 NECK_HALF_WIDTH_DEG = 45.0
+"""Half the angle over which they are measured."""
 HANGING_HEIGHT = 0.4
-"""Where sides of a neck are, as `HeadCoordinates` have it, and how far long hair stands out there,
-in distances of the eyes from the mouth."""
+"""How far long hair stands out from there, in distances of the eyes from the mouth."""
 MAX_APART_DEG = 8.0
 """Between the directions in which one camera sees a triangle, and their mean."""
 MAX_BESIDE_SHARE = 0.1
@@ -86,8 +97,9 @@ MAX_BESIDE_SHARE = 0.1
 MAX_STICKING_SHARE = 0.05
 """Of the triangles of a torso that is where images show a body."""
 STANDING_VOXELS = 1.5
+"""Height from which hair or a collar stands out."""
 STANDING_REACH_VOXELS = 4
-"""A surface is not known to be flat that is so near to where hair, or a collar, is so high."""
+"""Distance from it within which a surface is not known to be flat."""
 
 
 class Surface:
@@ -324,8 +336,8 @@ class Surface:
             share = hanging_share(self.at)
             hanging = self._scalp & (share > 0)
             growing = self._scalp & ~hanging
-            usual = np.median(height[growing]) if growing.any() else 0.0
-            height[hanging] = usual + share[hanging] * (HANGING_HEIGHT * self.at.unit - usual)
+            median = np.median(height[growing]) if growing.any() else 0.0
+            height[hanging] = median + share[hanging] * (HANGING_HEIGHT * self.at.unit - median)
         # one side's hair may be higher than the other's, which it is mirrored from
         offsets = np.zeros((len(scalp), HEIGHTS + 1, 3))
         offsets[:, :, NORMAL_AXIS["stga"]] = height[scalp, None] * np.linspace(1, 0, HEIGHTS + 1)

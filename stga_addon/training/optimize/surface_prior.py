@@ -13,32 +13,38 @@ from ...avatar.splats import SH_C0, Splats, joined
 from ...flame.quaternions import from_matrices, to_matrices
 from ..settings import TrainingSettings
 from .backend import Backend
-from .backing import CELL_VOXELS
-from .change import Turn
 from .frames import FrameStore
-from .likeness import eyeballs_of, lining_of
+from .occlusion_layer import CELL_VOXELS
+from .semantic_regions import eyeballs_of, lining_of
 from .state import parameters_and_average
+from .step_hook import Schedule
 from .surface import Surface
 from .unseen_hair import UnseenHair
 
 WELL_SEEN_COSINE = 0.8
+"""Cosine between a triangle and the camera that it faces most above which its splats are well
+observed: others' gradients are compared with theirs."""
 BEHIND_COSINE = -0.5
-"""Of the angle between a triangle and the camera that it faces most: above the first, gradients are
-those that others are compared with; below the second, nothing stands in an outline."""
+"""Cosine below which nothing stands in an outline."""
 DOUBT = 0.3
+"""Gradient, as a fraction of the median of well observed splats, at which a step pulls a splat
+halfway to what is plausible."""
 MIN_PULL = 0.02
-"""Gradient, as a share of the median of well seen splats, at which a splat is pulled halfway to
-what is plausible at a turn; the least share of the way that is worth it."""
+"""Least fraction of that way that is worth a change."""
 HIDDEN_SPACING_VOXELS = 1.0
+"""Spacing of the lattice on hidden triangles where no order is chosen."""
 MAX_HIDDEN_ORDER = 4
+"""Largest order of that lattice."""
 HIDDEN_OPACITY = 3.0
+"""Logit of the opacity of splats on hidden triangles."""
 HIDDEN_FLATNESS = 0.25
+"""Their thickness as a fraction of that of the lattice's splats."""
 LEAST_WIDTH_SHARE = 0.9
-BACKING_OPACITY = 5.0
+"""Width below which they may not shrink, as a fraction of what the lattice begins with."""
+OCCLUSION_OPACITY = 5.0
+"""Logit of the opacity of the occlusion layer."""
 CELL_WIDTH = 0.6
-"""Of the layer on hidden triangles: spacing and largest order of the lattice where none is chosen,
-logit, how much thinner it is than the lattice's splats and how much narrower it may become;
-logit, and least standard deviation in cells, of the one behind what may be looked through."""
+"""Least standard deviation of the occlusion layer's splats, in cells."""
 BESIDE_LID_SHARE = 0.6
 """Of the scale of the layer under lids, at their edges and in the mouth, where it would stand out
 beside the eye and the lips."""
@@ -50,12 +56,16 @@ BORDER_INSET = 0.6
 """Of the distance from the middle of a triangle, and of the scale, at the mesh's edge, of a lattice
 of order 1; a finer one reaches less beyond."""
 FLAT_VOXELS = 0.25
+"""Largest standard deviation along the normal of splats on skin and clothes; views of a narrow cone
+do not determine it."""
 FLAT_TOLERANCE = 1.02
-"""Largest standard deviation of splats on skin and clothes along the normal; how much more is worth
-a change. Views of a narrow cone do not tell it."""
+"""Factor by which a splat must be thicker for a change to be worth it."""
 MIN_VARIANCE = 1e-14
+"""Least variance of a splat along an axis, in m²."""
 GEOMETRY_MOMENTS = ("second/xyz", "second/rotation", "second/log_scale")
+"""Second moments of positions and shapes."""
 MOMENTS = ("second/color", "second/opacity", *GEOMETRY_MOMENTS)
+"""Second moments that are compared with those of well observed splats."""
 PULLED_COLUMNS = (
     "face",
     "parameters/color",
@@ -65,11 +75,11 @@ PULLED_COLUMNS = (
     "parameters/log_scale",
     *MOMENTS,
 )
+"""What is read of the splats that may be pulled."""
 PINNED_KINDS = ("parameters", "average", "first", "second")
+"""Arrays of the splats whose color is pinned."""
 INNER_PARAMETERS = ("xyz", "rotation", "log_scale", "opacity")
-"""Second moments of positions and shapes; of all that is compared with well seen splats; what is
-read of the splats that may be pulled; arrays of those whose color is pinned; parameters of the
-inner layer, and of the layer's end, that stay."""
+"""Parameters of the inner layer, and of the occlusion layer's end, that do not change."""
 
 
 class SurfacePrior:
@@ -93,21 +103,21 @@ class SurfacePrior:
         surface = self._surface
         sides = self._frames.sides
         may_be = sides.triangles | ~sides.shown | surface.lids | surface.is_flat
-        may_be |= self._frames.backing.triangles | self._eyeballs
+        may_be |= self._frames.occlusion_layer.triangles | self._eyeballs
         return np.asarray(may_be | (surface.turned_away > 0))
 
     def prepare(self) -> None:
         self.may_be_pulled  # noqa: B018
 
-    def apply(self, backend: Backend, turn: Turn) -> None:
+    def apply(self, backend: Backend, schedule: Schedule) -> None:
         where = backend.columns(("face", "unbound"))
         is_bound = ~where["unbound"]
         bound = np.flatnonzero(is_bound & self.may_be_pulled[where["face"]])
         if not len(bound):
             return
         well_seen = is_bound & (self._surface.facing > WELL_SEEN_COSINE)[where["face"]]
-        usual = np.flatnonzero(well_seen if well_seen.any() else is_bound)
-        moments = backend.columns(MOMENTS, usual)
+        reference = np.flatnonzero(well_seen if well_seen.any() else is_bound)
+        moments = backend.columns(MOMENTS, reference)
         columns = backend.columns(PULLED_COLUMNS, bound)
         is_inner = self._is_inner(columns)
         self._pull_colors(backend, bound, columns, moments["second/color"], is_inner)
@@ -124,12 +134,12 @@ class SurfacePrior:
         backend: Backend,
         bound: np.ndarray,
         columns: Mapping[str, np.ndarray],
-        usual: np.ndarray,
+        reference: np.ndarray,
         is_inner: np.ndarray,
     ) -> None:
         sides = self._frames.sides
         face = columns["face"]
-        share = doubt(columns["second/color"], usual) * ~sides.shown[face]
+        share = doubt(columns["second/color"], reference) * ~sides.shown[face]
         # the avatar is made of averages, which only steps move
         is_untouched = ~sides.shown[face] & ~columns["second/color"].any(1)
         # of a lid, the edge of a fold is seen, in the fold's shade
@@ -157,10 +167,10 @@ class SurfacePrior:
         backend: Backend,
         bound: np.ndarray,
         columns: Mapping[str, np.ndarray],
-        usual: np.ndarray,
+        reference: np.ndarray,
     ) -> None:
         face = columns["face"]
-        share = doubt(columns["second/opacity"][:, None], usual[:, None])
+        share = doubt(columns["second/opacity"][:, None], reference[:, None])
         surface = self._surface
         turned_away = np.where(surface.sticks_out, 0, surface.turned_away)
         share = (share * turned_away[face]) ** 2  # little of what outlines show
@@ -183,11 +193,11 @@ class SurfacePrior:
         backend: Backend,
         bound: np.ndarray,
         columns: Mapping[str, np.ndarray],
-        usual: Mapping[str, np.ndarray],
+        reference: Mapping[str, np.ndarray],
     ) -> None:
         """Where gradients are below DOUBT times those of well seen splats, Adam moves and shapes
         splats by steps that are as much shorter: a layer that hardly shows would get holes."""
-        least = {name: DOUBT**2 * np.median(usual[name].mean(1)) for name in GEOMETRY_MOMENTS}
+        least = {name: DOUBT**2 * np.median(reference[name].mean(1)) for name in GEOMETRY_MOMENTS}
         moments = {name: np.maximum(columns[name], least[name]) for name in GEOMETRY_MOMENTS}
         backend.assign(bound, moments)
 
@@ -325,7 +335,7 @@ class SurfacePrior:
         """(N,) bool: the splats of the layer behind lids and sides, each the nearest to its place.
         By depth, lids' own splats would join it, as training moves them by more than the tenth of a
         millimeter that it is deep, and never leave it."""
-        has_inner = self._surface.lids | self._frames.backing.triangles
+        has_inner = self._surface.lids | self._frames.occlusion_layer.triangles
         rows = np.flatnonzero(has_inner[columns["face"]])
         face = columns["face"][rows]
         place = self._inner.xyz[np.searchsorted(self._inner.face, face)]
@@ -337,11 +347,11 @@ class SurfacePrior:
         return is_inner
 
 
-def doubt(second: np.ndarray, usual: np.ndarray) -> np.ndarray:
+def doubt(second: np.ndarray, reference: np.ndarray) -> np.ndarray:
     """Share (N,) in 0…1 of what is plausible: 1 where views tell nothing, a half where gradients
-    are DOUBT times those of well seen splats. second (N, C): Adam's moments; usual (M, C): those
-    of well seen splats."""
-    little = DOUBT * np.median(np.sqrt(usual.mean(1))) + np.finfo(np.float32).tiny
+    are DOUBT times those of well observed splats. second (N, C): Adam's moments; reference (M, C):
+    those of well observed splats."""
+    little = DOUBT * np.median(np.sqrt(reference.mean(1))) + np.finfo(np.float32).tiny
     return np.asarray(little / (little + np.sqrt(second.mean(1))), np.float32)
 
 
@@ -377,7 +387,7 @@ def flattened(
 
 def above_unseen_hair(frames: FrameStore, splats: Splats) -> np.ndarray:
     """(N,) bool: unbound splats that stand higher than hair which faces no camera. Masks from
-    in front do not end the hull behind a head: what stands there hangs in the air from aside."""
+    in front do not end the hull behind a head: what stands there hangs in the air off-axis."""
     surface = frames.surface
     top = (surface.hair_height + frames.voxel) / frames.unit_lengths
     height = splats.xyz[:, NORMAL_AXIS[frames.convention]]
@@ -442,21 +452,21 @@ def border_inset(surface: Surface, order: np.ndarray) -> np.ndarray:
 
 def splats_behind(frames: FrameStore, sh_degree: int) -> Splats:
     """The opaque layer under lids, whose own splats, trained on open eyes, would leave gaps when
-    they close, and the `backing`."""
+    they close, and the `occlusion_layer`."""
     surface = frames.surface
     inner = inner_layer(frames, sh_degree)
-    has_inner = (surface.lids & ~surface.closed) | frames.backing.triangles
+    has_inner = (surface.lids & ~surface.closed) | frames.occlusion_layer.triangles
     return inner.rows(has_inner[inner.face])
 
 
 def inner_layer(frames: FrameStore, sh_degree: int = 0) -> Splats:
     """One splat in its plausible color, sorted by triangle, for each triangle of lids, under its
     middle and so large that closed lids have no gaps, of the mouth's unseen inside, and of the
-    `backing`."""
+    `occlusion_layer`."""
     capture = frames.capture
     axis = NORMAL_AXIS[frames.convention]
     lids = frames.surface.lids
-    backing = frames.backing
+    occlusion = frames.occlusion_layer
     layer = lattice_splats(
         capture.neutral, capture.faces, 0, sh_degree, HIDDEN_OPACITY, frames.convention
     )
@@ -467,17 +477,17 @@ def inner_layer(frames: FrameStore, sh_degree: int = 0) -> Splats:
     layer.log_scale[:] += np.log(share)[:, None]
     layer.log_scale[:, axis] += np.log(HIDDEN_FLATNESS)
     behind = lattice_splats(
-        backing.places, capture.faces, 0, sh_degree, BACKING_OPACITY, frames.convention
-    ).rows(backing.triangles)
+        occlusion.places, capture.faces, 0, sh_degree, OCCLUSION_OPACITY, frames.convention
+    ).rows(occlusion.triangles)
     behind.log_scale[:, axis] += np.log(HIDDEN_FLATNESS)
-    there = face_frames(backing.places, capture.faces, backing.places, frames.convention)
+    there = face_frames(occlusion.places, capture.faces, occlusion.places, frames.convention)
     world = to_world(behind, there)
     least = np.where(np.arange(3) == axis, 0, CELL_WIDTH * CELL_VOXELS * frames.voxel)
     world = replace(world, log_scale=np.log(np.maximum(np.exp(world.log_scale), least)))
     behind = to_local(world, frames.neutral, behind.face)
     within = lids | (frames.sides.triangles & ~frames.surface.outside)
-    layer = joined([layer.rows((within & ~backing.triangles)[layer.face]), behind])
+    layer = joined([layer.rows((within & ~occlusion.triangles)[layer.face]), behind])
     layer = layer.rows(np.argsort(layer.face))
-    color = np.where(backing.triangles[:, None], backing.color, frames.sides.color)
+    color = np.where(occlusion.triangles[:, None], occlusion.color, frames.sides.color)
     layer.sh[:, 0] = (color[layer.face] - 0.5) / SH_C0
     return layer

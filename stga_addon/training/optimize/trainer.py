@@ -11,23 +11,20 @@ from ...avatar.splats import joined
 from ...capture.model import Capture, View
 from ...schema import to_json
 from ..schedule import learning_rates, sh_degree
-from ..settings import CONTINUATIONS, TrainingSettings
+from ..settings import TrainingSettings
 from .avatar_tracking import RefinedTracking
 from .backend import Batch, RenderOptions
-from .change import Change, Turn, is_turn_of
 from .density import DensityControl
-from .dust import DustPruning
+from .floaters import FloaterPruning
 from .frames import FrameStore
 from .initial_splats import initial_splats, unseen_share
 from .make_backend import make_backend
+from .outliers import OutlierReset
 from .outlines import OutlinePruning
 from .state import TrainState, new_state, with_offsets
-from .strays import StrayReset
+from .step_hook import Schedule, StepHook, is_due
 from .surface_prior import SurfacePrior, above_unseen_hair, hidden_splats, splats_behind
-from .unseen_sides import plausible_aside
-
-EXTEND_LOCAL_SHARE = 0.5
-"""Of an extension's budget, in which what the new takes need is trained, before all splats."""
+from .unseen_sides import plausible_off_axis
 
 
 class Start(NamedTuple):
@@ -47,22 +44,18 @@ NEW = Start()
 class Strategy:
     """Decides which triangles each iteration trains, as `TrainingSettings.strategy` says.
 
-    region          (F,) bool: the only triangles whose splats the run may change; None for all
-    refined_region  the same of a refinement; None for any other run
+    region  (F,) bool: the only triangles whose splats a refinement may change; None for all
 
     "selective" alternates local iterations, which train a frame's selected triangles, with global
-    ones (STGA, training). "refine" trains the same region throughout, "extend" first what new takes
-    need, in views of all takes, and then all splats. Not in turn: where some splats are frozen in
-    the new views only, the others make up for them there, and drift.
+    ones (STGA, training). "refine" trains its region throughout, all others all splats.
     """
 
     def __init__(self, settings: TrainingSettings, selection: Mapping[int, np.ndarray]) -> None:
-        """selection: timestep -> (F,) bool triangles; continuations train the union."""
+        """selection: timestep -> (F,) bool triangles; a refinement trains the union."""
         self._settings = settings
         self._selection = selection
-        continues = settings.strategy in CONTINUATIONS
-        self.region = np.any(list(selection.values()), axis=0) if continues else None
-        self.refined_region = self.region if settings.strategy == "refine" else None
+        refines = settings.strategy == "refine"
+        self.region = np.any(list(selection.values()), axis=0) if refines else None
 
     def triangles(
         self, iteration: int, visit: int, timestep: int, progress: float
@@ -74,10 +67,8 @@ class Strategy:
         progress          share of the budget spent
         """
         settings = self._settings
-        region = self.region
-        if region is not None:
-            is_local = progress < EXTEND_LOCAL_SHARE and region.any()
-            return region if settings.strategy == "refine" or is_local else None
+        if self.region is not None:
+            return self.region
         selected = self._selection.get(timestep)
         count = iteration if settings.global_unit == "iteration" else visit
         is_global = count % (settings.global_interval + 1) == settings.global_interval
@@ -93,7 +84,7 @@ class Trainer:
     visit          visits of frames so far, minus one: consecutive views of one timestep are one
                    visit
     initial_count  splats of the whole lattice and hull points, which density control counts from
-    changes        by name, what may change the splats after a step, in this order
+    hooks          by name, what may edit the splats after a step, in this order
     """
 
     def __init__(
@@ -127,16 +118,16 @@ class Trainer:
             self.initial_count = len(state)
         self._backend = make_backend(device, settings, self.frames, state)
         limits = self.frames.stray_limits(settings)
-        strays = StrayReset(settings.stray_reset_interval, limits, settings.stray_reset_share)
-        self.changes: dict[str, Change] = {
-            "strays": strays,
+        interval = settings.stray_reset_interval
+        self.hooks: dict[str, StepHook] = {
+            "outliers": OutlierReset(interval, limits, settings.stray_reset_share),
             "density": density_control(settings),
         }
         if settings.random_background:  # alpha is learned from masks
-            self.changes["outlines"] = OutlinePruning(capture, settings.seed, self.frames.moved)
-        self.changes["dust"] = DustPruning(capture)
+            self.hooks["outlines"] = OutlinePruning(capture, settings.seed, self.frames.moved)
+        self.hooks["floaters"] = FloaterPruning(capture)
         if self.strategy.region is None:
-            self.changes["unseen sides"] = SurfacePrior(self.frames)
+            self.hooks["unseen sides"] = SurfacePrior(self.frames)
 
     def __len__(self) -> int:
         """How many splats there are."""
@@ -206,7 +197,7 @@ class Trainer:
         splats = state.splats(averaged=True)
         along = self.frames.surface.filmed_along if splats.sh_degree == 0 else None
         if along is not None:
-            splats = plausible_aside(splats, along, self.frames.sides)
+            splats = plausible_off_axis(splats, along, self.frames.sides)
         return Avatar(
             splats=splats,
             convention=settings.convention,
@@ -222,21 +213,22 @@ class Trainer:
             filmed_along=along,
         ).with_limited_offsets
 
-    def prepare_turns(self) -> None:
-        """Find out now what the first turns of changes to the splats would find out once."""
-        for change in self.changes.values():
-            change.prepare()
+    def prepare_hooks(self) -> None:
+        """Find out now what the first calls of the hooks would find out once."""
+        for hook in self.hooks.values():
+            hook.prepare()
 
     def _post_step(self, progress: float) -> None:
-        """Change the splats after an optimizer step, where it is the turn of one of the changes."""
+        """Call the hooks that are due after an optimizer step."""
         before = self._progress
         if before is None:  # begun or resumed: as of steps that all take the same share
             before = progress * (1 - 1 / max(1, self.iteration - 1))
         self._progress = progress
-        turn = Turn(self.iteration, progress, self.initial_count, self.strategy.region, before)
-        for change in self.changes.values():
-            if is_turn_of(change, turn):
-                change.apply(self._backend, turn)
+        region = self.strategy.region
+        schedule = Schedule(self.iteration, progress, self.initial_count, region, before)
+        for hook in self.hooks.values():
+            if is_due(hook, schedule):
+                hook.apply(self._backend, schedule)
 
 
 def density_control(settings: TrainingSettings) -> DensityControl:

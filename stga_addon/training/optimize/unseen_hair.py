@@ -11,28 +11,30 @@ from ...avatar.splats import Splats, joined
 from ...capture.mesh_geometry import vertex_normals
 from ...flame.quaternions import from_matrices, unit
 from .frames import SKIN_DEPTH, FrameStore
-from .likeness import HeadCoordinates
+from .semantic_regions import HeadCoordinates
 
 STRAND_COSINE = -0.3
 """Of the angle between a triangle and the camera that it faces most, below which strands grow:
 longer than the layer's splats, they would stand in outlines."""
 STRANDS = 10000
+"""Strands that a whole scalp would have."""
 STRAND_SHARE = 1.35
+"""Product of a strand's standard deviations along and across its direction, as a fraction of its
+part of the surface: strands hide what is below."""
 STRAND_SHAPE = (2.6, 0.38, 0.13)
-"""How many a whole scalp would have; the product of a strand's standard deviations along and across
-its growth, as a share of a strand's part of the surface, so that they hide what is below; these and
-the one along the normal, as multiples of that product's root."""
+"""Standard deviations along, across and normal to a strand, as multiples of that product's root."""
 SMOOTHING_STEPS = 10
+"""Averages over neighbors of the height of hair, which changes from triangle to triangle."""
 MIN_RISE = 0.3
-"""Means over neighbors of the height of hair, which changes from one triangle to the next; cosine
-of the angle between hair's surface and a triangle that its height is measured with at least."""
+"""Least cosine between hair's surface and a triangle in its slope."""
 CROWN_ELEVATION_DEG = 55.0
 """Of the place from which hair grows in all directions, behind the middle of the head."""
 LOCK_CONTRAST = 0.15
+"""Standard deviation of the brightness of locks, as a fraction of it."""
 LOCKS = 400
+"""Locks around the head."""
 LOCK_LENGTH = 0.7
-"""Standard deviation of the brightness of locks, as a share of it; how many lie around the head,
-and how far one keeps its brightness, in distances of the eyes from the mouth."""
+"""How far a lock keeps its brightness, in distances of the eyes from the mouth."""
 
 
 class UnseenHair:
@@ -139,7 +141,7 @@ class UnseenHair:
         return -SKIN_DEPTH * self._frames.units
 
     def shades(self, face: np.ndarray, xyz: np.ndarray) -> np.ndarray:
-        """(N,) brightness of hair at places (N, 3) on triangles, as a multiple of the usual one."""
+        """(N,) brightness of hair at places (N, 3) on triangles, relative to the typical one."""
         return lock_shades(self._at, points_to_world(xyz, self._frames.neutral, face))
 
     @property
@@ -173,7 +175,7 @@ def growth(at: HeadCoordinates, places: np.ndarray, normals: np.ndarray) -> np.n
 
 
 def lock_shades(at: HeadCoordinates, places: np.ndarray) -> np.ndarray:
-    """(N,) brightness of hair at places (N, 3), as a multiple of the usual one: locks, which reach
+    """(N,) brightness of hair at places (N, 3), relative to the typical one: locks, which reach
     from the crown down, have their own, that changes slowly along them."""
     crown = _crown(at)
     across = at.axes[0]

@@ -5,11 +5,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from ...avatar.embedding import MIN_DIVISOR, face_areas
-from ...avatar.splats import Splats, colored_aside
+from ...avatar.splats import Splats, colored_off_axis
 from ...capture.mesh_geometry import connected_parts
 from ...capture.model import Capture, View, evenly_spread, views_by_timestep
 from .initial_splats import mean_colors, mirror_images
-from .likeness import (
+from .semantic_regions import (
     BROWS_LEVEL,
     HeadCoordinates,
     ears_of,
@@ -24,41 +24,42 @@ from .likeness import (
 from .surface import FACING_TIMESTEPS, UNSEEN_COSINE, Surface
 
 SPREAD_VIEWS = 12
+"""Training views, spread over all, whose colors are measured."""
 OPEN_VIEWS = 6
-"""Training views whose colors are looked at, spread over all, and of the timesteps in which the
-mouth is highest."""
+"""Views whose colors are measured of the timesteps in which the mouth is highest."""
 MIN_TEETH_SHARE = 0.04
 """Of the pixels that show the mouth, that teeth fill at least; a slit between lips is as well one
 of the mesh alone."""
 SOURCE_COSINE = 0.25
-"""Of the angle between a triangle and the camera that it faces most, above which others take its
-color: hair at the temples and a beard beside the jaw are seen from 60 to 75° aside at most."""
+"""Cosine between a triangle and the camera that it faces most above which others take its color:
+hair at the temples and a beard beside the jaw are seen from 60 to 75° aside at most."""
 WELL_SHOWN_COSINE = 0.5
 """The same above which a face is shown better than its mirror image could tell."""
 FRINGE_COSINE = 0.2
-"""The same below which the scalp does not take the color of a fringe, where it is not shown
-itself."""
+"""The same for the scalp, which takes the color of a fringe where it is not visible itself."""
 FRINGE_SHARE = 0.2
 """Of what is shown above the brows, the highest, where hair is if there is any."""
 MIN_SHOWN_SHARE = 0.1
-"""Of the pixels that usually show as much of the surface: a folded eyelid has less."""
+"""Fraction of the median of the pixels that show as much of the surface, below which it is not
+visible: a folded eyelid has less."""
 NEAREST = 24
-"""Shown triangles of whose colors a hidden one has the median."""
+"""Visible triangles of whose colors a hidden one has the median."""
 SOURCE_TRIANGLES = 100
-"""Triangles over which the light on a side of the face, and the color of hair from aside, are
-medians, and over which unseen colors are softened."""
+"""Triangles over which the light on a side of the face, and hair's color off axis, are medians, and
+over which unseen colors are softened."""
 LEVEL_WEIGHT = 3.0
 """By how much shown triangles of neck and shoulders above and below a hidden one count as farther
 than those beside it: collars are level, and a chin's shadow is on a neck's front only."""
 SAME_COLOR_DEVIATION = 0.12
-"""By how much colors, in 0…1, may differ that count as the same but for their shade: collars and
-hairlines stay sharp."""
+"""Largest difference in 0…1 of colors that differ by their shade alone: collars and hairlines stay
+sharp."""
 MAX_LIGHT_RATIO = 2.0
 """Of the light on one side of a face to that on the other."""
 SHOWN_COSINE = 0.5
-ASIDE_SHARE = 0.75
-"""Of the angle between a triangle and the camera that it faces most, above which its color depends
-on no view; share of the color from aside at a right angle to the views."""
+"""Cosine between a triangle and the camera that it faces most above which its color depends on no
+view."""
+OFF_AXIS_WEIGHT = 0.75
+"""Fraction of the off-axis color at a right angle to the views."""
 
 
 @dataclass(frozen=True)
@@ -72,7 +73,7 @@ class UnseenSides:
     is_hair     (F,) bool: hair's triangles, where any is shown
     view_dependence  (F,) 0…1 of the color that views show: 1 in hair, for its sheen and strands,
                 more than 0 where a triangle turns away from all views
-    aside       (F, 3) in 0…1: the color from a right angle to the views
+    off_axis    (F, 3) in 0…1: the color from a right angle to the views
     """
 
     triangles: np.ndarray
@@ -80,7 +81,7 @@ class UnseenSides:
     color: np.ndarray
     is_hair: np.ndarray
     view_dependence: np.ndarray
-    aside: np.ndarray
+    off_axis: np.ndarray
 
 
 def unseen_sides(surface: Surface) -> UnseenSides:
@@ -94,8 +95,8 @@ def unseen_sides(surface: Surface) -> UnseenSides:
     color, pixels = mean_colors(capture, _color_views(capture))
     density = pixels / np.maximum(face_areas(capture.neutral, capture.faces), MIN_DIVISOR)
     facing = density[cosine > WELL_SHOWN_COSINE]
-    usual = np.median(facing[facing > 0]) if facing.any() else 0.0
-    shown = density > MIN_SHOWN_SHARE * usual
+    median = np.median(facing[facing > 0]) if facing.any() else 0.0
+    shown = density > MIN_SHOWN_SHARE * median
     is_source = (pixels > 0) & is_outside & (cosine > SOURCE_COSINE) & ~surface.lids
     if not is_source.any():
         none = np.zeros_like(shown)
@@ -108,7 +109,7 @@ def unseen_sides(surface: Surface) -> UnseenSides:
     found = color.copy()
     found[hidden] = sides.nearest(is_source, hidden)
     turned = np.where(is_outside, surface.turned_from(SHOWN_COSINE), 0.0)
-    aside = color.copy()
+    off_axis = color.copy()
     is_hair = np.zeros_like(shown)
     may_be_mirrored = unseen.copy()
     if surface.at is not None:
@@ -123,7 +124,7 @@ def unseen_sides(surface: Surface) -> UnseenSides:
         scalp = surface.kinds["scalp"]
         if len(hair):
             near = nearest_rows(sides.centers[hair], sides.centers[scalp], SOURCE_TRIANGLES)
-            aside[scalp] = np.median(color[hair[near]], axis=1)
+            off_axis[scalp] = np.median(color[hair[near]], axis=1)
             is_hair = scalp.copy()
             found[scalp & unseen] = np.median(color[hair], axis=0)
     rows, mirrored = sides.mirrored(may_be_mirrored, well_shown)
@@ -136,8 +137,8 @@ def unseen_sides(surface: Surface) -> UnseenSides:
     found[lids] = of_skin
     shown[lids] = False
     triangles = (is_outside & (cosine < UNSEEN_COSINE)) | inside
-    aside = np.where((unseen | ~(shown | is_hair))[:, None], found, aside)
-    return UnseenSides(triangles, shown, found, is_hair, np.where(is_hair, 1.0, turned), aside)
+    off_axis = np.where((unseen | ~(shown | is_hair))[:, None], found, off_axis)
+    return UnseenSides(triangles, shown, found, is_hair, np.where(is_hair, 1.0, turned), off_axis)
 
 
 def _hair(
@@ -234,18 +235,18 @@ class _Sides:
 
 def plausible_aside(splats: Splats, along: np.ndarray, sides: UnseenSides) -> Splats:
     """Splats that views show along one direction only, that of their triangle (F, 3), with what is
-    plausible from aside: hair, and of the rest what lies on it, not what hangs before it."""
+    plausible off-axis: hair, and of the rest what lies on it, not what hangs before it."""
     face = splats.face
-    share = ASIDE_SHARE * sides.view_dependence[face]
+    share = OFF_AXIS_WEIGHT * sides.view_dependence[face]
     share[splats.unbound & ~sides.is_hair[face]] = 0
     share[sides.triangles[face]] = 0  # they have one color from everywhere, and hair its locks
-    return colored_aside(splats, along[face], share, sides.aside[face])
+    return colored_off_axis(splats, along[face], share, sides.off_axis[face])
 
 
 def _lid_colors(
     surface: Surface, is_source: np.ndarray, color: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Lids (M,) that stay in their folds, which are in the shade, and the usual color (M, 3) of the
+    """Lids (M,) that stay in their folds, which are in the shade, and the median color (M, 3) of
     skin in their half of the face; none where no skin is shown there."""
     found = np.full(color.shape, np.nan)
     at = surface.at

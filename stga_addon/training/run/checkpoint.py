@@ -28,10 +28,13 @@ from ..settings import TrainingSettings
 from .folder import AVATAR, CHECKPOINT, SELECTION, Continuation, Run
 
 VERSION = 4
+
 TRACKING = "tracking/parameters"
+"""Prefix of the arrays of the tracking's parameters."""
 IDENTITY = "identity"
+"""Array with the capture's identity."""
 STRAIN_RANGE = "strain_range.npz"
-"""`strain_range` (F, 2, 6) float32 of a run, and `identity`."""
+"""File of a run's `strain_range` (F, 2, 6) float32 and its `identity`."""
 MAX_COUNT = (1 << 53) - 1
 """Largest iteration or timestep that a checkpoint may hold."""
 OTHER_RUN = "belongs to another run than run.json; remove it, or train into another folder"

@@ -1,12 +1,8 @@
 """Continuing a finished run in another folder: refining a region of its avatar, or extending it by
-further takes; and the order of the views that this trains, those asked for and, now and then, a few
-of all others."""
+further takes; and the order of the views that this trains."""
 
-from bisect import bisect_right
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from functools import reduce
-from operator import add
 
 import numpy as np
 
@@ -16,10 +12,8 @@ from ...errors import StgaError
 from ...files import file_digest
 from ...raster.cpu.layout import Parameters
 from ...schema import validate
-from ...selection import select_capture
 from ..evaluate import metrics
-from ..evaluate.metrics import RESIDUAL_SCALE, EvaluationView, Residuals, triangle_residuals
-from ..optimize.image_preparation import image_preparation
+from ..evaluate.metrics import EvaluationView
 from ..optimize.state import TrainState, state_of_avatar, with_offsets
 from ..schedule import learning_rates, view_order
 from ..settings import TrainingSettings
@@ -29,58 +23,14 @@ from .folder import AVATAR, CHECKPOINT, Continuation, Run
 START_SHARE = 0.5
 """Share of the run's schedule of learning rates that has passed when its continuation begins."""
 DENSITY_INTERVAL = 40
+"""Iterations between density control's steps in a continuation, whose budget is a tenth of a
+training's."""
 DENSITY_SPAN = (0.0, 0.6)
-"""Density control of a continuation, whose budget is a tenth of a training's."""
-MIN_RESIDUAL_RATIO = 1.5
-MIN_RESIDUAL_GAIN = 0.005
-"""How much larger a triangle's residual in new takes than in old ones calls for training."""
-COMPARED_VIEWS = 36
-"""Views of the old takes, and of the new ones, in which residuals are compared."""
-MIN_UNLIKE_RATIO = 3.0
-MIN_UNLIKE_RESIDUAL = 0.05
-"""How much larger than its take's median, and how large, the residual of a strange view is."""
+"""Fractions of the budget between which density control acts."""
 MIN_GROUP_VIEWS = 4
 """Evaluation views of a group at least, where it has so many."""
 ROUNDING = 1e-5
-"""By which colors differ that went through harmonics of what is plausible from aside."""
-
-
-def select_for_takes(
-    continuation: Continuation, capture: Capture, settings: TrainingSettings, starts: Sequence[int]
-) -> tuple[dict[int, np.ndarray], list[View]]:
-    """timestep of the new takes -> (F,) bool: what moves in it, or looks different than in the old
-    takes; and the views among those compared that do not look like the head at all, as where images
-    of two cameras were exchanged.
-
-    starts: first timesteps of the new takes, ascending.
-    A triangle looks different where the avatar's residual in a few views of the new takes is larger
-    than in a few of the old ones by MIN_RESIDUAL_RATIO and MIN_RESIDUAL_GAIN.
-    """
-    avatar = read_avatar(continuation.parent / AVATAR)
-    prepare = image_preparation(capture, settings)
-    parts: tuple[list[View], list[View]] = [], []
-    for view in capture.views["train"]:
-        parts[continuation.includes(view.timestep)].append(view)
-    old_views, new_views = (replayed_views(capture, part, COMPARED_VIEWS) for part in parts)
-
-    def residuals(*views: View) -> Residuals:
-        return triangle_residuals(avatar, capture, views, prepare, RESIDUAL_SCALE)
-
-    old = residuals(*old_views)
-    by_view = [residuals(view) for view in new_views]
-    new = reduce(add, by_view)
-    known = np.nan_to_num(old.mean())
-    now = np.nan_to_num(new.mean())
-    differs = now > np.maximum(MIN_RESIDUAL_RATIO * known, known + MIN_RESIDUAL_GAIN)
-    timesteps = tuple(timestep for timestep in capture.timesteps if continuation.includes(timestep))
-    moving = select_capture(replace(capture, timesteps=timesteps), settings.selection)
-    selection = {timestep: faces | differs for timestep, faces in moving.items()}
-    # views whose residual stands out in their take
-    errors = np.array([each.error.sum() / max(each.weight.sum(), 1.0) for each in by_view])
-    takes = np.array([bisect_right(starts, view.timestep) for view in new_views])
-    usual = np.array([np.median(errors[takes == take]) for take in takes])
-    unlike = np.flatnonzero(errors > np.maximum(MIN_UNLIKE_RATIO * usual, MIN_UNLIKE_RESIDUAL))
-    return selection, [new_views[number] for number in unlike]
+"""By which colors differ that went through harmonics of what is plausible off-axis."""
 
 
 def starting_state(
@@ -199,9 +149,9 @@ def continued_evaluation_views(
 
 
 REPLAY_SHARE = 1 / 3
-"""Share of a refinement's iterations that train views outside its frames, if any."""
-EXTEND_REPLAY_SHARE = 0.4
-"""Share of an extension's iterations that train views of the old takes."""
+"""Fraction of a refinement's iterations that train views outside its frames, if any."""
+EXTEND_REPLAY_SHARE = 1 / 2
+"""Fraction of an extension's iterations that train views of the old takes."""
 REPLAY_TIMESTEPS = 12
 """Timesteps that are replayed: those that differ most from each other."""
 REPLAY_VIEWS = 120
@@ -219,17 +169,19 @@ def continued_order(
     seed: int,
     start: int = 0,
 ) -> Iterator[View]:
-    """Endless order of views from position `start` on: of the continuation's frames and, now and
-    then, of others.
+    """Endless order of views from position `start` on: of the continuation's frames and, in turn or
+    now and then, of others.
 
-    region (F,) bool: what is refined, by views that see much of it. None for an extension.
+    region (F,) bool: what is refined, by views that see much of it. None for an extension, which
+    trains the views of all takes.
     """
     views = capture.views["train"]
     asked = [view for view in views if continuation.includes(view.timestep)]
     rest = [view for view in views if not continuation.includes(view.timestep)]
-    others = replayed_views(capture, rest)
+    others = rest
     if region is not None:
-        asked, others = (views_of_region(capture, members, region) for members in (asked, others))
+        parts = (asked, replayed_views(capture, rest))
+        asked, others = (views_of_region(capture, members, region) for members in parts)
     share = (EXTEND_REPLAY_SHARE if region is None else REPLAY_SHARE) if others else 0.0
     replayed = [int(position * share) for position in (start, start + 1)]
     new = view_order(asked, 1, seed, start - replayed[0])
@@ -240,14 +192,12 @@ def continued_order(
         position += 1
 
 
-def replayed_views(
-    capture: Capture, views: Sequence[View], limit: int = REPLAY_VIEWS
-) -> list[View]:
-    """At most `limit` views: some cameras each of the timesteps that differ most."""
+def replayed_views(capture: Capture, views: Sequence[View]) -> list[View]:
+    """At most REPLAY_VIEWS views: some cameras each of the timesteps that differ most."""
     by_timestep = views_by_timestep(views)
     chosen = distinct_timesteps(capture, sorted(by_timestep))
     kept = []
-    cameras = max(1, limit // max(1, len(chosen)))
+    cameras = max(1, REPLAY_VIEWS // max(1, len(chosen)))
     for turn, timestep in enumerate(chosen):
         members = sorted(by_timestep[timestep], key=lambda view: view.camera_index)
         steps = np.linspace(0, len(members), min(cameras, len(members)), endpoint=False).astype(int)

@@ -5,6 +5,7 @@ import re
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -22,7 +23,7 @@ from ...files import (
     write_npz,
 )
 from ...flame.forward import FlameFrame, frame_of
-from ...flame.sequence import FRAME_FIELDS, SHIFT_SIZE, TORSO_SHIFT, FlameSequence, read_motion
+from ...flame.sequence import FRAME_FIELDS, SHIFT_SIZE, TORSO_SHIFT, FlameSequence, motion_of
 from ...render.device import EXPECTED_DEVICE, GPU, adapter_names, choose_device, is_device
 from ...schema import from_json, setting, to_json
 from ...worker.lock import hold_folder
@@ -116,10 +117,20 @@ def has_run(folder: Path) -> bool:
 
 def read_run(folder: Path) -> Run:
     """Raises StgaError where the folder holds no run, a damaged one or one of another version."""
-    path = folder / RUN
-    if not path.exists():
+    if not has_run(folder):
         raise StgaError(f"{folder}: holds no run ({RUN} is missing)")
-    return from_json(Run, read_document(path, "run", FORMAT, VERSION), path)
+    path = folder / RUN
+    with naming(path, "read"):
+        state = path.stat()
+    return _remembered(path, state.st_ino, state.st_mtime_ns, state.st_size)
+
+
+@lru_cache(maxsize=8)
+def _remembered(path: Path, *state: int) -> Run:
+    """The run of a file in this state: a training asks at each evaluation whether the folder is
+    still its own."""
+    found: Run = from_json(Run, read_document(path, "run", FORMAT, VERSION), path)
+    return found
 
 
 def next_folder(run: Path) -> Path:
@@ -296,8 +307,9 @@ def write_tracking(
 def read_tracking(folder: Path, sequence: FlameSequence) -> np.ndarray:
     """(T, P + 3) that `write_tracking` wrote for the sequence. Raises StgaError if damaged."""
     path = folder / TRACKING
-    motion = read_motion(path, sequence.model)
-    shift = read_npz(path).get(TORSO_SHIFT)
+    arrays = read_npz(path)
+    motion = motion_of(path, arrays, sequence.model)
+    shift = arrays.get(TORSO_SHIFT)
     if motion.timesteps != sequence.timesteps or shift is None:
         raise StgaError(f"{path}: expected {TORSO_SHIFT} and the timesteps of the run's capture")
     parameters = [motion.frame(timestep).parameters for timestep in motion.timesteps]
@@ -316,8 +328,8 @@ def with_refined_tracking(capture: Capture, folder: Path, fitted: bool = True) -
     sequence = capture.flame
     if sequence is None or not path.exists():
         return capture
-    motion = read_motion(path, sequence.model)
     arrays = read_npz(path)
+    motion = motion_of(path, arrays, sequence.model)
     count = len(motion.timesteps)
     tracked = arrays.get("tracked", np.zeros(0))
     if len(tracked) != count:

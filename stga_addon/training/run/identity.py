@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 
 from ...capture.model import Capture
-from ...files import file_digest
 from ...schema import to_json
 from ..settings import TrainingSettings
 
@@ -47,7 +46,8 @@ class RunIdentity:
 
 
 def identity_of(capture: Capture, principal_point: str, settings: TrainingSettings) -> RunIdentity:
-    """Reads the FLAME model file but no images and no tracked meshes. Raises StgaError."""
+    """Reads neither images nor tracked meshes."""
+    flame = capture.flame
     views = [(split, view) for split, members in sorted(capture.views.items()) for view in members]
     cameras = {view.camera_index for _, view in views}
     timesteps = {view.timestep for _, view in views}
@@ -73,7 +73,7 @@ def identity_of(capture: Capture, principal_point: str, settings: TrainingSettin
         _digest(_quantized(np.hstack([poses, np.reshape(intrinsics, (-1, 4))]))),
         _digest(np.ascontiguousarray(capture.faces, np.int32).tobytes()),
         _digest(_quantized(capture.neutral)),
-        "" if capture.flame_file is None else file_digest(capture.flame_file),
+        "" if capture.flame_file is None or flame is None else flame.model.file_digest,
         _settings_digest(to_json(settings)),
     )
 

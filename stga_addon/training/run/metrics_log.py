@@ -12,6 +12,7 @@ from ...schema import from_json
 from ..evaluate.forecast import Forecast
 
 METRICS = "metrics.jsonl"
+"""Name of the file in a run's folder."""
 REQUIRED = ("iteration", "seconds", "splats", "evaluation_s", "wall_s")
 """Fields of every line."""
 TRACKING_GAIN = "tracking_gain_db"
@@ -47,12 +48,13 @@ def append_metrics(folder: Path, line: Mapping[str, Any]) -> None:
         out.write(json.dumps(line) + "\n")
 
 
-def cut_metrics(folder: Path, count: int) -> None:
+def cut_metrics(folder: Path, count: int) -> list[dict[str, Any]]:
     """Remove the evaluations beyond the first `count`, which a resumed run makes again, or a
-    stopped run has made for itself."""
+    stopped run has made for itself; returns these."""
     kept = read_metrics(folder)[:count]
     with replacing(folder / METRICS) as partial:
         partial.write_text("".join(json.dumps(line) + "\n" for line in kept), encoding="utf-8")
+    return kept
 
 
 def _fault(line: Any) -> str | None:

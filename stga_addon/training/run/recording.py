@@ -40,22 +40,26 @@ from ..settings import TrainingSettings
 from .folder import AVATAR, avatar_version, open_refined, open_run, read_run
 
 EXPOSURE_VIEWS = 24
+"""Views of a camera, spread over the take, that its exposure is fitted to."""
 EXPOSURE_HEIGHT_PX = 160
-"""Views of a camera, spread over the take, that its exposure is fitted to, and their height."""
+"""Height of these images."""
 CAMERA_WEIGHT = 0.2
 """Of the camera's exposure in that of a view, as a share of the view's pixels."""
 MIN_COVER = 250
 """Of a mask, of 255, from which a pixel shows the person alone."""
 SHADING_PRIOR = 0.01
+"""Weight of the light that the avatar was trained in as a fraction of the pixels, where that of a
+take is fitted."""
 SHADING_ITERATIONS = 6
-"""Weight of the light that the avatar was trained in, as a share of the pixels."""
+"""Reweighted least squares fits of that light."""
 SCALE_TIMESTEPS = 6
 """Spread over the take, that the scale is found from."""
 ROUNDS = 2
 """Of tracking, each from the motion that the one before has led to, smoothed in takes in order."""
 IDENTITY = Similarity(1.0, np.eye(3), np.zeros(3))
+
 PART_TIMESTEPS = 16
-"""Tracked by a helping process at a time."""
+"""Timesteps that a helping process tracks at a time."""
 Source = tuple[Path, int, Path, float, int]
 """A run, when its avatar was written, and a capture, once scaled and tracked in rounds."""
 HeadColors = tuple[np.ndarray, np.ndarray, np.ndarray]
@@ -198,11 +202,11 @@ def _fit_rotation(run: Path, root: Path) -> np.ndarray | None:
     stored = read_run(run)
     capture = open_capture(root, stored.flame)
     cameras = cameras_of(capture)
-    usual = cameras_of(open_run(run).capture)
-    if set(cameras) != set(usual):
+    trained = cameras_of(open_run(run).capture)
+    if set(cameras) != set(trained):
         return None
     rotations = [
-        usual[index].world_to_camera[:3, :3].T @ camera.world_to_camera[:3, :3]
+        trained[index].world_to_camera[:3, :3].T @ camera.world_to_camera[:3, :3]
         for index, camera in cameras.items()
     ]
     rotation = Rotation.from_matrix(rotations).mean().as_matrix()
@@ -264,20 +268,20 @@ def _light(avatar: Avatar, settings: TrainingSettings, capture: Capture) -> Ligh
     lit = []
     for chosen, pixels in _colors_by_camera(avatar, settings, capture):
         drawn, seen, normals = (np.concatenate(side, 1) for side in zip(*pixels, strict=True))
-        usual = fit_exposure(drawn, seen)
+        overall = fit_exposure(drawn, seen)
         for view, (own_drawn, own_seen, _) in zip(chosen, pixels, strict=True):
-            own = fit_exposure(own_drawn, own_seen, usual, CAMERA_WEIGHT)
+            own = fit_exposure(own_drawn, own_seen, overall, CAMERA_WEIGHT)
             scaled = own * np.array([[1.0], [255.0]])
             rows.append((float(view.camera_index), *scaled.ravel().tolist(), float(view.timestep)))
-        lit.append((drawn, (seen - usual[1][:, None]) / usual[0][:, None], normals))
+        lit.append((drawn, (seen - overall[1][:, None]) / overall[0][:, None], normals))
     return tuple(rows), _fit_shading(*(np.concatenate(side, 1) for side in zip(*lit, strict=True)))
 
 
 def _fit_shading(drawn: np.ndarray, seen: np.ndarray, normals: np.ndarray) -> np.ndarray:
     """Harmonics (9, 3) by the normal (3, N) of a factor from colors (3, N) to those seen."""
     by_normal = basis(normals.T)
-    usual = uniform(1.0)
-    found = usual.copy()
+    even = uniform(1.0)
+    found = even.copy()
     for _ in range(SHADING_ITERATIONS):
         for channel, (x, y) in enumerate(zip(drawn, seen, strict=True)):
             residual = y - x * (by_normal @ found[:, channel])
@@ -285,7 +289,7 @@ def _fit_shading(drawn: np.ndarray, seen: np.ndarray, normals: np.ndarray) -> np
             system = by_normal * x[:, None]
             prior = SHADING_PRIOR * (weight @ x**2 + 1e-9)
             matrix = (weight * system.T) @ system + prior * np.eye(len(found))
-            right = system.T @ (weight * y) + prior * usual[:, channel]
+            right = system.T @ (weight * y) + prior * even[:, channel]
             found[:, channel] = np.linalg.solve(matrix, right)
     return found
 

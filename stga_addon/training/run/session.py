@@ -56,27 +56,31 @@ from .continuation import (
     starting_state,
 )
 from .folder import AVATAR, CHECKPOINT, TRACKING, Run
-from .metrics_log import METRICS, TRACKING_GAIN, append_metrics, cut_metrics, read_metrics
+from .metrics_log import METRICS, TRACKING_GAIN, append_metrics, cut_metrics
 
 _log = logging.getLogger(__name__)
+
 CHECKPOINT_S = 30.0
 """Seconds of training between checkpoints: what a crash may cost."""
 CHECKPOINT_VARIABLE = "STGA_CHECKPOINT_S"
 """Environment variable that replaces it, for machines that are taken away often."""
 TRACKING_START_SHARE = 0.5
+"""Fraction of the budget after which the avatar tracks its head."""
 TRACKING_TIME_SHARE = 0.2
-"""Of the budget, after which the avatar tracks its head; what that may take of seconds."""
+"""Fraction of the seconds that this tracking may take."""
 LEFT_OUT_INTERVAL = 12
+"""Every how many timesteps one is left out of that tracking where no camera is held out."""
 LEFT_OUT_VIEWS = 24
+"""Views that decide whether the tracking is kept."""
 MIN_NEIGHBORS = 3
-"""Where no camera is held out, every how many timesteps one is left out of that tracking; views
-that say whether it is kept; timesteps of which one has neighbors."""
+"""Tracked timesteps around a left-out one without which it decides nothing."""
 UNCHECKED = (
     "no held-out view shows a timestep that is trained, and none of these lies between others"
 )
+"""Why a tracking that nothing checked is not kept."""
 SET_ASIDE = {AVATAR: "avatar_to_resume.npz", TRACKING: "tracking_to_resume.npz"}
-"""Files of a stopped run that belong to an evaluation of its own -> those that an unbroken run
-would have, put back when it is resumed."""
+"""Files of a stopped run that belong to its evaluation -> those that an unbroken run would have,
+put back when it is resumed."""
 Selection = Mapping[int, np.ndarray]
 """timestep -> (F,) bool: triangles."""
 RECENT_LOSSES = 100
@@ -84,14 +88,23 @@ RECENT_LOSSES = 100
 RESIDUAL_VIEWS = 24
 """Views in which the residuals of a finished run are measured."""
 READERS_BESIDE_CPU = 0.2
+"""Threads that decode images beside a training on the CPU, as a fraction of its own."""
 READERS_BESIDE_GPU = 0.5
-"""Threads that decode images, as a share of those that kernels run on, or would."""
+"""The same beside one on the GPU, as a fraction of those that kernels would run on."""
 
 
 def image_readers(device: str) -> int:
     """How many images are decoded at a time beside a training on a device."""
     share = READERS_BESIDE_CPU if device == "cpu" else READERS_BESIDE_GPU
     return max(1, round(share * threads()))
+
+
+class Trained(NamedTuple):
+    """An avatar file that a training has written, and its avatar where it was read to be measured:
+    `read_avatar` does not read the file again while somebody holds it."""
+
+    path: Path
+    avatar: Avatar | None
 
 
 def train_run_or_fall_back(
@@ -101,15 +114,16 @@ def train_run_or_fall_back(
     selection: Selection | None = None,
     resume: bool = False,
     report: Report = ignore,
-) -> Path:
-    """`train_run`; where a GPU fails, on the CPU from the last checkpoint on."""
+) -> Trained:
+    """`train_and_measure`; where a GPU fails, on the CPU from the last checkpoint on."""
     try:
-        return train_run(capture, out, run, selection, resume, report)
+        return train_and_measure(capture, out, run, selection, resume, report)
     except DeviceError as error:
         _log.warning("%s; continuing on the CPU from the last checkpoint", error.cause)
     # Outside the handler: the error's traceback would keep the failed loop and its buffers alive.
     report(Progress(stage="Continuing on the CPU"))
-    return train_run(capture, out, replace(run, device="cpu"), selection, True, report)
+    run = replace(run, device="cpu")
+    return train_and_measure(capture, out, run, selection, True, report)
 
 
 def train_run(
@@ -120,7 +134,19 @@ def train_run(
     resume: bool = False,
     report: Report = ignore,
 ) -> Path:
-    """Train a capture into the folder `out` and return the path of the avatar file.
+    """`train_and_measure`; the path of the avatar file."""
+    return train_and_measure(capture, out, run, selection, resume, report).path
+
+
+def train_and_measure(
+    capture: Capture,
+    out: Path,
+    run: Run,
+    selection: Selection | None = None,
+    resume: bool = False,
+    report: Report = ignore,
+) -> Trained:
+    """Train a capture into the folder `out`, and measure the error of the avatar by triangle.
 
     selection: instead of the rule's. With `resume`, continues from the folder's checkpoint to the
     parameters that an unbroken run would have reached (same seed, number of threads and device).
@@ -152,22 +178,21 @@ def train_run(
                 selection = checkpoints.read_selection(out, len(capture.faces), run.digest)
             session = _begin(capture, out, run, selection, report)
         session.complete()
-    return out / AVATAR
+    return Trained(out / AVATAR, session.measured)
 
 
 def train_more(
     capture: Capture, out: Path, run: Run, seconds: float, report: Report = ignore
-) -> Path:
+) -> Trained:
     """Train the run in the folder `out` for so many seconds more than it was, whether its budget is
-    spent or not, by the later part of its schedule; the path of the avatar file. Raises as
-    `train_run` does."""
+    spent or not, by the later part of its schedule. Raises as `train_and_measure` does."""
     lpips.load_network()
     with folders.locked(out):
         run = replace(run, identity=folders.check_identity(out, run, capture))
         session = _resume(_usable(capture), out, run, report)
         session.begin_addition(seconds)
         session.complete()
-    return out / AVATAR
+    return Trained(out / AVATAR, session.measured)
 
 
 def _usable(capture: Capture) -> Capture:
@@ -199,6 +224,7 @@ class _Session:
     interrupts    the first Ctrl-C
     addition      training beyond the budget, if it was asked for
     fitting_s     what is left of fitting unseen heads after a budget in seconds, at most
+    measured      the avatar that was kept, once it was read
     """
 
     capture: Capture
@@ -216,6 +242,7 @@ class _Session:
     interrupts: list[int] = field(default_factory=list)
     addition: _Addition | None = None
     fitting_s: float = 0.0
+    measured: Avatar | None = None
 
     def begin_addition(self, seconds: float) -> None:
         """Train so long from here on, whatever budget and goals the run began with."""
@@ -235,7 +262,7 @@ class _Session:
         # meanwhile, the splats are shown as they begin
         self._tell("Compiling kernels", longer=1.0)
         precompile_kernels(self.run.device)
-        self.trainer.prepare_turns()
+        self.trainer.prepare_hooks()
         lines = self.evaluator.lines
         self.began = perf_counter() - (lines[-1]["wall_s"] if lines else 0.0)
         if self._is_whole():
@@ -364,7 +391,7 @@ class _Session:
             views = capture.views["train"]
             order = view_order(views, settings.views_per_visit, settings.seed, first)
         else:
-            region = self.trainer.strategy.refined_region
+            region = self.trainer.strategy.region
             order = continued_order(self.run.continuation, capture, region, settings.seed, first)
         coarse, full = image_scales(settings, capture.views["train"])
 
@@ -424,7 +451,7 @@ class _Session:
         unseen = self._unseen_timesteps()
         if tracking is None or not unseen:
             return {}
-        avatar = read_avatar(self.folder / AVATAR)
+        avatar = self.measured = read_avatar(self.folder / AVATAR)
         settings = self.run.settings
         kept = RefinedTracking(self.capture, settings.convention)
         kept.parameters = folders.read_tracking(self.folder, tracking.sequence)
@@ -571,7 +598,9 @@ class _Session:
                 write_avatar(path, self._avatar())
 
         share = min(1.0, spent.share)
-        return self.report(Progress(share, stage, evaluator.forecast_text, known, preview))
+        detail = evaluator.forecast_text
+        lines = tuple(evaluator.lines)
+        return self.report(Progress(share, stage, detail, known, preview, metrics=lines))
 
     def _avatar(self) -> Avatar:
         return self.trainer.avatar(self.run.principal_point, self._strain_limits())
@@ -630,7 +659,7 @@ class _Session:
         views = [view for split in ("train", "val") for view in self.capture.views.get(split, ())]
         shown = evenly_spread(views, RESIDUAL_VIEWS)
         prepare = image_preparation(capture, settings)
-        avatar = read_avatar(self.folder / AVATAR)
+        avatar = self.measured = read_avatar(self.folder / AVATAR)
         residuals = triangle_residuals(avatar, capture, shown, prepare, RESIDUAL_SCALE)
         folders.write_residuals(self.folder, residuals.mean())
 
@@ -699,8 +728,7 @@ def _resume(capture: Capture, folder: Path, run: Run, report: Report) -> _Sessio
     session.elapsed_s = found.elapsed_s
     session.losses.extend(found.losses)
     session.tracking_gain = found.tracking_gain
-    cut_metrics(folder, found.lines)
-    evaluator.lines = read_metrics(folder)
+    evaluator.lines = cut_metrics(folder, found.lines)
     evaluator.count = found.evaluations
     for name, aside in SET_ASIDE.items():
         if (folder / aside).exists():
@@ -725,7 +753,7 @@ def _session(
     strain_range = checkpoints.strain_range_of(folder, capture, run)
     trainer = Trainer(capture, settings, selection, Start(state, strain_range), run.device)
     if run.continuation is not None:
-        views = continued_evaluation_views(run, capture, trainer.strategy.refined_region)
+        views = continued_evaluation_views(run, capture, trainer.strategy.region)
     else:
         background = settings.background
         backdrop = settings.backdrop

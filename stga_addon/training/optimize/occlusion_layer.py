@@ -1,5 +1,5 @@
-"""An opaque layer behind the surface, so that nobody looks through a head from aside: images make
-its sides transparent where it is tracked too wide, and a torso may have a front only."""
+"""An opaque layer behind the surface, which off-axis views would look through: images make a head's
+sides transparent where it is tracked too wide, and a torso may have a front only."""
 
 from dataclasses import dataclass
 
@@ -11,7 +11,7 @@ from ...avatar.lattice import NORMAL_AXIS
 from ...capture.mesh_geometry import vertex_normals
 from ...capture.model import Capture
 from .initial_splats import voxel_size
-from .likeness import (
+from .semantic_regions import (
     CHIN_LEVEL,
     TORSO_HEIGHT,
     HeadCoordinates,
@@ -23,42 +23,48 @@ from .surface import Surface
 from .unseen_sides import SOURCE_TRIANGLES, UnseenSides
 
 GRAZED_COSINE = 0.7
+"""A triangle has an occlusion layer behind it if the cosine between its normal and the camera that
+it faces most is below this."""
 FACE_ANGLE_DEG = 45.0
-"""Of the angle between a triangle and the camera that it faces most, below which it has a layer
-behind it; from straight ahead, beyond which there is no face, seen from the middle of the head."""
+"""Angle from straight ahead, from the middle of the head, beyond which there is no face."""
 ONE_DIRECTION_COSINE = 0.8
+"""GRAZED_COSINE of a head that was filmed from one direction, along which its splats lie: off-axis
+views would show the mouth's inside between them."""
 ONE_DIRECTION_FACE_ANGLE_DEG = 30.0
-"""The same of a head that was filmed from one direction, along which its splats lie: from aside,
-the mouth's inside shows between them."""
+"""FACE_ANGLE_DEG of such a head."""
 CELL_VOXELS = 2
+"""Side of the cell of a head's surface behind which one splat is enough."""
 BORDER_CELLS = 2.0
-"""Behind how large a part of the head one splat is enough; how far from the mesh's edge, in these
-cells, clothes have a layer behind them, as it would stand out there."""
+"""Least distance of clothes' layer from the mesh's edge, where it would stand out."""
 DEPTH_VOXELS = 0.5
+"""Step between the depths at which the layer may lie."""
 MAX_DEPTHS = 10
+"""Depths that are tried; the first that lies within the masks is taken."""
 MARGIN_SHARE = 0.015
+"""How far the layer must lie within the masks, as a fraction of their height."""
 BACK_MARGIN_SHARE = 0.03
+"""The same of a torso's back, whose triangles are large."""
 SPLAT_REACH = 1.8
-"""Step of the depths at which the layer may lie, and how many are tried: the first that is within
-the masks, with a margin as a share of their height; of a torso, whose triangles are large; how far
-the splats of these reach, three standard deviations, in the side of a square of two triangles, or
-in cells where these are larger."""
+"""Three standard deviations of a splat, in sides of a square of two triangles, or in cells where
+these are larger."""
 BEHIND_DEG = (-30.0, 0.0, 30.0)
 """Directions from behind from which the inner side of a torso's front may show."""
 BACK_SHARE = 0.5
+"""Depth of a back, an ellipse, as a fraction of half of the torso's width."""
 BACK_LEVELS = 0.5
+"""Height over which a torso's width and color are measured, in distances of the eyes from the
+mouth."""
 BACK_REACH = (0.02, 0.98)
+"""Quantiles of the positions across a torso between which its width lies."""
 BACK_GAP_VOXELS = 1.5
-"""Depth of a back, an ellipse, as a share of half of the torso's width; heights, in distances of
-the eyes from the mouth, within which that, between quantiles, and the color are measured; how deep
-it is at the sides."""
+"""Depth of the back at the torso's sides."""
 BACK_SIDE = 0.5
-"""How far from its middle, in half of its width, a front has the color of its back: a collar is
-lower in front than behind."""
+"""Distance from the middle, as a fraction of half of the width, from which a front has the color of
+its back: a collar is lower in front than behind."""
 
 
 @dataclass(frozen=True)
-class Backing:
+class OcclusionLayer:
     """The layer behind some triangles.
 
     triangles  (F,) bool: those behind which it has a splat
@@ -71,38 +77,38 @@ class Backing:
     color: np.ndarray
 
 
-def backing_of(surface: Surface, sides: UnseenSides) -> Backing:
+def occlusion_layer(surface: Surface, sides: UnseenSides) -> OcclusionLayer:
     """Behind neck and clothes, and the outside of a head that few cameras see at a grazing angle or
     not at all, but for ears and the parts of the face: at the least depth that masks allow, in the
-    color from aside. Behind the front of a torso that has no back: a round one in the usual color
+    off-axis color. Behind the front of a torso that has no back: a round one in the median color
     of its height."""
     capture = surface.capture
     faces = capture.faces
     neutral = np.asarray(capture.neutral, np.float64)
     at = surface.at
     if at is None or not surface.has_few_cameras:
-        return Backing(np.zeros(len(faces), bool), neutral, sides.aside)
-    front, back, usual = _back(surface, at, sides.color)
+        return OcclusionLayer(np.zeros(len(faces), bool), neutral, sides.off_axis)
+    front, back, median_color = _back(surface, at, sides.color)
     of_back = np.zeros(len(neutral), bool)
     of_back[faces[front]] = True
     grazed, behind = _behind_sides(surface, at, ~of_back[faces].any(1))
     centers = neutral[faces].mean(1)
-    color = sides.aside.copy()
-    color[front] = usual
+    color = sides.off_axis.copy()
+    color[front] = median_color
     skin = np.flatnonzero(grazed & ~sides.is_hair)
     if len(skin):
         around = nearest_rows(centers[skin], centers[skin], SOURCE_TRIANGLES)
         color[skin] = np.median(color[skin][around], axis=1)
     places = np.where(of_back[:, None], back, behind)
-    return Backing(grazed | front, places, color)
+    return OcclusionLayer(grazed | front, places, color)
 
 
 def _behind_sides(
     surface: Surface, at: HeadCoordinates, allowed: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """One triangle in each cell, of those `allowed` (F,) bool that somebody may look through from
-    aside, as (F,) bool: what is `_grazed`; neck and clothes, as what a collar or a fold hides from
-    the cameras need not be opaque for them. The neutral vertices (V, 3), moved inside the head
+    """One triangle in each cell, of those `allowed` (F,) bool that an off-axis view may look
+    through, as (F,) bool: what is `_grazed`; neck and clothes, as what a collar or a fold hides
+    from the cameras need not be opaque for them. The neutral vertices (V, 3), moved inside the head
     until masks cover them."""
     faces = surface.capture.faces
     neutral = np.asarray(surface.capture.neutral, np.float64)
@@ -186,7 +192,7 @@ def _back(
     front = _open_front(surface, at)
     if not front.any():
         return front, neutral, color[front]
-    places, usual = _round_back(surface.capture, at, front, color)
+    places, median_color = _round_back(surface.capture, at, front, color)
     rows = np.flatnonzero(front)
     turned = face_frames(neutral, faces, neutral, "stga").rotation[rows]
     there = face_frames(places, faces, places, "stga")
@@ -200,7 +206,7 @@ def _back(
     fits = ~surface.beside_masks(rows, offsets[:, :1], -BACK_MARGIN_SHARE)[:, 0]
     fits &= ~surface.beside_masks(rows, offsets[:, 1:]).any(1)
     front[rows] = fits
-    return front, places, usual[fits]
+    return front, places, median_color[fits]
 
 
 def _round_back(

@@ -1,4 +1,4 @@
-"""Changes of the splats between steps: what they are told, and what they have in common."""
+"""Hooks that edit the splats between steps, and the schedule that they are called with."""
 
 from dataclasses import dataclass
 from typing import Protocol
@@ -9,11 +9,11 @@ from .backend import Backend
 
 
 @dataclass(frozen=True)
-class Turn:
-    """When a change is made.
+class Schedule:
+    """When a hook is called.
 
     iteration      steps made so far
-    progress       share of the budget spent, 0…1
+    progress       fraction of the budget spent, 0…1
     initial_count  splats of the whole lattice and hull points
     region         (F,) bool: the triangles whose splats may change; None for all
     before         progress at the step before
@@ -25,28 +25,28 @@ class Turn:
     region: np.ndarray | None = None
     before: float = 0.0
 
-    def passes(self, share: float) -> bool:
-        """Whether this is the first step at which that share of the budget is spent."""
-        return self.before < share <= self.progress
+    def passes(self, fraction: float) -> bool:
+        """Whether this is the first step at which that fraction of the budget is spent."""
+        return self.before < fraction <= self.progress
 
 
-class Change(Protocol):
+class StepHook(Protocol):
     """Edits the rows of a backend every so many steps.
 
-    interval  iterations between turns; 0: never
+    interval  iterations between calls; 0: never
     """
 
     @property
     def interval(self) -> int: ...
 
     def prepare(self) -> None:
-        """Find out now what the first turn would find out once."""
+        """Find out now what the first call would find out once."""
         ...
 
-    def apply(self, backend: Backend, turn: Turn) -> None:
+    def apply(self, backend: Backend, schedule: Schedule) -> None:
         """Decide on the host, by the columns that this needs, and edit the rows."""
         ...
 
 
-def is_turn_of(change: Change, turn: Turn) -> bool:
-    return change.interval > 0 and turn.iteration % change.interval == 0
+def is_due(hook: StepHook, schedule: Schedule) -> bool:
+    return hook.interval > 0 and schedule.iteration % hook.interval == 0

@@ -11,59 +11,81 @@ from ...capture.model import Capture
 from ...flame.model import faces_within
 
 SCALP_ANGLE_DEG = 66.0
+"""Angle from straight ahead, from the middle of the head, behind which hair grows."""
 SCALP_ELEVATION_DEG = 38.0
+"""Elevation above which hair grows."""
 NECK_ANGLE_DEG = 60.0
-"""Hair grows behind the first or above the second, seen from the middle of the head; the neck
-begins behind the third."""
+"""Angle from straight ahead behind which the neck begins."""
 EYES_TO_MIDDLE = 1.35
+"""How far the head's middle lies behind the eyes, in distances of the eyes from the mouth, the unit
+of all levels here."""
 BROWS_OVER_EYES = 0.15
+"""How far the head's middle lies above the eyes."""
 BROWS_LEVEL = 0.45
+"""Height of the brows over the eyes."""
 JAW_LEVEL = -0.5
+"""Height of the jaw over the eyes."""
 CHIN_LEVEL = -2.0
+"""Height of the chin over the eyes."""
 TORSO_HEIGHT = 2.0
-"""Places on a head, in distances of its eyes from its mouth: how far its middle lies behind the
-eyes and above them; heights over the eyes; of a torso, which a bust's end has not."""
+"""Least extent of a torso; the end of a bust has less."""
 JAW_DEG = (76.0, 90.0)
+"""Angles from straight ahead between which the jaw's lower end rises to what is behind it."""
 JAW = (-1.0, JAW_LEVEL)
-"""Angles from straight ahead, and heights over the eyes in that unit, below which the neck begins:
-a jaw reaches lower than what is behind it."""
+"""Heights over the eyes at JAW_DEG below which the neck begins."""
 HAIRLINE_DEG = (84.0, 112.0, 140.0)
+"""Angles from straight ahead of the hairline's points."""
 HAIRLINE = (0.15, -0.55, -1.15)
+"""Heights over the eyes at HAIRLINE_DEG below which no hair grows; it begins above the ears."""
 LONG_HAIRLINE = (0.15, -1.0, -2.3)
+"""Heights over the eyes at HAIRLINE_DEG below which no long hair hangs."""
 HANGING_DEG = (90.0, 140.0)
+"""Angles between which hanging hair reaches its full distance from the neck."""
 HANGING_RISE = 0.6
-"""The same below which no hair grows, which begins above the ears, or none hangs; between which
-angles, and how far below the first, it gets its full distance from the neck."""
+"""Distance below the hairline at which it reaches that distance."""
 EAR_SIDE = 0.93
+"""Distance of ears from the middle plane at least."""
 EAR_LEVEL = -0.33
+"""Height of the ears' middle over the eyes."""
 EAR_HEIGHT = 0.57
+"""Half the height of an ear."""
 EAR_ANGLE_DEG = 90.0
+"""Angle of the ears' middle from straight ahead."""
 EAR_WIDTH_DEG = 14.0
-"""How far from the middle plane ears begin, where they are, and half their extent."""
+"""Half the angle that an ear takes up."""
 MIN_HAIR_CONTRAST = 0.9
+"""A triangle of the scalp has hair if its color is this far from the skin's, as a fraction of the
+scalp's most different ones, in standard deviations of skin."""
 LEAST_SHADE = 0.02
+"""Least standard deviation of skin's shades, in colors of 0…1."""
 SMOOTHED = 24
-"""A scalp's triangle has hair if its color is that far from the skin's, in standard deviations of
-its shades, as a share of the scalp's most different ones; the least standard deviation of a shade,
-in colors of 0…1; triangles around one over which what is found is smoothed."""
+"""Triangles around one over which a decision or color is smoothed."""
 
 EYEBALLS = ("left_eyeball", "right_eyeball")
+
 TEETH = ("teeth",)
+
 LINING_REACH = 1.3
+"""Distance from the mouth's middle within which its lining and throat lie."""
 LINING_LEVEL = -0.4
+"""Height over the eyes below which they lie; the sockets of the eyes are as near."""
 TONGUE_REACH = 0.5
-"""How far from a mouth's middle, in that unit, its lining and throat reach, and how high over the
-eyes, whose sockets are as near; what else comes so near to the mouth is teeth, gums and tongue."""
+"""Distance from the mouth's middle within which everything but skin is teeth, gums or tongue."""
 DEPTHS = (0.0, 0.25, 0.45, 0.75)
+"""Distances from the visible lips at which the colors of a mouth's inside are given: it gets darker
+inward."""
 LIP_SHARE = 0.75
+"""Brightness of the lining at the lips, as a fraction of theirs."""
 GUM_SHARES = np.array([[0.43, 0.24, 0.22], [0.22, 0.1, 0.09], [0.12, 0.04, 0.03]])
+"""Color of gums and tongue at the later DEPTHS, as fractions of the eyes' white."""
 TOOTH_DEPTHS = (0.05, 0.15, 0.5)
+"""Distances from the visible lips at which the brightness of teeth is given."""
 TOOTH_SHARES = (0.92, 0.74, 0.23)
+"""Brightness of teeth at TOOTH_DEPTHS, as fractions of the eyes' white."""
 WHITE_QUANTILE = 0.8
+"""Quantile of the eyeballs' brightness above which triangles are white."""
 WHITE = np.array([0.75, 0.67, 0.63])
-"""The less light, the farther from the lips that views show, in that unit: what a mouth's lining
-has of the lips' color, gums and tongue and, elsewhere, teeth of the eyes' white, the mean of their
-brightest triangles beyond that quantile; that in daylight, for heads without eyes."""
+"""Color of the eyes' white in daylight, for heads without eyes."""
 
 
 @dataclass(frozen=True)
@@ -165,9 +187,9 @@ def hairy_triangles(
     shades (K, 3) do; all where no skin is known."""
     if not len(sources) or not len(skin):
         return sources
-    usual = np.median(skin, axis=0)
-    shades = (skin - usual).T @ (skin - usual) / len(skin) + LEAST_SHADE**2 * np.eye(3)
-    away = color[sources] - usual
+    median = np.median(skin, axis=0)
+    shades = (skin - median).T @ (skin - median) / len(skin) + LEAST_SHADE**2 * np.eye(3)
+    away = color[sources] - median
     contrast = np.sqrt((away * np.linalg.solve(shades, away.T).T).sum(1))
     near = nearest_rows(centers[sources], centers[sources], SMOOTHED)
     contrast = np.quantile(contrast[near], 0.1, axis=1)

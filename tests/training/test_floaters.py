@@ -1,4 +1,4 @@
-"""Pruning of dust, and the sums of blend weights that tell it."""
+"""Pruning of floaters, and the sums of blend weights that tell it."""
 
 from copy import copy
 from dataclasses import replace
@@ -16,9 +16,9 @@ from stga_addon.raster.cpu.rasterize import (
     frames_in_camera,
     render_forward,
 )
-from stga_addon.training.optimize.change import Turn
-from stga_addon.training.optimize.dust import TURNS, DustPruning
+from stga_addon.training.optimize.floaters import PRUNING_TIMES, FloaterPruning
 from stga_addon.training.optimize.frames import FrameStore
+from stga_addon.training.optimize.step_hook import Schedule
 from stga_addon.training.optimize.trainer import Trainer
 
 from .toys import Rows, quick_settings, random_splats
@@ -44,9 +44,9 @@ def test_blend_weights(toy):
         assert weights[row] == pytest.approx(rendered([row]).image[0].sum(), rel=1e-4, abs=1e-4)
 
 
-def test_what_fills_no_view_is_dust(toy):
-    """Catches dust that stays, bound splats or those outside the trained region that go, and a look
-    at every step."""
+def test_what_fills_no_view_floats(toy):
+    """Catches floaters that stay, bound splats or those outside the trained region that go, and a
+    look at every step."""
     trainer = Trainer(toy, quick_settings("global", lattice=1), {})
     state = trainer.state
     state.unbound[:] = np.arange(len(state)) % 3 > 0
@@ -64,13 +64,14 @@ def test_what_fills_no_view_is_dust(toy):
             return trainer._backend.blend_weights(view)
 
     for before, now, region, gone in (
-        (0.1, TURNS[0] - 0.01, None, None),
-        (TURNS[0] - 0.01, TURNS[0], None, tiny),
+        (0.1, PRUNING_TIMES[0] - 0.01, None, None),
+        (PRUNING_TIMES[0] - 0.01, PRUNING_TIMES[0], None, tiny),
         (0.7, 0.9, np.arange(len(toy.faces)) < 40, tiny & near),
-        (TURNS[1], 0.9, None, None),
+        (PRUNING_TIMES[1], 0.9, None, None),
     ):
         backend = Backend(state)
-        DustPruning(toy).apply(backend, Turn(round(1000 * now), now, len(state), region, before))
+        schedule = Schedule(round(1000 * now), now, len(state), region, before)
+        FloaterPruning(toy).apply(backend, schedule)
         kept = np.isin(np.arange(len(state)), backend.state.gradient_count)
         assert bool(backend.looks) == (gone is not None)
         if gone is None:
@@ -84,7 +85,7 @@ def test_what_fills_no_view_is_dust(toy):
 
 @pytest.mark.parametrize("usual", [1.0, 10.0])
 def test_after_a_short_training(usual, toy):
-    """Catches dust that has not faded yet, beside fuller hair, and hair that has faded."""
+    """Catches floaters that have not faded yet, beside fuller hair, and hair that has faded."""
     state = Trainer(toy, quick_settings("global", lattice=0), {}).state
     state.unbound[:] = True
     state.gradient_count[:] = np.arange(len(state))
@@ -92,33 +93,33 @@ def test_after_a_short_training(usual, toy):
     weight[::5] = 0.6
     backend = Rows(state)
     backend.blend_weights = lambda view: weight
-    DustPruning(toy).apply(backend, Turn(200, TURNS[0], len(state)))
+    FloaterPruning(toy).apply(backend, Schedule(200, PRUNING_TIMES[0], len(state)))
     kept = np.isin(np.arange(len(weight)), backend.state.gradient_count)
     assert_array_equal(kept, (weight > 0.6) | (usual < 5))
 
 
-def test_a_turn_comes_once(toy):
+def test_a_pruning_comes_once(toy):
     """Catches a look that is missed or made twice where steps take different shares of the budget,
     or where a run is resumed between two steps."""
     shares = np.cumsum(np.random.default_rng(0).uniform(0.001, 0.05, 60))
     shares = shares[shares < 1]
     begun = Trainer(toy, quick_settings("global", lattice=0), {})
     trainer = copy(begun)
-    turns = []
-    changes = {"all": SimpleNamespace(interval=1, apply=lambda _, turn: turns.append(turn))}
-    trainer.changes = changes
+    calls = []
+    hooks = {"all": SimpleNamespace(interval=1, apply=lambda _, schedule: calls.append(schedule))}
+    trainer.hooks = hooks
     for share in shares:
         trainer.iteration += 1
         trainer._post_step(share)
-    assert sum(turn.passes(0.6) for turn in turns) == 1
+    assert sum(schedule.passes(0.6) for schedule in calls) == 1
     steps = [n / 50 for n in range(50)]
     for stop in (1, 12, 29, 30, 31, 48):
-        turns.clear()
+        calls.clear()
         for part in (steps[:stop], steps[stop:]):
             resumed = copy(begun)
             resumed.iteration = 0 if part[0] == 0 else stop
-            resumed.changes = changes
+            resumed.hooks = hooks
             for share in part:
                 resumed.iteration += 1
                 resumed._post_step(share)
-        assert [n for n, turn in enumerate(turns) if turn.passes(0.6)] == [30]
+        assert [n for n, schedule in enumerate(calls) if schedule.passes(0.6)] == [30]
