@@ -254,6 +254,20 @@ def test_splats_follow_the_deformation(convention, names, tmp_path):
     assert_allclose(displayed_colors(shown), expected, atol=1e-4)
 
 
+@pytest.mark.parametrize("names", [(), ("strain_position",)])
+def test_splats_follow_a_subdivided_head(names):
+    """Catches splats on other triangles where a modifier has divided those of the head."""
+    avatar = driven_avatar("stga", names)
+    shown, head = show_on_head(avatar)
+    subdivision = head.modifiers.new("subdivision", "SUBSURF")
+    subdivision.subdivision_type = "SIMPLE"
+    bpy.context.scene.frame_set(5)
+    found = evaluated_splats(shown)[0]
+    subdivision.show_viewport = False
+    bpy.context.view_layer.update()
+    assert_allclose(found, evaluated_splats(shown)[0], atol=1e-6)
+
+
 def test_updated_splats_follow_strain_anew():
     """Catches new splats shown with the strain coefficients of the first ones."""
     first, second = (driven_avatar("stga", ("strain_position",), seed) for seed in (6, 7))
