@@ -44,7 +44,7 @@ from ..stga_addon.scene.objects import (
 )
 from ..stga_addon.scene.record import capture_of, store_path
 from ..stga_addon.scene.rig.head import import_head
-from ..stga_addon.tracking.folder import is_tracked, read_focal_length
+from ..stga_addon.tracking.folder import describe_focal_length, is_tracked
 from ..stga_addon.tracking.footage.sources import VIDEO_SUFFIXES
 from ..stga_addon.training.run.folder import has_run, next_folder
 from . import options
@@ -107,8 +107,7 @@ class HeadImport(Edit):
         store_path(head, tags.FLAME_MODEL, str(capture.flame_file or ""))
         head[tags.PRINCIPAL_POINT] = principal_point
         head[tags.TRACKED] = is_tracked(capture.root)
-        lens = read_focal_length(capture.root)
-        head[tags.FOCAL_LENGTH] = "" if lens is None else lens.description
+        head[tags.FOCAL_LENGTH] = describe_focal_length(capture.root)
         scene.stga.head = head
         if set_up_scene or not heads:
             scene.frame_start = capture.timesteps[0]

@@ -50,7 +50,7 @@ from ..options import (
 )
 from ..progress import Clock, Progress, ignore
 from ..selection import SelectionOptions
-from ..tracking.folder import read_focal_length
+from ..tracking.folder import describe_focal_length
 from ..training.run.folder import AVATAR, Run, claimed_folder, has_run, read_run
 from ..training.settings import TrainingSettings, make_settings
 from .batch import BatchOptions, EngineOptions, run_batch_command
@@ -372,8 +372,8 @@ def _info(options: Namespace, head: OpenHead | None) -> None:
     capture = open_capture(path, request.flame, request.principal_point)
     found: Any = carry_out(request, with_bar=False)
     rows = summarize_capture(capture)
-    lens = read_focal_length(capture.root)
-    rows += [] if lens is None else [("focal length", lens.description)]
+    lens = describe_focal_length(capture.root)
+    rows += [("focal length", lens)] if lens else []
     print(*format_table(rows), sep="\n")
     if found.plan:
         from ..training.effects.plan import describe_effects

@@ -353,8 +353,7 @@ class _Steps:
         self._report = report
         self._time_left = TimeLeft()
         self._share = tracking_share
-        self._before = 0
-        """1 where cameras are found before the head is tracked."""
+        self._before = 0  # 1 where cameras are found before the head is tracked
         self._now = Progress()
         self._quality = dict[str, float]()
 

@@ -187,16 +187,16 @@ class FocalLength:
         return f"{text}; {low:.0f} to {high:.0f} px with a probability of 90 %"
 
 
-def read_focal_length(capture: Path) -> FocalLength | None:
-    """What the report of a tracked capture says; None where it has no report, or where a
-    calibration told it. Raises StgaError where the report is malformed."""
+def describe_focal_length(capture: Path) -> str:
+    """`FocalLength.description` of what the report of a tracked capture says; "" where it has no
+    report, or where a calibration told it. Raises StgaError where the report is malformed."""
     path = capture / REPORT_FILE
     report = read_json(path) if path.is_file() else None
     if not isinstance(report, dict) or report.get(FOCAL_KEYS["pixels"]) is None:
-        return None
-    return from_json(
-        FocalLength, {name: report.get(key) for name, key in FOCAL_KEYS.items()}, str(path)
-    )
+        return ""
+    values = {name: report.get(key) for name, key in FOCAL_KEYS.items()}
+    found: FocalLength = from_json(FocalLength, values, str(path))
+    return found.description
 
 
 @dataclass(frozen=True)

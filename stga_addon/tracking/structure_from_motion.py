@@ -309,7 +309,7 @@ class _Search:
         for image in model.reg_image_ids():
             config.add_image(image)
         config.fix_gauge(colmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
-        # `bundle_adjustment` writes to the log at any level
+        # bundle adjustment writes to the log at any level
         colmap.create_default_bundle_adjuster(options, config, model).solve()
         model.update_point_3d_errors()
 

@@ -291,7 +291,8 @@ def test_a_duplicate_keeps_its_avatar():
     first, second = (driven_avatar("stga", ("strain_position",), seed) for seed in (6, 7))
     second = replace(second, neutral=first.neutral, faces=first.faces)
     shown, _ = show_on_head(first)
-    version, twin = shown.copy(), shown.copy()  # Shift+D, Alt+D
+    version = shown.copy()  # Shift+D
+    twin = shown.copy()  # Alt+D
     version.data = shown.data.copy()
     for each in (version, twin):
         bpy.context.scene.collection.objects.link(each)

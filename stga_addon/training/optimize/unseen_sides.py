@@ -141,6 +141,16 @@ def unseen_sides(surface: Surface) -> UnseenSides:
     return UnseenSides(triangles, shown, found, is_hair, np.where(is_hair, 1.0, turned), off_axis)
 
 
+def plausible_off_axis(splats: Splats, along: np.ndarray, sides: UnseenSides) -> Splats:
+    """Splats that views show along one direction only, that of their triangle (F, 3), with what is
+    plausible off-axis: hair, and of the rest what lies on it, not what hangs before it."""
+    face = splats.face
+    share = OFF_AXIS_WEIGHT * sides.view_dependence[face]
+    share[splats.unbound & ~sides.is_hair[face]] = 0
+    share[sides.triangles[face]] = 0  # they have one color from everywhere, and hair its locks
+    return colored_off_axis(splats, along[face], share, sides.off_axis[face])
+
+
 def _hair(
     surface: Surface, color: np.ndarray, has_pixels: np.ndarray, is_source: np.ndarray
 ) -> np.ndarray:
