@@ -113,13 +113,7 @@ class HeadImport(Edit):
             scene.frame_start = capture.timesteps[0]
             scene.frame_end = capture.timesteps[-1]
             scene.frame_set(capture.timesteps[0])
-        leave_edit_mode()
-        for thing in objects.selected:
-            thing.select_set(False)
-        if objects.get(head.name) is head:
-            head.select_set(True)
-            mover_of(head).select_set(True)
-            objects.active = head
+        _select(head, objects)
         if not heads:  # later on, the user shows it
             hide_default_cube(scene)
         remove(tags.find(tags.TRACKED_HEAD, capture.root))
@@ -140,6 +134,17 @@ class HeadImport(Edit):
 
     def is_told(self, warning: str) -> bool:
         return not self.ignored_warning or self.ignored_warning not in warning
+
+
+def _select(head: Any, objects: Any) -> None:
+    """Select the head and its mover alone, where the view layer has it."""
+    leave_edit_mode()
+    for thing in objects.selected:
+        thing.select_set(False)
+    if objects.get(head.name) is head:
+        head.select_set(True)
+        mover_of(head).select_set(True)
+        objects.active = head
 
 
 class ImportCapture(HeadImport, bpy.types.Operator, FileImport):

@@ -218,6 +218,7 @@ def _in_range(nodes: Nodes, vector: Any, ends: tuple[str, str]) -> Any:
 
 
 POSED = _meshes("Posed Triangles", _posed, "Head", "Neutral")
+
 DEFORMED = _meshes("Triangle Deformation", _deformed, "Posed", "Neutral")
 """Posed and neutral mesh -> the mesh with its triangles' deformation."""
 SIGNALS = {
