@@ -107,13 +107,14 @@ def unseen_sides(surface: Surface) -> UnseenSides:
     sides = _Sides(surface, color, well_shown, hair)
     hidden = unseen | ~shown | surface.lids
     found = color.copy()
-    found[hidden] = sides.nearest(is_source, hidden)
+    ears = np.zeros_like(shown) if surface.at is None else ears_of(surface.at)
+    found[hidden] = sides.nearest(is_source & ~ears, hidden)
     turned = np.where(is_outside, surface.turned_from(SHOWN_COSINE), 0.0)
     off_axis = color.copy()
     is_hair = np.zeros_like(shown)
     may_be_mirrored = unseen.copy()
     if surface.at is not None:
-        kinds = {"body": surface.kinds["body"], "ears": ears_of(surface.at)}
+        kinds = {"body": surface.kinds["body"], "ears": ears}
         for kind, own in kinds.items():
             if (own & is_source).any() and (own & hidden).any():
                 is_level = kind == "body"
