@@ -203,7 +203,7 @@ def painted(capture, hair=HAIR, fringe=0.75):
     hairline = np.interp(centers[:, 2], (-0.06, 0.02), (-1.1, fringe))
     color = np.where(centers[:, 2:] < 0.02, shaded_skin(hair), SKIN)
     color[level > hairline] = hair
-    color[level + 0.5 * centers[:, 2] / 0.07 < -2.5] = CLOTH
+    color[level + 0.3 * centers[:, 2] / 0.07 < -2.4] = CLOTH
     color[eyeballs_of(capture)] = EYES
     return color
 

@@ -48,7 +48,7 @@ NEAREST = 24
 SOURCE_TRIANGLES = 100
 """Triangles over which the light on a side of the face, and hair's color off axis, are medians, and
 over which unseen colors are softened."""
-COLLAR_SLOPE = 0.5
+COLLAR_SLOPE = 0.3
 """Rise of a collar from front to back, by its depth."""
 LEVEL_WEIGHT = 3.0
 """By how much visible triangles of neck and shoulders above and below the collar's plane through a
