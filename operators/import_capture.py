@@ -44,7 +44,7 @@ from ..stga_addon.scene.objects import (
 )
 from ..stga_addon.scene.record import capture_of, store_path
 from ..stga_addon.scene.rig.head import import_head
-from ..stga_addon.tracking.folder import is_tracked
+from ..stga_addon.tracking.folder import describe_focal_length, is_tracked
 from ..stga_addon.tracking.footage.sources import VIDEO_SUFFIXES
 from ..stga_addon.training.run.folder import has_run, next_folder
 from . import options
@@ -107,18 +107,13 @@ class HeadImport(Edit):
         store_path(head, tags.FLAME_MODEL, str(capture.flame_file or ""))
         head[tags.PRINCIPAL_POINT] = principal_point
         head[tags.TRACKED] = is_tracked(capture.root)
+        head[tags.FOCAL_LENGTH] = describe_focal_length(capture.root)
         scene.stga.head = head
         if set_up_scene or not heads:
             scene.frame_start = capture.timesteps[0]
             scene.frame_end = capture.timesteps[-1]
             scene.frame_set(capture.timesteps[0])
-        leave_edit_mode()
-        for thing in objects.selected:
-            thing.select_set(False)
-        if objects.get(head.name) is head:
-            head.select_set(True)
-            mover_of(head).select_set(True)
-            objects.active = head
+        _select(head, objects)
         if not heads:  # later on, the user shows it
             hide_default_cube(scene)
         remove(tags.find(tags.TRACKED_HEAD, capture.root))
@@ -139,6 +134,17 @@ class HeadImport(Edit):
 
     def is_told(self, warning: str) -> bool:
         return not self.ignored_warning or self.ignored_warning not in warning
+
+
+def _select(head: Any, objects: Any) -> None:
+    """Select the head and its mover alone, where the view layer has it."""
+    leave_edit_mode()
+    for thing in objects.selected:
+        thing.select_set(False)
+    if objects.get(head.name) is head:
+        head.select_set(True)
+        mover_of(head).select_set(True)
+        objects.active = head
 
 
 class ImportCapture(HeadImport, bpy.types.Operator, FileImport):

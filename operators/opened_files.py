@@ -20,11 +20,13 @@ from ..stga_addon.scene.display.splat_object import (
     get_input,
     hide_covered,
     hide_in_layers,
+    hide_object,
     replace_native_splats,
 )
 from ..stga_addon.scene.objects import layers_with, mover_of, remove
 from ..stga_addon.scene.record import owner_of, rebase, rebase_file, store_path, stored_path
 from ..stga_addon.scene.render.viewport_display import is_shown_as_trained
+from ..stga_addon.scene.rig.head import bone_shapes
 from ..stga_addon.training.run.folder import has_run
 from . import monitor
 from .common import UNSAVED, AtEnd, is_head, register_handlers
@@ -121,6 +123,9 @@ def _after_append(imported: Any) -> None:
             hide_in_layers(thing, scene)
         elif tags.CONVENTION in thing:
             hide_covered(thing, scene)
+        elif thing.get(tags.KIND) == tags.RIG:
+            for shape in bone_shapes(thing):
+                hide_object(shape, scene)
         if item.source_library is not None and not isinstance(thing, bpy.types.Collection):
             source = bpy.path.abspath(item.source_library.filepath)
             rebase([thing], bpy.data.filepath, source=source)

@@ -24,6 +24,7 @@ from ..stga_addon.scene import light
 from ..stga_addon.scene.cameras import scene_camera, turntable_cameras
 from ..stga_addon.scene.evaluation import kept_evaluated
 from ..stga_addon.scene.gpu.context import has_gpu_context
+from ..stga_addon.scene.gpu.packing import View, in_range
 from ..stga_addon.scene.layers import SceneLayer
 from ..stga_addon.scene.objects import (
     Identity,
@@ -185,13 +186,13 @@ class RenderVideo(Stepwise, bpy.types.Operator, FileExport):
                 images = _images(view, frames, cameras)
                 for number in range(len(frames)):
                     yield from _while_rendering(status, number / len(frames), output)
-                    layers, camera, is_new = next(images)
+                    layers, seen, is_new = next(images)
                     if drawn is not None:
-                        drawn.add(layers, camera)
+                        drawn.add(layers, seen)
                     else:
                         if is_new or any(layer.relit for layer in layers):
-                            posed = [layer.posed(camera.position) for layer in layers]
-                        recorder.add(posed, camera)
+                            posed = [layer.posed(seen.camera.position) for layer in layers]
+                        recorder.add([in_range(each, seen) for each in posed], seen.camera)
                     share = (number + 1) / len(frames)
                     if status.report(Progress(share, "Recording", figures=lambda: left)):
                         raise Cancelled(f"{output}: cancelled")
@@ -220,9 +221,9 @@ def _while_rendering(status: Any, share: float, output: Path) -> StepGenerator:
 
 def _images(
     view: SceneView, frames: Sequence[int], cameras: Sequence[Camera] | None
-) -> Iterator[tuple[list[SceneLayer], Camera, bool]]:
-    """What each image shows: layers and camera, None: the scene's; and whether the layers are
-    new."""
+) -> Iterator[tuple[list[SceneLayer], View, bool]]:
+    """What each image shows: layers, and by which view; and whether the layers are new. cameras:
+    None: the scene's, which has their clip distances."""
     cache = SplatCache()
     before = None
     for number, frame in enumerate(frames):
@@ -234,8 +235,9 @@ def _images(
                 layers = all_layers(bpy.context.evaluated_depsgraph_get(), cache)
             depsgraph = bpy.context.evaluated_depsgraph_get()
             camera = cameras[number] if cameras else scene_camera(depsgraph)
+            seen = engine.camera_view(camera, scene.camera.evaluated_get(depsgraph))
         before = frame
-        yield layers, camera, is_new
+        yield layers, seen, is_new
 
 
 def _dismiss(scene: Identity) -> None:

@@ -13,8 +13,13 @@ from ..operators.pose import is_posing
 from ..operators.training_python import has_training_python
 from ..stga_addon.errors import StgaError
 from ..stga_addon.jobs.table import Kind
+from ..stga_addon.scene import tags
 from ..stga_addon.scene.display import splat_nodes
-from ..stga_addon.scene.display.splat_object import splat_modifier
+from ..stga_addon.scene.display.splat_object import (
+    get_input,
+    is_partly_filmed,
+    splat_modifier,
+)
 from ..stga_addon.worker.status import WorkerState
 from ..stga_addon.worker.training_python import PYTHON_VARIABLE
 from .select_panel import has_selection
@@ -22,6 +27,10 @@ from .show_panel import draw_input, draw_left_out
 from .sidebar import SidebarPanel, draw_end, draw_running, draw_text
 from .train_panel import draw_missing_python, draw_preferences, draw_train_button
 
+FILM_MORE = (
+    "Blue was not filmed, but is plausible. To have it as it is: film the person turning the head "
+    "by 90° to both sides, and train again"
+)
 GO_ON = "Go on working, save, or quit Blender"
 
 
@@ -104,6 +113,7 @@ def _draw_message(layout: Any, context: Any) -> None:
 
 def _draw_what_to_try(layout: Any, context: Any, settings: Any) -> None:
     """Buttons that bring a shown avatar to life, and what the last video has come to."""
+    _draw_unseen(layout, context, settings.splats)
     layout.label(text="Orbit the avatar, or try", icon="INFO")
     column = layout.column(align=True)
     is_playing = context.screen.is_animation_playing
@@ -138,3 +148,14 @@ def _draw_what_to_try(layout: Any, context: Any, settings: Any) -> None:
         opened = box.operator("wm.path_open", text=f"Open {video.subject.name}", icon="PLAY")
         opened.filepath = str(video.subject)
         draw_text(box, context, str(video.subject.parent), "FILE_FOLDER")
+
+
+def _draw_unseen(layout: Any, context: Any, splats: Any) -> None:
+    """What the color of sides that were not filmed means, while it is shown."""
+    if not is_partly_filmed(splats) or not get_input(splats, splat_nodes.SHOW_UNSEEN):
+        return
+    box = layout.box()
+    draw_text(
+        box, context, f"{splats[tags.FILMED].partition(';')[0].capitalize()}. {FILM_MORE}", "INFO"
+    )
+    draw_input(box, splat_modifier(splats), splat_nodes.SHOW_UNSEEN, toggle=True, icon="HIDE_OFF")

@@ -63,6 +63,9 @@ class TrackCheckPanel(SidebarPanel, bpy.types.Panel):
         head = context.scene.stga.head
         sheet = layout.operator("wm.path_open", text="Open Contact Sheet", icon="IMAGE_DATA")
         sheet.filepath = str(capture_of(head) / SHEET_FILE)
+        lens = head.get(tags.FOCAL_LENGTH)
+        if lens:
+            draw_text(layout, context, f"Focal length: {lens}", "CAMERA_DATA")
         row = layout.row(align=True)
         row.operator("stga.view_footage", text="", icon="TRIA_LEFT").step = -1
         through = context.space_data.region_3d.view_perspective == "CAMERA"

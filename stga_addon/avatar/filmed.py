@@ -16,6 +16,7 @@ MAX_SLOPE = 0.5
 """Of surfaces that count, up or down: others look to no side."""
 SEEN_TO_DEG = 90
 """How far from a camera's direction a surface is seen."""
+FROM_ALL_SIDES = "filmed from all sides"
 
 
 def filmed_sides(avatar: Avatar) -> str:
@@ -47,7 +48,7 @@ def filmed_sides(avatar: Avatar) -> str:
         dark = np.flatnonzero(hidden > total / 2)
         reach.append(dark[0] * SECTOR_DEG - SEEN_TO_DEG if len(dark) else None)
     if reach == [None, None]:
-        return "filmed from all sides"
+        return FROM_ALL_SIDES
     right_deg, left_deg = (SEEN_TO_DEG if end is None else max(0, int(end)) for end in reach)
     reached = f"{right_deg}° on its right to {left_deg}° on its left"
     return f"filmed from {reached}; what is beyond is plausible"

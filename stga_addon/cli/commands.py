@@ -50,6 +50,7 @@ from ..options import (
 )
 from ..progress import Clock, Progress, ignore
 from ..selection import SelectionOptions
+from ..tracking.folder import describe_focal_length
 from ..training.run.folder import AVATAR, Run, claimed_folder, has_run, read_run
 from ..training.settings import TrainingSettings, make_settings
 from .batch import BatchOptions, EngineOptions, run_batch_command
@@ -370,7 +371,10 @@ def _info(options: Namespace, head: OpenHead | None) -> None:
     request = Analyze(**given_options(options, Analyze))
     capture = open_capture(path, request.flame, request.principal_point)
     found: Any = carry_out(request, with_bar=False)
-    print(*format_table(summarize_capture(capture)), sep="\n")
+    rows = summarize_capture(capture)
+    lens = describe_focal_length(capture.root)
+    rows += [("focal length", lens)] if lens else []
+    print(*format_table(rows), sep="\n")
     if found.plan:
         from ..training.effects.plan import describe_effects
 

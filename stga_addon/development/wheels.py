@@ -23,7 +23,7 @@ from packaging.utils import canonicalize_name, parse_wheel_filename
 
 from ..errors import StgaError
 from ..progress import Say
-from ..worker.training_python import GPU_REQUIREMENT, REQUIREMENTS
+from ..worker.training_python import CAMERAS_REQUIREMENT, GPU_REQUIREMENT, REQUIREMENTS
 
 TORCH_CPU_INDEX = "https://download.pytorch.org/whl/cpu"
 """PyTorch's CPU build serves GPUs as well, since the kernels are WebGPU's; the CUDA build, which
@@ -147,7 +147,7 @@ def collect_wheels(folder: Path, target: Target, say: Say = lambda line: None) -
 
     Raises StgaError where one cannot be had.
     """
-    wanted = [*REQUIREMENTS.values(), GPU_REQUIREMENT]
+    wanted = [*REQUIREMENTS.values(), GPU_REQUIREMENT, CAMERAS_REQUIREMENT]
     wheels: dict[str, Path] = {}
     followed: set[str] = set()
     while wanted:

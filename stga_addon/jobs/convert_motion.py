@@ -173,7 +173,8 @@ def _tracked_by_avatar(
             with hold_folder(out, LOCK_FILE, WRITER):
                 clear(out)
         if not is_written(out):
-            track(Track(request.source, None, out, avatar=avatar, step=step), report, say)
+            asked = Track(request.source, None, out, avatar=avatar, step=step, take="talk")
+            track(asked, report, say)
         misfit = read_json(out / REPORT_FILE)["image_misfit"][AVATAR_MISFIT]
         share = float(np.median(list(misfit.values())))
         if share > MAX_MISFIT:

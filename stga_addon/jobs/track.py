@@ -17,7 +17,16 @@ from ..format import format_duration
 from ..options import option
 from ..progress import Cancelled, Progress, Report, Say, TimeLeft, Written
 from ..report import CURVE
-from ..tracking.folder import KEPT_FOLDER, LOCK_FILE, REPORT_FILE, SHEET_FILE, is_flame, is_written
+from ..tracking.folder import (
+    KEPT_FOLDER,
+    LOCK_FILE,
+    REPORT_FILE,
+    SHEET_FILE,
+    clear,
+    is_begun,
+    is_flame,
+    is_written,
+)
 from ..tracking.stages import Draw, Stage
 from ..training.run.folder import AVATAR
 from ..worker.helpers import Helpers
@@ -42,6 +51,12 @@ SYNC = {
     "motion": "by what moves in them",
 }
 """Choice of how several videos are aligned in time -> what it is."""
+TAKES = {
+    "auto": "found out, and said",
+    "around": "a camera that moves around a still head, or photos of one: their cameras are found",
+    "talk": "a head that moves before a camera",
+}
+"""Choice of what was filmed -> what it is."""
 MATTES = {"auto": "made for frames without a mask", "none": "only those of the footage"}
 """What `Track.mattes` may be but a folder of masks."""
 CAPTURE_FOLDER = "capture"
@@ -123,6 +138,11 @@ class Track:
         "none",
         choices=SYNC,
     )
+    take: str = option(
+        "what a single camera without calibration filmed (default: found out)",
+        "auto",
+        choices=TAKES,
+    )
     mattes: str = option(
         "masks of the person: made where the footage has none (default), only the footage's, or a "
         "folder's",
@@ -137,6 +157,10 @@ class Track:
         if self.avatar is not None and (self.model is not None or self.meshes):
             name = "--meshes" if self.model is None else "--model"
             raise StgaError(f"{name}: does not go with --avatar, whose head is tracked")
+        for name in ("cameras", "landmarks"):
+            if self.take == "around" and getattr(self, name) is not None:
+                problem = f"does not go with --{name}, which is of cameras that are known"
+                raise StgaError(f"--take around: {problem}")
 
 
 @dataclass(frozen=True)
@@ -189,13 +213,6 @@ MAX_MISFIT = 0.5
 """Median fraction of the head's pixels beyond which the avatar is another person's."""
 TRACKING_SHARE = 0.5
 """Of the progress, before an avatar tracks or is trained."""
-FOCAL_SOURCES = {
-    "given": "as given",
-    "file": "as the file says",
-    "estimated": "estimated from the head's landmarks",
-    "avatar": "that of the avatar's camera",
-}
-"""Where a focal length is from (`Footage.focal`) -> what a person reads of it."""
 
 
 def refuse_tracked(request: Track) -> None:
@@ -228,10 +245,10 @@ def _track_head(request: Track, report: Report) -> Written:
     from ..tracking.track import track as track_footage
 
     steps = _Steps(report)
-    footage = _open(request, steps)
+    footage, told = _open(request, steps)
     options = _options(request)
     found = track_footage(footage, request.model, request.out, options, steps.report, steps.show)
-    return _written(request.out, found, report)
+    return _written(request.out, found, report, told)
 
 
 def _track_by_avatar(request: Track, run: Path, report: Report) -> Written:
@@ -243,7 +260,7 @@ def _track_by_avatar(request: Track, run: Path, report: Report) -> Written:
 
     steps = _Steps(report, TRACKING_SHARE)
     out = request.out
-    footage = _open(request, steps)
+    footage, told = _open(request, steps)
     person, model = avatar_person(run)
     options = replace(_options(request), person=person)
     found = track_footage(footage, model, out, options, steps.report, steps.show)
@@ -254,13 +271,14 @@ def _track_by_avatar(request: Track, run: Path, report: Report) -> Written:
     found = replace(found, median_px=report_errors(out, model))
     end_tracking(out)
     share = float(np.median(tracked.misfit))
-    lines = [f"avatar: does not explain {share:.0%} of the head's pixels (median)"]
+    lines = [*told, f"avatar: does not explain {share:.0%} of the head's pixels (median)"]
     if share > MAX_MISFIT:
         lines.append("warning: the avatar does not look like the person of this footage")
     return _written(out, found, report, lines)
 
 
-def _open(request: Track, steps: "_Steps") -> "Footage":
+def _open(request: Track, steps: "_Steps") -> tuple["Footage", tuple[str, ...]]:
+    """The footage, and lines on how it was understood."""
     from ..tracking.footage.open import open_footage, sized
     from ..tracking.footage.sequences import FrameRange
 
@@ -270,7 +288,32 @@ def _open(request: Track, steps: "_Steps") -> "Footage":
     mattes = None if request.mattes in MATTES else Path(request.mattes)
     cameras = request.cameras
     footage = open_footage(request.footage, cameras, frames, request.focal, mattes=mattes)
-    return footage if request.size == 1 else sized(footage, request.size)
+    told: tuple[str, ...] = ()
+    if footage.focal == "calibration":
+        if request.take == "around":
+            raise StgaError(f"--take around: {request.footage} has a calibration already")
+    elif request.landmarks is None:
+        footage, told = _with_found_cameras(footage, request, steps)
+    return (footage if request.size == 1 else sized(footage, request.size)), told
+
+
+def _with_found_cameras(
+    footage: "Footage", request: Track, steps: "_Steps"
+) -> tuple["Footage", tuple[str, ...]]:
+    """As `around.with_found_cameras`; what is refused leaves nothing."""
+    from ..tracking.around import with_found_cameras
+    from ..tracking.stages import Crew
+
+    out = request.out
+    is_new = not is_begun(out)
+    try:
+        with Helpers(folder=out / KEPT_FOLDER) as helpers:
+            crew = Crew(helpers, steps.report, steps.show)
+            return with_found_cameras(footage, out, request.take, crew)
+    except StgaError:
+        if is_new and is_begun(out):
+            clear(out)
+        raise
 
 
 def _options(request: Track) -> "TrackingOptions":
@@ -284,8 +327,8 @@ def _written(
     out: Path, found: "TrackingReport", report: Report, told: Sequence[str] = ()
 ) -> Written:
     lines = [f"warning: {warning}" for warning in found.warnings]
-    if found.focal_px is not None:
-        lines.append(f"focal length: {found.focal_px:.0f} px, {FOCAL_SOURCES[found.focal]}")
+    if found.focal_length is not None:
+        lines.append(f"focal length: {found.focal_length.description}")
     if found.torso is not None:
         lines.append(f"torso: {found.torso.description}")
     error = f"{found.median_px:.2f} px (median)"
@@ -310,14 +353,15 @@ class _Steps:
         self._report = report
         self._time_left = TimeLeft()
         self._share = tracking_share
+        self._before = 0  # 1 where cameras are found before the head is tracked
         self._now = Progress()
         self._quality = dict[str, float]()
 
     def report(self, stage: Stage, done: int, total: int) -> None:
         """Raises Cancelled where the report says to stop."""
-        begin = self._share * stage.begin
-        end = self._share * stage.end
-        share = begin + (end - begin) * done / max(total, 1)
+        self._before = max(self._before, -math.floor(stage.begin))
+        at = stage.begin + (stage.end - stage.begin) * done / max(total, 1)
+        share = (at + self._before) / (1 / self._share + self._before)
         figures = {"left_s": self._time_left.after(share), **self._quality}
         detail = f"{done} of {total}" if total > 1 else ""
         self._now = Progress(share, stage.title, detail, lambda: figures)
@@ -408,7 +452,7 @@ def check_inputs(track: Track) -> None:
     if (out / INPUTS).exists():
         stored = read_inputs(out)
         for name, value in inputs.items():
-            before = stored.get(name)
+            before = stored.get(name, "auto" if name == "take" else None)
             if before != value:
                 raise StgaError(f"{name}: {out} began with {shorten(before)}; give another --out")
     elif is_written(track.out) or (out / RUN_FOLDER).exists():

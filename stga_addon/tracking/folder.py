@@ -31,6 +31,21 @@ MOTIONS = {"head": "turns with the head", "still": "keeps its direction", "own":
 """How a torso can move -> its description."""
 TORSO_KEY = "torso"
 """Key of the report; null where the torso's motion could not be determined."""
+FOCAL_KEYS = {
+    "pixels": "focal_length_px",
+    "source": "focal_length_from",
+    "interval_px": "focal_length_interval_px",
+}
+"""Fields of `FocalLength` -> their keys in the report."""
+FOCAL_SOURCES = {
+    "given": "as given",
+    "file": "as the file says",
+    "usual": "that of a phone",
+    "estimated": "estimated from the head's landmarks",
+    "avatar": "that of the avatar's camera",
+}
+"""Where the focal length of a camera without calibration is from (`Footage.focal`), and what a
+person reads of it."""
 POINTS_FILE = "torso_points.npz"
 
 AVATAR_MISFIT = "avatar"
@@ -148,6 +163,40 @@ def read_torso_motion(capture: Path) -> TorsoMotion | None:
         # of a capture that was tracked before there were any
         found = {"shift_mm": 0.0, "bend_mm": 0.0, **found}
     return from_json(TorsoMotion, found, f"{path}: {TORSO_KEY}")
+
+
+@dataclass(frozen=True)
+class FocalLength:
+    """Of a single camera without calibration, in pixels.
+
+    source       which of FOCAL_SOURCES it is from
+    interval_px  the interval that holds it with a probability of 90 %; None where it was not
+                 estimated
+    """
+
+    pixels: float = setting(above=0)
+    source: str = setting(choices=FOCAL_SOURCES)
+    interval_px: tuple[float, float] | None = setting(None, above=0)
+
+    @property
+    def description(self) -> str:
+        text = f"{self.pixels:.0f} px, {FOCAL_SOURCES[self.source]}"
+        if self.interval_px is None:
+            return text
+        low, high = self.interval_px
+        return f"{text}; {low:.0f} to {high:.0f} px with a probability of 90 %"
+
+
+def describe_focal_length(capture: Path) -> str:
+    """`FocalLength.description` of what the report of a tracked capture says; "" where it has no
+    report, or where a calibration told it. Raises StgaError where the report is malformed."""
+    path = capture / REPORT_FILE
+    report = read_json(path) if path.is_file() else None
+    if not isinstance(report, dict) or report.get(FOCAL_KEYS["pixels"]) is None:
+        return ""
+    values = {name: report.get(key) for name, key in FOCAL_KEYS.items()}
+    found: FocalLength = from_json(FocalLength, values, str(path))
+    return found.description
 
 
 @dataclass(frozen=True)

@@ -64,10 +64,7 @@ def open_take(
     footage: Footage, head_file: Path | None, out: Path, options: TrackingOptions
 ) -> OpenedFootage:
     """Raises StgaError for a folder that is no place for a capture, and for a damaged head."""
-    if folder.is_written(out):
-        raise StgaError(f"{out}: already holds a capture; give another --out")
-    if Path(realpath(out)) == footage.root:
-        raise StgaError(f"{out}: is the folder of the footage; give another --out")
+    check_place(footage, out)
     person = options.person
     head = read_head_model(head_file) if person is None else person.fit.head
     stored = _stored(footage, out)
@@ -79,6 +76,14 @@ def open_take(
         "landmarks": None if options.landmarks is None else realpath(options.landmarks),
     }
     return OpenedFootage(stored, head, head_file, out, options, source)
+
+
+def check_place(footage: Footage, out: Path) -> None:
+    """Raise StgaError for a folder that is no place for a capture."""
+    if folder.is_written(out):
+        raise StgaError(f"{out}: already holds a capture; give another --out")
+    if Path(realpath(out)) == footage.root:
+        raise StgaError(f"{out}: is the folder of the footage; give another --out")
 
 
 def begin_landmarks(opened: OpenedFootage) -> None:

@@ -119,32 +119,38 @@ def solve_identity(
     own = expressions + RIGID_SIZE
     frames = np.pad(start, ((0, 0), (own - start.shape[1], 0)))
     begun = np.zeros(known) if shape is None else shape
-    state = np.concatenate([begun, [0.0], frames.ravel()])
+    common = np.append(begun, 0.0)
     size = np.zeros(shared)
     if observations[0].eye is not None:
         size[:known] = _size_by_identity(head, places) / SIZE_SIGMA
     for _ in range(IDENTITY_ITERATIONS):
-        precision, pull = prior_terms(head, state[shared:].reshape(-1, own))
-        matrix = np.diag(np.concatenate([np.ones(shared), precision.ravel()]))
-        right = np.concatenate([-state[:shared], pull.ravel()])
-        matrix[:shared, :shared] += np.outer(size, size)
-        right[:shared] -= size * (size @ state[:shared])
-        for number, observation in enumerate(observations):
-            frame = slice(shared + own * number, shared + own * (number + 1))
-            rows = np.r_[:shared, frame]
-            values = state[rows]
-            block, gradient = normal_equations(points, values, observation)
-            matrix[np.ix_(rows, rows)] += block
-            right[rows] += gradient
+        precision, pull = prior_terms(head, frames)
+        matrix = np.eye(shared) + np.outer(size, size)
+        right = -matrix @ common
+        solved = []
+        for values, diagonal, pulled, observation in zip(
+            frames, precision, pull, observations, strict=True
+        ):
+            every = np.concatenate([common, values])
+            block, gradient = normal_equations(points, every, observation)
+            inner = block[shared:, shared:] + np.diag(diagonal)
+            outer = np.column_stack([block[shared:, :shared], gradient[shared:] + pulled])
+            inside = np.linalg.solve(inner, outer)
+            solved.append(inside)
+            # Schur complement: timesteps share nothing but the identity
+            eliminated = block[:shared, shared:] @ inside
+            matrix += block[:shared, :shared] - eliminated[:, :-1]
+            right += gradient[:shared] - eliminated[:, -1]
         step = np.linalg.solve(matrix, right)
-        state += step
-        if np.abs(step).max() < CONVERGED_STEP:
+        moves = np.stack([inside[:, -1] - inside[:, :-1] @ step for inside in solved])
+        common = common + step
+        frames = frames + moves
+        if max(np.abs(step).max(), np.abs(moves).max()) < CONVERGED_STEP:
             break
-    scale = 1 + scale_sigma * state[known]
-    frames = state[shared:].reshape(len(observations), own)
+    scale = 1 + scale_sigma * common[known]
     frames[:, :expressions] /= scale
     frames[:, -TRANSLATION_SIZE:] /= scale
-    return Identity(state[:known] / scale, float(scale), frames)
+    return Identity(common[:known] / scale, float(scale), frames)
 
 
 def _size_by_identity(head: HeadModel, places: SurfacePoints) -> np.ndarray:

@@ -15,10 +15,15 @@ class Stage(Enum):
 
     title       what it is called
     begin, end  of the progress: about its share of the time on two processors where one camera
-                recorded a video of 1080p; what follows the capture begins at 1
+                recorded a video of 1080p; what precedes it, where cameras are to be found, begins
+                at -1, and what follows the capture at 1
     """
 
     OPENING = ("Opening the footage", 0.0, 0.0)
+    FRAMES = ("Choosing frames", -1.0, -0.9)
+    FEATURES = ("Features of images", -0.9, -0.5)
+    MATCHES = ("Matches between images", -0.5, -0.1)
+    CAMERAS = ("Cameras of images", -0.1, 0.0)
     HEAD_MODEL = ("Head model", 0.0, 0.035)
     LANDMARKS = ("Landmarks", 0.035, 0.115)
     FOCAL_LENGTH = ("Focal length", 0.115, 0.12)

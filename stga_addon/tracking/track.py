@@ -30,16 +30,14 @@ class TrackingReport:
     scale            meters per unit of the cameras' world
     warnings         one sentence each
     torso            how the torso moves; None where that cannot be told
-    focal_px, focal  focal length of a single camera without a calibration, else None; and
-                     `Footage.focal`
+    focal_length     of a single camera without calibration, else None
     """
 
     median_px: float
     scale: float
     warnings: tuple[str, ...]
     torso: folder.TorsoMotion | None
-    focal_px: float | None
-    focal: str
+    focal_length: folder.FocalLength | None
 
 
 def track(
@@ -103,11 +101,8 @@ def _write(head: SeenHead, crew: Crew) -> TrackingReport:
     out = opened.out
     fit = head.fitted.fit
     torso = head.torso
-    focal = None
-    if head.footage.focal != "calibration":
-        focal = head.footage.cameras[0].camera.fl_x
-    estimate = recorded.focal
-    interval = None if estimate is None else [round(estimate.low, 1), round(estimate.high, 1)]
+    focal = _focal_length(head)
+    told = dict.fromkeys(folder.FOCAL_KEYS) if focal is None else to_json(focal)
     median = median_px(head.errors)
     pixels = {name: {t: px for t, (px, _) in own.items()} for name, own in head.errors.items()}
     values = {
@@ -118,9 +113,7 @@ def _write(head: SeenHead, crew: Crew) -> TrackingReport:
         "warnings": list(head.warnings),
         "reprojection_px": folder.rounded(pixels),
         "image_misfit": folder.rounded(head.fitted.misfits),
-        "focal_length_px": None if focal is None else round(focal, 1),
-        "focal_length_from": head.footage.focal,
-        "focal_length_interval_px": interval,
+        **{key: told[name] for name, key in folder.FOCAL_KEYS.items()},
         folder.TORSO_KEY: None if torso.motion is None else to_json(torso.motion),
     }
     write_json(out / folder.REPORT_FILE, values)
@@ -137,9 +130,16 @@ def _write(head: SeenHead, crew: Crew) -> TrackingReport:
         with replacing(out / BUNDLED_MODEL) as copy:
             shutil.copyfile(BUNDLED_HEAD, copy)
     write_capture(out, head.footage, torso, opened.options.meshes, crew.report)
-    scale = fit.to_capture.scale
-    told_by = head.footage.focal
-    return TrackingReport(median, scale, head.warnings, torso.motion, focal, told_by)
+    return TrackingReport(median, fit.to_capture.scale, head.warnings, torso.motion, focal)
+
+
+def _focal_length(head: SeenHead) -> folder.FocalLength | None:
+    if head.footage.focal == "calibration":
+        return None
+    pixels = round(head.footage.cameras[0].camera.fl_x, 1)
+    estimate = head.fitted.recorded.focal
+    interval = None if estimate is None else (round(estimate.low, 1), round(estimate.high, 1))
+    return folder.FocalLength(pixels, head.footage.focal, interval)
 
 
 def _keep_landmarks(out: Path, recorded: RecordedFootage) -> None:

@@ -89,25 +89,43 @@ class Helpers:
         and read from there instead of working on an equal part again. Raises what work raises, and
         StgaError where a helper ends before its work does.
         """
-        if keep and self._folder is not None:
-            files = [self._folder / f"{_digest(work, part)}.npz" for part in parts]
-            parts = [(file, work, part) for file, part in zip(files, parts, strict=True)]
-            work = _kept
+        if keep:
+            work, parts = self._keeping(work, parts)
         if min(self._count, len(parts)) >= 2:
             return self._shared(work, parts, done)
         steps = count(1)
         return [work(*part, lambda: done(next(steps))) for part in parts]
 
-    def run(self, work: Callable[..., Any], part: tuple, done: Callable[[int], None]) -> Any:
-        """The result of work(*part, step) of one helper, as `map`; for what is not worth two."""
-        shared = self._shared if self._count >= 2 else self.map
-        return shared(work, [part], done)[0]
+    def run(
+        self,
+        work: Callable[..., Any],
+        part: tuple,
+        done: Callable[[int], None],
+        keep: bool = False,
+        apart: bool = False,
+    ) -> Any:
+        """The result of work(*part, step) of one helper, as `map`; for what is not worth two.
+        apart: never in this process, for what `done` could not end there."""
+        parts: Sequence[tuple] = [part]
+        if keep:
+            work, parts = self._keeping(work, parts)
+        shared = self._shared if self._count >= 2 or apart else self.map
+        return shared(work, parts, done)[0]
+
+    def _keeping(
+        self, work: Callable[..., Any], parts: Sequence[tuple]
+    ) -> tuple[Callable[..., Any], Sequence[tuple]]:
+        """Work and parts whose results are kept in the folder; as they are without one."""
+        if self._folder is None:
+            return work, parts
+        files = [self._folder / f"{_digest(work, part)}.npz" for part in parts]
+        return _kept, [(file, work, part) for file, part in zip(files, parts, strict=True)]
 
     def _shared(
         self, work: Callable[..., Any], parts: Sequence[tuple], done: Callable[[int], None]
     ) -> list[Any]:
         """The results of as many helping processes as there are parts for."""
-        number = min(self._count, len(parts))
+        number = min(max(self._count, 1), len(parts))
         while len(self._processes) < number:
             self._processes.append(_start())
         idle: SimpleQueue[subprocess.Popen[bytes]] = SimpleQueue()

@@ -25,6 +25,8 @@ REQUIREMENTS = {  # Module -> requirement of tracking and training, as in `pypro
 """Module -> requirement of tracking and training, as in `pyproject.toml`."""
 GPU_REQUIREMENT = "wgpu>=0.32,<1"
 """Trains on a GPU; without it, or where it has no driver, the CPU trains."""
+CAMERAS_REQUIREMENT = "pycolmap>=4,<5"
+"""Finds the cameras of images without a calibration; without it, only that is refused."""
 PYTHON_VARIABLE = "STGA_PYTHON"  # Names the training Python, above every other choice: for farms
 BLENDER_VARIABLE = "STGA_BLENDER"  # The command that starts Blender on a machine that renders
 

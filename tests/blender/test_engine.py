@@ -352,6 +352,50 @@ def test_only_visible_objects_are_rendered(tmp_path):
     assert alpha[:, WIDTH // 2 :].max() > 0.5
 
 
+def test_background_scenes_are_shown(tmp_path):
+    """Catches splats of a background scene left out, where Cycles and EEVEE show them."""
+    avatar = textured(avatar_of("stga"))
+    shown, _ = show(avatar)
+    camera = camera_at()
+    expected = render(tmp_path)["A"]
+    assert expected.max() > 0.5
+    behind = bpy.context.scene
+    multilayer(behind.render.image_settings)
+    between = bpy.data.scenes.new("between")
+    main = behind.copy()
+    for child in (*main.collection.objects, *main.collection.children):
+        kind = "objects" if isinstance(child, bpy.types.Object) else "children"
+        getattr(main.collection, kind).unlink(child)
+    between.background_set = behind
+    main.background_set = between
+    main.camera = camera
+    main.render.filepath = str(tmp_path / "main.exr")
+    bpy.ops.render.render(write_still=True, scene=main.name)
+    assert_allclose(read_passes(tmp_path / "main.exr")["A"], expected, atol=TOLERANCE)
+    shown.hide_render = True
+    bpy.ops.render.render(write_still=True, scene=main.name)
+    assert read_passes(tmp_path / "main.exr")["A"].max() == 0
+
+
+@pytest.mark.parametrize("device", ["CPU", "GPU"])
+def test_clip_distances_of_the_camera(device, monkeypatch, tmp_path):
+    """Catches splats nearer or farther than the camera's clip distances, keyframed too."""
+    if device == "CPU":
+        monkeypatch.setattr(engine, "has_gpu_context", lambda: False)
+    places = [(x, 0, -z) for x, z in ((-0.3, 1), (0, 2), (0.3, 3))]
+    show_world_splats(splats_of(places, log_scale=np.log(0.03)), "three")
+    camera = active_camera((0, 0, 0))
+    for start, end, seen in ((0.1, 100, "111"), (1.5, 100, "011"), (0.1, 2.5, "110")):
+        camera.data.clip_start = start
+        camera.data.clip_end = end
+        for name in ("clip_start", "clip_end"):
+            camera.data.keyframe_insert(name, frame=1)
+        alpha = render(tmp_path)["A"]
+        pixel = [int(WIDTH * (0.5 + 50 / 36 * x / -z)) for x, _, z in places]
+        found = "".join(str(int(alpha[HEIGHT // 2, each] > 0.3)) for each in pixel)
+        assert found == seen
+
+
 def test_animation(tmp_path):
     """Catches splats that stay where they were, and a keyframed *Disable in Renders* ignored."""
     shown, _ = show(textured(avatar_of("stga")))

@@ -64,7 +64,8 @@ def parts_of(shown):
 
 def test_lit_splats_have_albedo_and_normals_and_a_mesh_throws_shadows():
     """Catches recorded colors that are lit again, roughness of none, normals that do not follow
-    the head, a mesh in whose shadow its own splats lie, and light that is estimated later."""
+    the head or are those of other triangles where it is subdivided, a mesh in whose shadow its own
+    splats lie, and light that is estimated later."""
     shown, head = native_head()
     avatar = lit_avatar()
     plate = mesh_vertices(head.data)
@@ -79,6 +80,12 @@ def test_lit_splats_have_albedo_and_normals_and_a_mesh_throws_shadows():
     normals = vertex_normals(plate.astype(np.float64), avatar.faces)[avatar.faces].mean(1)
     on_ball = avatar.faces.max(1) < BALL  # elsewhere the weights of faces at a corner matter
     assert_allclose(cloud[NORMAL][on_ball], normals[on_ball], atol=6e-3)
+    divided = head.modifiers.new("subdivision", "SUBSURF")
+    divided.subdivision_type = "SIMPLE"
+    on_divided = parts_of(shown)["POINTCLOUD"]
+    head.modifiers.remove(divided)
+    for name in ("position", NORMAL):
+        assert_allclose(on_divided[name], cloud[name], atol=1e-5)
     assert not [name for name in cloud if name.startswith("stga")]
     assert cloud["material"] == ["STGA Lit Splats"]
     caster = parts["MESH"]["position"]

@@ -123,3 +123,22 @@ def test_a_head_is_brought_into_another_file(tmp_path, how, moved):
     open_file(tmp_path / "film/film.blend")
     assert places(panel().head) == expected(project)
     assert Path(bpy.path.abspath(panel().avatar)) == project / "run/avatar.npz"
+
+
+@pytest.mark.parametrize("what", ["splats", "head", "collection"])
+def test_append_shows_what_the_file_shows(tmp_path, what):
+    """Catches what only supports a head as loose objects in the scene: a gray spike of a meter for
+    the shape that bones are drawn by, and the neutral mesh over the splats."""
+    project = make_project(tmp_path / "project")
+    brought = {each.get(tags.KIND): each for each in bpy.data.objects}
+    brought |= {"splats": panel().splats, "collection": panel().head.users_collection[0]}
+    name = brought[what].name
+    kept = {kind: each.name for kind, each in brought.items()}
+    bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
+    kind = "Collection" if what == "collection" else "Object"
+    within = f"{project / 'shots/head.blend'}/{kind}/"
+    bpy.ops.wm.append(filepath=within + name, directory=within, filename=name)
+    visible = {each.name for each in bpy.context.scene.objects if each.visible_get()}
+    wanted = {name} if kind == "Object" else {kept["splats"]}
+    others = {kept[each] for each in (tags.RIG, tags.ROOT) if each in kept}
+    assert wanted <= visible <= wanted | others

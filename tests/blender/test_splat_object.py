@@ -18,14 +18,16 @@ from stga_addon.avatar.file import Avatar
 from stga_addon.avatar.offsets import COLOR, OFFSETS, POSITION, SCALE
 from stga_addon.avatar.splats import SH_C0
 from stga_addon.avatar.strain import at_rest, edge_neighbors
-from stga_addon.scene import compat
+from stga_addon.scene import compat, tags
 from stga_addon.scene.arrays import evaluated_vertices
 from stga_addon.scene.display import splat_nodes
 from stga_addon.scene.display.node_builder import find_tree
 from stga_addon.scene.display.splat_attributes import (
     DISPLAY_COLOR,
+    RELIT_COLOR,
     avatar_attributes,
     read_attribute,
+    write_attributes,
 )
 from stga_addon.scene.display.splat_nodes import POINTS, QUADS
 from stga_addon.scene.display.splat_object import (
@@ -252,6 +254,20 @@ def test_splats_follow_the_deformation(convention, names, tmp_path):
     assert_allclose(displayed_colors(shown), expected, atol=1e-4)
 
 
+@pytest.mark.parametrize("names", [(), ("strain_position",)])
+def test_splats_follow_a_subdivided_head(names):
+    """Catches splats on other triangles where a modifier has divided those of the head."""
+    avatar = driven_avatar("stga", names)
+    shown, head = show_on_head(avatar)
+    subdivision = head.modifiers.new("subdivision", "SUBSURF")
+    subdivision.subdivision_type = "SIMPLE"
+    bpy.context.scene.frame_set(5)
+    found = evaluated_splats(shown)[0]
+    subdivision.show_viewport = False
+    bpy.context.view_layer.update()
+    assert_allclose(found, evaluated_splats(shown)[0], atol=1e-6)
+
+
 def test_updated_splats_follow_strain_anew():
     """Catches new splats shown with the strain coefficients of the first ones."""
     first, second = (driven_avatar("stga", ("strain_position",), seed) for seed in (6, 7))
@@ -268,6 +284,39 @@ def test_updated_splats_follow_strain_anew():
     assert not can_update(shown, driven_avatar("stga"))
     set_input(shown, splat_nodes.NEUTRAL, None)
     assert not can_update(shown, second)
+
+
+def test_a_duplicate_keeps_its_avatar():
+    """Catches a version kept by Shift+D that changes with the original, by their neutral mesh."""
+    first, second = (driven_avatar("stga", ("strain_position",), seed) for seed in (6, 7))
+    second = replace(second, neutral=first.neutral, faces=first.faces)
+    shown, _ = show_on_head(first)
+    version = shown.copy()  # Shift+D
+    twin = shown.copy()  # Alt+D
+    version.data = shown.data.copy()
+    for each in (version, twin):
+        bpy.context.scene.collection.objects.link(each)
+    update_splats(shown, avatar_attributes(second))
+    for each, expected in ((shown, second), (twin, second), (version, first)):
+        found = stored_avatar(each)
+        assert_array_equal(found.splats.xyz, expected.splats.xyz)
+        offsets = expected.driven_offsets["strain_position"]
+        assert_array_equal(found.driven_offsets["strain_position"], offsets)
+    neutral = get_input(shown, splat_nodes.NEUTRAL)
+    update_splats(shown, avatar_attributes(first))
+    assert get_input(shown, splat_nodes.NEUTRAL) == neutral
+
+
+def test_new_splats_are_not_lit_as_those_before():
+    """Catches colors of Relight Frame that outlive the splats they were found for."""
+    avatar = driven_avatar("stga", ())
+    shown, _ = show_on_head(avatar)
+    color = np.ones(4 * len(avatar.splats), np.float32)
+    write_attributes(shown.data, {RELIT_COLOR: ("FLOAT_COLOR", "color", color)}, "POINT")
+    shown.data[tags.RELIT_FRAME] = 1
+    update_splats(shown, avatar_attributes(avatar))
+    assert RELIT_COLOR not in shown.data.attributes
+    assert tags.RELIT_FRAME not in shown.data
 
 
 def test_world_splats():

@@ -6,6 +6,7 @@ import pytest
 from avatar.conftest import splats_of
 
 from stga_addon.avatar.splats import SH_C0
+from stga_addon.capture.color import linear_to_srgb
 from stga_addon.scene.compat import choose_format
 from stga_addon.scene.display.splat_object import show_world_splats
 from stga_addon.scene.render import view_transform
@@ -44,11 +45,29 @@ def test_scenes_with_different_view_transforms():
     assert np.percentile(difference, 99) < 6  # 4.6
 
 
+def test_curves_are_told_apart():
+    """Catches colors of other curves: a black or white level, or a handle, that was changed."""
+    scene = scene_with("Standard")
+    scene.view_settings.use_curve_mapping = True
+    curves = scene.view_settings.curve_mapping
+    linear = np.array([[0.3, 0.4, 0.5]])
+    trained = linear_to_srgb(linear)
+    for black, white in ((0.0, 1.0), (0.1, 1.0), (0.2, 1.0), (0.2, 0.8)):
+        curves.black_level = (black, 0, black)
+        curves.white_level = (1, white, 1)
+        curves.update()
+        measure(scene)
+        low = np.array([black, 0, black])
+        expected = low + linear * (np.array([1, white, 1]) - low)
+        np.testing.assert_allclose(inverse_view(scene).to_linear(trained), expected, atol=0.01)
+    curves.curves[3].points[0].handle_type = "VECTOR"
+    assert inverse_view(scene) is None
+
+
 def test_an_animated_exposure_keeps_a_few(monkeypatch):
     """Catches a table per frame that stays in memory, and a still scene's displaced."""
     monkeypatch.setattr(view_transform, "_measured", {})
-    monkeypatch.setattr(view_transform, "_shown", lambda scene, axis: scene.view_settings.exposure)
-    monkeypatch.setattr(view_transform, "InverseView", lambda axis, exposure: exposure)
+    monkeypatch.setattr(view_transform, "_inverse", lambda scene: scene.view_settings.exposure)
     still = scene_with("Filmic", exposure=-3.0)
     animated = scene_with("AgX")
     for frame in range(50):

@@ -34,7 +34,7 @@ from stga_addon.development.wheels import (
     needs,
 )
 from stga_addon.tracking.face_networks import PersonNetwork
-from stga_addon.worker.training_python import GPU_REQUIREMENT, REQUIREMENTS
+from stga_addon.worker.training_python import CAMERAS_REQUIREMENT, GPU_REQUIREMENT, REQUIREMENTS
 
 LINUX = Target("linux-x64", "3.11", ("4.2.0", "5.1.0"))
 WINDOWS = Target("windows-x64", "3.13", ("5.1.0", ""))
@@ -119,7 +119,7 @@ def test_the_lock_has_what_each_target_needs(target):
         name, version, _, own = parse_wheel_filename(wheel)
         if own & tags:
             versions.setdefault(name, set()).add(version.public)
-    for text in (*REQUIREMENTS.values(), GPU_REQUIREMENT):
+    for text in (*REQUIREMENTS.values(), GPU_REQUIREMENT, CAMERAS_REQUIREMENT):
         requirement = Requirement(text)
         if requirement.name != "numpy":
             (version,) = versions[canonicalize_name(requirement.name)]
@@ -159,7 +159,8 @@ def test_wheels_are_known_by_their_hash(tmp_path, monkeypatch, lock):
     monkeypatch.setattr(
         "stga_addon.development.wheels.REQUIREMENTS", {"filelock": "filelock>=4,<5"}
     )
-    monkeypatch.setattr("stga_addon.development.wheels.GPU_REQUIREMENT", "filelock>=4,<5")
+    for name in ("GPU_REQUIREMENT", "CAMERAS_REQUIREMENT"):
+        monkeypatch.setattr(f"stga_addon.development.wheels.{name}", "filelock>=4,<5")
     make_wheel(folder, "filelock", "4.2.11", "py3-none-any", "malware")
     with refusal("could not download filelock"):
         collect_wheels(folder, LINUX)
@@ -178,6 +179,7 @@ def test_only_when_told_to_does_a_zip_have_cuda(tmp_path, monkeypatch, capsys, l
     wheel_set(wheels, LINUX)
     next(wheels.glob("torch-*")).unlink()
     make_wheel(wheels, "wgpu", "0.32.0", "py3-none-any")
+    make_wheel(wheels, "pycolmap", "4.2.1", "py3-none-any")
     tag = NATIVE["linux-x64"].format("311")
     cpu = make_wheel(offered, "torch", "2.13.0+cpu", tag, "sympy")
     with_cuda = {

@@ -13,6 +13,7 @@ from stga_addon.development.package import ROOT
 from stga_addon.jobs.python_check import describe_check, finish_check, start_check
 from stga_addon.worker import training_python
 from stga_addon.worker.training_python import (
+    CAMERAS_REQUIREMENT,
     GPU_REQUIREMENT,
     PYTHON_VARIABLE,
     REQUIREMENTS,
@@ -91,8 +92,9 @@ PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 def test_requirements():
     """Catches other versions than an installation by pip has, and ones that are not bounded."""
     extras = PROJECT["optional-dependencies"]
-    assert sorted(REQUIREMENTS.values()) == sorted([*PROJECT["dependencies"], *extras["train"]])
+    required = sorted([*REQUIREMENTS.values(), CAMERAS_REQUIREMENT])
+    assert required == sorted([*PROJECT["dependencies"], *extras["train"]])
     assert GPU_REQUIREMENT in extras["gpu"]
-    for requirement in [*REQUIREMENTS.values(), GPU_REQUIREMENT]:
+    for requirement in [*required, GPU_REQUIREMENT]:
         assert re.fullmatch(r"[a-z-]+>=[\d.]+,<\d+", requirement)
         assert re.fullmatch(r"[a-z-]+", package_name(requirement))

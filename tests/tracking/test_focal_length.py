@@ -211,7 +211,7 @@ def test_a_lens_that_nothing_tells_is_that_of_the_avatars_camera(tmp_path, head)
     fit = HeadFit(head, np.zeros(0), {}, HERE)
     known = KnownPerson(fit, lambda mesh, camera: np.zeros((1, 1, 3), np.uint8), likely)
     found = track(*inputs, TrackingOptions(tmp_path / "points", mattes=False, person=known))
-    assert (found.focal, found.focal_px) == ("avatar", 300)
+    assert (found.focal_length.source, found.focal_length.pixels) == ("avatar", 300)
     assert any("focal length is an estimate" in warning for warning in found.warnings)
 
 
@@ -235,12 +235,12 @@ def test_a_phones_video_is_decoded_once_and_its_lens_is_told(tmp_path, head, mon
         footage, tmp_path / "head.npz", out, TrackingOptions(tmp_path / "points", mattes=False)
     )
     assert decoded == list(range(COUNT))
-    assert found.focal == "estimated"
-    assert found.focal_px == pytest.approx(1.6 * usual_focal(*SIZE), rel=0.1)
+    assert found.focal_length.source == "estimated"
+    assert found.focal_length.pixels == pytest.approx(1.6 * usual_focal(*SIZE), rel=0.1)
     report = read_json(tmp_path / "out/tracking.json")
-    assert report["focal_length_px"] == round(found.focal_px, 1)
+    assert report["focal_length_px"] == found.focal_length.pixels
     assert report["focal_length_from"] == "estimated"
     frame = read_json(tmp_path / "out/transforms_train.json")["frames"][5]
-    assert frame["fl_x"] == pytest.approx(found.focal_px)
+    assert frame["fl_x"] == pytest.approx(found.focal_length.pixels, abs=0.05)
     written = np.asarray(Image.open(tmp_path / "out" / frame["file_path"]))
     np.testing.assert_array_equal(written, footage.cameras[0].image(5))

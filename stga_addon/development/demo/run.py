@@ -81,25 +81,18 @@ def run_demo(out: Path, budget: Mapping[str, Any], device: str = "cpu") -> None:
     print(f"({perf_counter() - begin:.0f} s)")
 
 
-def avatar_from_footage(out: Path, seconds: float, device: str = "cpu") -> None:
+def avatar_from_footage(out: Path, budget: Mapping[str, Any], device: str = "cpu") -> None:
     """Make an avatar in OUT/footage from the images and cameras of the demo's capture, without its
-    meshes.
+    meshes. budget: as of `run_demo`.
 
     Raises StgaError.
     """
     from ...cli.commands import COMMANDS
 
     cameras = ["--cameras", str(out / "capture/transforms.json")]
-    more = [
-        "--out",
-        str(out / "footage"),
-        "--budget",
-        f"{seconds}s",
-        "--seed",
-        str(SEED),
-        "--device",
-        device,
-    ]
+    more = ["--out", str(out / "footage"), "--seed", str(SEED), "--device", device]
+    for name, value in budget.items():
+        more += ["--budget", f"{value}s"] if name == "seconds" else [f"--{name}", str(value)]
     parser = ArgumentParser()
     COMMANDS["avatar"].add_arguments(parser, None)
     COMMANDS["avatar"].carry_out(parser.parse_args([str(out / "capture"), *cameras, *more]), None)

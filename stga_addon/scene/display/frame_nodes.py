@@ -129,12 +129,29 @@ _SIGNAL = "stga_signal_{}"  # by name
 FACE_COLOR = "stga_face_color"  # sRGB, added to the colors of a triangle's splats
 
 
-def _deformed(nodes: Nodes, posed: Any, neutral: Any) -> Any:
-    """The neutral mesh at the posed vertices, with deformation tensors (`avatar.strain`)."""
+def _moved_neutral(nodes: Nodes, posed: Any, neutral: Any) -> Any:
+    """The neutral mesh at the posed vertices; of a subdivided mesh, the first are the original."""
     position = nodes.out("GeometryNodeInputPosition")
     index = nodes.out("GeometryNodeInputIndex")
     moved = nodes.sample(posed, position, index, "FLOAT_VECTOR", "POINT")
-    mesh = nodes.out("GeometryNodeSetPosition", {"Geometry": neutral, "Position": moved})
+    return nodes.out("GeometryNodeSetPosition", {"Geometry": neutral, "Position": moved})
+
+
+def _posed(nodes: Nodes, head: Any, neutral: Any) -> Any:
+    """The head with the faces that splats are bound to, also where it is subdivided."""
+    sizes = []
+    for mesh in (head, neutral):
+        size = nodes.add("GeometryNodeAttributeDomainSize", {"Geometry": mesh}, component="MESH")
+        sizes.append(size.outputs["Face Count"])
+    differs = nodes.compare("NOT_EQUAL", *sizes)
+    is_known = nodes.compare("GREATER_THAN", sizes[1], 0.0)
+    moved = _moved_neutral(nodes, head, neutral)
+    return nodes.switch("GEOMETRY", nodes.logic("AND", differs, is_known), head, moved)
+
+
+def _deformed(nodes: Nodes, posed: Any, neutral: Any) -> Any:
+    """`_moved_neutral` with deformation tensors (`avatar.strain`)."""
+    mesh = _moved_neutral(nodes, posed, neutral)
     p0, p1, p2 = nodes.triangle_corners()
     e1 = nodes.vector("SUBTRACT", p1, p0)
     e2 = nodes.vector("SUBTRACT", p2, p0)
@@ -199,6 +216,8 @@ def _in_range(nodes: Nodes, vector: Any, ends: tuple[str, str]) -> Any:
     lowest, highest = (nodes.attribute(name) for name in ends)
     return nodes.vector("MAXIMUM", nodes.vector("MINIMUM", vector, highest), lowest)
 
+
+POSED = _meshes("Posed Triangles", _posed, "Head", "Neutral")
 
 DEFORMED = _meshes("Triangle Deformation", _deformed, "Posed", "Neutral")
 """Posed and neutral mesh -> the mesh with its triangles' deformation."""

@@ -37,7 +37,8 @@ def is_current(tree: bpy.types.NodeTree) -> bool:
 
 
 def _version() -> str:
-    return f"{__version__} with unseen{' and lit native' if compat.NATIVE_SPLATS else ''} splats"
+    lit = " and lit native" if compat.NATIVE_SPLATS else ""
+    return f"{__version__} with unseen{lit} splats on subdivided heads"
 
 
 def new_socket(tree: bpy.types.NodeTree, name: str, side: str, kind: str) -> Any:

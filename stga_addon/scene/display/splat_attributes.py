@@ -169,9 +169,11 @@ def write_splats(mesh: Any, attributes: Attributes) -> None:
         mesh.vertices.add(len(positions) // 3)
     # Through the attribute, which takes all values at once; `MeshVertex.co` takes them one by one.
     write_attributes(mesh, attributes | {"position": attributes[XYZ]}, "POINT")
-    for name in {LINEAR_SH, LINEAR_OPACITY, ALBEDO, UNSEEN} - attributes.keys():  # of splats before
+    of_earlier_splats = {LINEAR_SH, LINEAR_OPACITY, ALBEDO, UNSEEN, RELIT_COLOR}
+    for name in of_earlier_splats - attributes.keys():
         if name in mesh.attributes:
             mesh.attributes.remove(mesh.attributes[name])
+    mesh.pop(tags.RELIT_FRAME, None)
     mesh[tags.REVISION] = uuid4().hex
     mesh.update()
 

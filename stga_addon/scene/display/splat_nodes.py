@@ -12,7 +12,7 @@ from ...capture.meshes import SELECTED_WEIGHT
 from .. import compat, tags
 from ..layers import FROZEN_COLOR, UNSEEN_COLOR
 from . import splat_attributes as stored
-from .frame_nodes import DEFORMED, FACE_COLOR, FRAMES, PLACED, SIGNALS, driven
+from .frame_nodes import DEFORMED, FACE_COLOR, FRAMES, PLACED, POSED, SIGNALS, driven
 from .lit_nodes import LIGHTS, LIT, RECORDED, SCENE_LIGHT, SURFACE
 from .node_builder import NodeGroup, Nodes, find_tree, kept_material, new_socket, new_tree
 
@@ -361,7 +361,7 @@ def build_next_node_group(options: TreeOptions) -> bool:
     groups = [PLACED[convention], _RELIT, *MODES.values(), *SH_BANDS[:degree]]
     if convention is not None:
         groups += [FRAMES[convention], _FROZEN_SPLATS, _MARKED, _PAINT]
-        groups += [DEFORMED] if offsets else []
+        groups += [DEFORMED if offsets else POSED]
         groups += [SIGNALS[name] for name in options.signals]
         groups += [driven(name, convention) for name in offsets]
     if degree > 0 or options.is_colored:
@@ -427,10 +427,9 @@ def _build(nodes: Nodes, options: TreeOptions) -> None:
         splats = nodes.group(PLACED[None], splats)
         color = _color(nodes, inputs, None, options.degree)
     else:
-        head = mesh = nodes.object_info(inputs[HEAD]).outputs["Geometry"]
-        if options.offsets:  # the neutral mesh, deformed as the head is
-            neutral = nodes.object_info(inputs[NEUTRAL], "ORIGINAL").outputs["Geometry"]
-            mesh = nodes.group(DEFORMED, head, neutral)
+        head = nodes.object_info(inputs[HEAD]).outputs["Geometry"]
+        neutral = nodes.object_info(inputs[NEUTRAL], "ORIGINAL").outputs["Geometry"]
+        mesh = nodes.group(DEFORMED if options.offsets else POSED, head, neutral)
         for name in options.signals:
             mesh = nodes.group(SIGNALS[name], mesh)
         mesh = nodes.group(FRAMES[options.convention], mesh)
@@ -456,7 +455,7 @@ def _build(nodes: Nodes, options: TreeOptions) -> None:
         if options.convention is not None:
             choices = {RECORDED: False, SCENE_LIGHT: True}
             lit = nodes.menu("BOOLEAN", inputs[NATIVE_LIGHT], choices, LIGHTS)
-            given = nodes.switch("GEOMETRY", lit, splats, nodes.group(SURFACE, splats, head))
+            given = nodes.switch("GEOMETRY", lit, splats, nodes.group(SURFACE, splats, mesh))
         native = nodes.group(NATIVE_GROUPS[options.degree], given or splats, visible, *fields)
         if lit is not None:
             native = nodes.switch("GEOMETRY", lit, native, nodes.group(LIT, native, head))

@@ -10,7 +10,7 @@ import bpy
 import numpy as np
 
 from ...avatar.file import UNSEEN_REGION, Avatar, AvatarLight
-from ...avatar.filmed import filmed_sides
+from ...avatar.filmed import FROM_ALL_SIDES, filmed_sides
 from ...avatar.offsets import OFFSETS
 from ...avatar.splats import Splats
 from ...errors import StgaError
@@ -93,7 +93,6 @@ def show_avatar(
     for shown_in in splat_object.users_scene:
         use_transparent_bounces(shown_in)
     splat_object.data.clear_geometry()  # also of attributes that only the avatar before has
-    splat_object.data.pop(tags.RELIT_FRAME, None)
     update_splats(splat_object, prepared)
     return splat_object
 
@@ -160,10 +159,25 @@ def _stored_neutral(splat_object: Any) -> Any:
     return None
 
 
+def _own_neutral(splat_object: Any) -> Any:
+    """The neutral mesh to write into: a new one where other splats, as those of a duplicate that
+    is kept, have the same."""
+    neutral = get_input(splat_object, splat_nodes.NEUTRAL)
+    others = [each for each in bpy.data.objects if tags.CONVENTION in each]
+    sharing = [each for each in others if _stored_neutral(each) == neutral.data]
+    own = [each for each in sharing if each.data == splat_object.data and each.library is None]
+    if len(own) < len(sharing):
+        neutral = neutral.copy()
+        neutral.data = neutral.data.copy()
+        for each in own:
+            set_input(each, splat_nodes.NEUTRAL, neutral)
+    return neutral.data
+
+
 def update_splats(splat_object: Any, prepared: SplatAttributes) -> None:
     """Show other splats in the same object. prepared: `avatar_attributes` where `can_update` is
     true."""
-    neutral = get_input(splat_object, splat_nodes.NEUTRAL).data
+    neutral = _own_neutral(splat_object)
     stored.write_attributes(neutral, prepared.neutral, "FACE")
     stored.write_light(neutral, prepared.light)
     neutral.update()
@@ -176,7 +190,7 @@ def store_light(splat_object: Any, avatar: Avatar) -> bool:
     count = len(splat_object.data.vertices)
     if neutral is None or not has_triangles(neutral, avatar.faces) or count != len(avatar.splats):
         return False
-    stored.write_light(neutral, avatar.light)
+    stored.write_light(_own_neutral(splat_object), avatar.light)
     stored.write_attributes(splat_object.data, stored.albedo_attribute(avatar), "POINT")
     splat_object.data.update()
     splat_object.data[tags.REVISION] = uuid4().hex  # what was read of it before is out of date
@@ -258,6 +272,11 @@ def later_modifiers(splat_object: Any) -> list[Any]:
     """The modifiers after ours that change what viewports show of the splats."""
     last = [*splat_object.modifiers].index(splat_modifier(splat_object))
     return [each for each in splat_object.modifiers[last + 1 :] if each.show_viewport]
+
+
+def is_partly_filmed(splat_object: Any) -> bool:
+    """Whether some of its splats are on sides of the head that no camera saw."""
+    return splat_object.get(tags.FILMED, "") not in ("", FROM_ALL_SIDES)
 
 
 def set_input(splat_object: Any, name: str, value: Any) -> None:

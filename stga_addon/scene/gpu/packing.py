@@ -2,18 +2,19 @@
 order that `shaders.py` documents; numpy only."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
 
-from ...avatar.embedding import FaceFrames
+from ...avatar.embedding import FaceFrames, points_to_world
 from ...capture.camera import Camera
 from ...capture.mesh_geometry import vertex_normals
 from ...errors import StgaError
 from ...flame.quaternions import normalized, to_matrices
 from ...light.harmonics import GLOSSY
 from ...light.lamps import LightView, head_bounds, light_rows, light_view
+from ...raster.posed_splats import PosedSplats
 from ..layers import SceneLayer, random_percentage
 
 NEAR_M = 0.01
@@ -42,6 +43,16 @@ class View:
     near: float = NEAR_M
     far: float = np.inf
     clip_planes: np.ndarray | None = None
+
+
+def in_range(posed: PosedSplats, view: View) -> PosedSplats:
+    """The splats whose centers lie within the view's near and far ends; the same object where all
+    do."""
+    world = points_to_world(posed.splats.xyz, posed.frames, posed.splats.face)
+    row = (view.camera.world_to_camera @ posed.to_world)[2]
+    depth = world @ row[:3] + row[3]
+    inside = (depth >= view.near) & (depth <= view.far)
+    return posed if inside.all() else replace(posed, splats=posed.splats.rows(inside))
 
 
 class StaticSplats:

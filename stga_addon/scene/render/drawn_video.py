@@ -9,11 +9,11 @@ from pathlib import Path
 import bpy
 import numpy as np
 
-from ...capture.camera import Camera
 from ...errors import StgaError
 from ...files import replacing
 from ...render.video import finished, is_video, sequence_files
 from ..compat import choose_format, sequencer_strips
+from ..gpu.packing import View
 from ..layers import SceneLayer
 from ..objects import set_frames_per_second
 from .engine import draw_image
@@ -31,9 +31,9 @@ class DrawnVideo:
         self._background = background
         self._images: list[Path] = []
 
-    def add(self, layers: Sequence[SceneLayer], camera: Camera) -> None:
+    def add(self, layers: Sequence[SceneLayer], view: View) -> None:
         """Draw an image. Raises StgaError where the GPU cannot, or the disk is full."""
-        image = draw_image(list(layers), camera)
+        image = draw_image(list(layers), view)
         if image is None:
             raise StgaError("The video cannot be drawn: Blender has no GPU context, or it fails")
         path = self._folder / f"{len(self._images) + 1:04d}.png"

@@ -18,7 +18,7 @@ from ...raster.splat_shader import MIN_ALPHA
 from ...render.client import RenderClient
 from ..cameras import Eye, render_camera
 from ..gpu.context import has_gpu_context
-from ..gpu.packing import View
+from ..gpu.packing import NEAR_M, View, in_range
 from ..gpu.renderer import CompositeTarget, SplatRenderer
 from ..layers import SceneLayer
 from ..light import settings_values
@@ -135,18 +135,18 @@ class SplatsEngine(bpy.types.RenderEngine):  # type: ignore[misc]
         """Values (H, W, channels) of each pass, top row first. view_name: of a stereo image, or
         empty."""
         scene = depsgraph.scene
-        camera = self._camera(depsgraph, border, view_name)
+        view = self._view(depsgraph, border, view_name)
         layers = all_layers(depsgraph, SplatCache())
         self.update_stats("", f"{sum(len(layer.splats) for layer in layers)} splats")
         held_out = any(layer.holdout for layer in layers)
         shown = [layer.painted(0.0) if layer.holdout else layer for layer in layers]
-        image = self._image(shown, camera)
+        image = self._image(shown, view)
         hidden = np.zeros_like(image.alpha)
         if held_out:  # white where splats are seen, black where holdouts hide them
             white = [layer.painted(0.0 if layer.holdout else 1.0) for layer in layers]
-            hidden = np.clip(image.alpha - self._image(white, camera).rgb[0], 0, image.alpha)
-        view = inverse_view(scene)
-        if view is None and needs_inverse(scene):
+            hidden = np.clip(image.alpha - self._image(white, view).rgb[0], 0, image.alpha)
+        inverse = inverse_view(scene)
+        if inverse is None and needs_inverse(scene):
             problem = "The view transform could not be measured in time and changes colors"
             self.report({"WARNING"}, f"{problem}; render again, or choose Standard")
         assert image.depth is not None
@@ -154,12 +154,12 @@ class SplatsEngine(bpy.types.RenderEngine):  # type: ignore[misc]
         covered = image.alpha - hidden >= threshold
         background = scene_background(scene)
         return {
-            "Combined": combined(image.rgb, image.alpha, background, view, hidden),
+            "Combined": combined(image.rgb, image.alpha, background, inverse, hidden),
             "Depth": np.where(covered, image.depth, BACKGROUND_DEPTH)[..., None],
         }
 
-    def _camera(self, depsgraph: Any, border: tuple[int, int, int, int], view_name: str) -> Camera:
-        """The scene's camera, or the eye of it, or the camera, that a view is seen by."""
+    def _view(self, depsgraph: Any, border: tuple[int, int, int, int], view_name: str) -> View:
+        """Of the scene's camera, or the eye of it, or the camera, that a view is seen by."""
         scene = depsgraph.scene
         eye = None
         camera = view_camera(scene, view_name)
@@ -169,13 +169,13 @@ class SplatsEngine(bpy.types.RenderEngine):  # type: ignore[misc]
             eye = Eye(pose, self.camera_shift_x(camera))
         evaluated = camera.evaluated_get(depsgraph) if camera is not None else None
         size = self.resolution_x, self.resolution_y
-        return render_camera(evaluated, depsgraph, *size, border, eye)
+        return camera_view(render_camera(evaluated, depsgraph, *size, border, eye), evaluated)
 
-    def _image(self, layers: list[SceneLayer], camera: Camera) -> ComposedImage:
-        image = draw_image(layers, camera, partial(self.report, {"WARNING"}))
+    def _image(self, layers: list[SceneLayer], view: View) -> ComposedImage:
+        image = draw_image(layers, view, partial(self.report, {"WARNING"}))
         if image is None:
-            posed = [layer.posed(camera.position) for layer in layers]
-            image = _rasterizer.compose(posed, camera, with_depth=True)
+            posed = [in_range(layer.posed(view.camera.position), view) for layer in layers]
+            image = _rasterizer.compose(posed, view.camera, with_depth=True)
             if _rasterizer.failure:
                 self.report({"WARNING"}, _rasterizer.failure)
         return image
@@ -186,6 +186,12 @@ class SplatsEngine(bpy.types.RenderEngine):  # type: ignore[misc]
     def view_draw(self, context: Any, depsgraph: Any) -> None:
         self._viewport.draw(context, depsgraph)
         self.update_stats("", display.problem if display.failed else self._viewport.error)
+
+
+def camera_view(camera: Camera, evaluated: Any) -> View:
+    """A camera's view within the clip distances of an evaluated camera object."""
+    data = evaluated.data
+    return View(camera, max(NEAR_M, data.clip_start), data.clip_end)
 
 
 def view_camera(scene: Any, view_name: str) -> Any:
@@ -207,7 +213,7 @@ _told: set[str] = set()
 
 
 def draw_image(
-    layers: list[SceneLayer], camera: Camera, warn: Warn = log_warning
+    layers: list[SceneLayer], view: View, warn: Warn = log_warning
 ) -> ComposedImage | None:
     """A final image drawn by the GPU; None where Blender has no context of it, or the GPU fails,
     which is told once."""
@@ -215,7 +221,7 @@ def draw_image(
         return None
     try:
         renderer = SplatRenderer()
-        renderer.draw(layers, View(camera))
+        renderer.draw(layers, view)
         return renderer.read()
     except Exception as error:  # of many kinds, by device and version
         reason = f"Splats are not drawn by Blender's GPU module ({error})"

@@ -251,8 +251,10 @@ def evaluated_splats(depsgraph: Any, cache: SplatCache, to_file: np.ndarray) -> 
 
 
 def with_heads(scene: Any) -> list[Any]:
-    """The scene's splat objects and the heads that they follow, for `kept_evaluated`."""
-    shown = [each for each in scene.objects if each.get(tags.KIND) == tags.SPLATS]
+    """The splat objects of the scene and its background, and the heads that they follow, for
+    `kept_evaluated`."""
+    objects = [each for own in (scene, *_background_scenes(scene)) for each in own.objects]
+    shown = [each for each in objects if each.get(tags.KIND) == tags.SPLATS]
     heads = []
     for each in shown:
         with suppress(StgaError):  # it has lost its modifier
@@ -289,17 +291,34 @@ def _visible_objects(
     """The object of the view layer, itself or the instance of it, and its world matrix, of those
     that are visible. is_asked: asked first, because all else takes longer. view: as of
     `visible_layers`."""
-    layer = depsgraph.view_layer
-    if view is None:
-        visible = _rendered_objects(layer.layer_collection, depsgraph, is_asked)
-    else:
-        asked = filter(is_asked, layer.objects)
-        visible = [each for each in asked if each.visible_get(viewport=view)]
+    visible = list[Any]()
+    for layer in shown_view_layers(depsgraph):
+        if view is None:
+            visible += _rendered_objects(layer.layer_collection, depsgraph, is_asked)
+        elif layer == depsgraph.view_layer or view.local_view is None:
+            how = {"view_layer": layer, "viewport": view}
+            visible += [each for each in filter(is_asked, layer.objects) if each.visible_get(**how)]
     return [
         (owner, each, matrix)
-        for owner in visible
+        for owner in dict.fromkeys(visible)
         for each, matrix in _with_instances(owner, depsgraph, Matrix(), is_asked)
     ]
+
+
+def shown_view_layers(depsgraph: Any) -> list[Any]:
+    """The depsgraph's view layer, and that which Blender shows of each background scene."""
+    layers = [depsgraph.view_layer]
+    for scene in _background_scenes(depsgraph.scene):
+        layers.append(next((each for each in scene.view_layers if each.use), scene.view_layers[0]))
+    return layers
+
+
+def _background_scenes(scene: Any) -> list[Any]:
+    """The background scene of a scene, that of this one, and so on."""
+    found = list[Any]()
+    while (scene := scene.background_set) is not None and scene not in found:
+        found.append(scene)
+    return found
 
 
 def _rendered_objects(layer: Any, depsgraph: Any, is_asked: Callable[[Any], bool]) -> list[Any]:
@@ -332,14 +351,16 @@ def _with_instances(
 def _is_seen(owner: Any, instance: Any, depsgraph: Any) -> bool:
     """Whether the camera sees an object of a final image, which is an instance of `owner`."""
     evaluated = [each.evaluated_get(depsgraph) for each in (owner, instance)]
-    is_indirect = owner.indirect_only_get(view_layer=depsgraph.view_layer)
+    layers = shown_view_layers(depsgraph)
+    is_indirect = any(owner.indirect_only_get(view_layer=layer) for layer in layers)
     return not is_indirect and all(each.visible_camera for each in evaluated)
 
 
 def _is_holdout(owner: Any, instance: Any, depsgraph: Any) -> bool:
     """Whether an object of a final image hides what it covers, by its collections or its own."""
     evaluated = [each.evaluated_get(depsgraph) for each in (owner, instance)]
-    is_masked = owner.holdout_get(view_layer=depsgraph.view_layer)
+    layers = shown_view_layers(depsgraph)
+    is_masked = any(owner.holdout_get(view_layer=layer) for layer in layers)
     return is_masked or any(each.is_holdout for each in evaluated)
 
 

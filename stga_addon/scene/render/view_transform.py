@@ -17,7 +17,6 @@ from ..light import world_light
 
 DATA_VIEWS = ("Raw", "False Color", "Log", "Filmic Log")
 """View transforms that show data instead of colors; they are left alone."""
-# samples along an axis of the table measured, and of its inverse
 GRID = 41
 """Samples along an axis of the table measured."""
 INVERSE_GRID = 25
@@ -26,6 +25,10 @@ DARKEST = -14.0
 """Log2 of the darkest scene-linear sample after 0."""
 BRIGHTEST = 6.0
 """Log2 of the brightest one."""
+RAMP = 1024
+"""Grays that are measured first, evenly spread in log2, to place the samples between them."""
+STEP_WEIGHT = 0.5
+"""Weight of steps of the shown gray against steps in log2 where samples are placed."""
 INVERSE_STEPS = 15
 """Damped Gauss-Newton steps to a color of the inverse."""
 MAX_STEP = 4
@@ -50,8 +53,9 @@ class InverseView:
         target = np.stack(np.meshgrid(nodes, nodes, nodes, indexing="ij"), -1).reshape(-1, 3)
         # Places in samples that show `target` best, by damped Gauss-Newton steps.
         last = len(axis) - 1
-        gray = np.maximum.accumulate(np.einsum("iiic->i", shown) / 3)
-        place = np.interp(target, gray, np.arange(last + 1))
+        grays = np.maximum.accumulate(np.einsum("iiic->ci", shown), axis=1)
+        by_channel = zip(target.T, grays, strict=True)
+        place = np.stack([np.interp(t, gray, np.arange(last + 1)) for t, gray in by_channel], 1)
         slopes = np.stack(np.gradient(shown, axis=(0, 1, 2)), -1).reshape(*shown.shape[:3], 9)
         for _ in range(INVERSE_STEPS):
             rest = interpolate(shown, place) - target
@@ -120,9 +124,7 @@ def measure(scene: Any) -> None:
 
     def work() -> None:
         try:
-            stops = np.linspace(DARKEST, BRIGHTEST, GRID - 1) - scene.view_settings.exposure
-            axis = np.append(0, 2**stops)
-            _keep(key, InverseView(axis, _shown(scene, axis)))
+            _keep(key, _inverse(scene))
         finally:
             measured.set()
 
@@ -144,21 +146,50 @@ def _keep(key: tuple[Any, ...], view: InverseView) -> None:
 def _settings(scene: Any) -> tuple[Any, ...]:
     """What the view transform depends on, less the display device."""
     view = scene.view_settings
-    scalars = [each for each in view.bl_rna.properties if each.type in {"BOOLEAN", "FLOAT", "ENUM"}]
-    names = [each.identifier for each in scalars if not getattr(each, "is_array", False)]
-    curves = view.curve_mapping.curves if view.use_curve_mapping else ()
-    points = [tuple(point.location) for curve in curves for point in curve.points]
-    return working_space(), *(getattr(view, name) for name in names), *points
+    settings = _scalars(view)
+    if view.use_curve_mapping:
+        curves = view.curve_mapping
+        settings += [*_scalars(curves), *curves.black_level, *curves.white_level]
+        points = [point for curve in curves.curves for point in curve.points]
+        settings += [(*point.location, point.handle_type) for point in points]
+    return working_space(), *settings
 
 
-def _shown(scene: Any, axis: np.ndarray) -> np.ndarray:
-    """(G, G, G, 3) sRGB 0…1 that an sRGB display shows of scene-linear colors of `axis` (G,)."""
-    size = len(axis)
-    pixels = np.ones((size, size, size, 4), np.float32)
-    pixels[..., :3] = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), -1)
+def _scalars(data: Any) -> list[Any]:
+    """The values of its properties that are one number, switch or name."""
+    every = [each for each in data.bl_rna.properties if each.type in {"BOOLEAN", "FLOAT", "ENUM"}]
+    names = [each.identifier for each in every if not getattr(each, "is_array", False)]
+    return [getattr(data, name) for name in names]
+
+
+def _inverse(scene: Any) -> InverseView:
+    axis = _axis(scene)
+    grid = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), -1)
+    shown = _shown(scene, grid.reshape(GRID**2, GRID, 3))
+    return InverseView(axis, shown.reshape(grid.shape))
+
+
+def _axis(scene: Any) -> np.ndarray:
+    """(GRID,) scene-linear samples, ascending from 0: denser where grays are shown that differ
+    more, as just above the black level of curves."""
+    stops = np.linspace(DARKEST, BRIGHTEST, RAMP - 1) - scene.view_settings.exposure
+    ramp = np.append(0, 2**stops)
+    shown = _shown(scene, np.repeat(ramp[None, :, None], 3, axis=2))[0]
+    steps = np.abs(np.diff(shown, axis=0)).max(axis=1)
+    even = np.full(len(steps), 1 / len(steps))
+    total = np.cumsum(even + STEP_WEIGHT * steps / max(steps.sum(), 1e-12))
+    place = np.interp(np.linspace(0, total[-1], GRID), np.append(0, total), np.arange(RAMP))
+    return np.interp(place, np.arange(RAMP), ramp)
+
+
+def _shown(scene: Any, linear: np.ndarray) -> np.ndarray:
+    """(H, W, 3) sRGB 0…1 that an sRGB display shows of scene-linear colors (H, W, 3)."""
+    height, width, _ = linear.shape
+    pixels = np.ones((height, width, 4), np.float32)
+    pixels[..., :3] = linear
     copy = scene.copy()
     settings = copy.render.image_settings
-    images = [bpy.data.images.new("view transform", size * size, size, float_buffer=True)]
+    images = [bpy.data.images.new("view transform", width, height, float_buffer=True)]
     try:
         images[0].colorspace_settings.name = working_space()
         images[0].pixels.foreach_set(pixels.ravel())

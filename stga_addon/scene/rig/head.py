@@ -329,7 +329,7 @@ def _draw_at_skin(rig: Any, basis: np.ndarray, weights: np.ndarray, joints: np.n
         sides = [(end, 2 + k, 2 + (k + 1) % 4) for end in (0, 1) for k in range(4)]
         mesh.from_pydata([(0, 0, 0), (0, 1, 0), *ring], [], sides)
         shape = bpy.data.objects.new(BONE_SHAPE, mesh)  # in no collection
-        shape.hide_viewport = shape.hide_render = True  # but in one where the head is appended
+        shape.hide_viewport = shape.hide_render = True
     for name in ("jaw", "left_eye", "right_eye"):
         joint = JOINTS.index(name)
         bone = rig.pose.bones[name]
@@ -341,6 +341,14 @@ def _draw_at_skin(rig: Any, basis: np.ndarray, weights: np.ndarray, joints: np.n
             bone.use_custom_shape_bone_size = False
             bone.custom_shape_scale_xyz = (tip.length,) * 3
             bone.custom_shape_rotation_euler = tip.to_track_quat("Y", "Z").to_euler()
+
+
+def bone_shapes(rig: Any) -> list[Any]:
+    """The objects that the bones of an armature object are drawn by, as far as `add_rig` made
+    them."""
+    bones = rig.pose.bones if rig.pose is not None else ()
+    drawn = {bone.custom_shape for bone in bones} - {None}
+    return [each for each in drawn if each.data.name.startswith(BONE_SHAPE)]
 
 
 def _new_shape_key(

@@ -58,6 +58,9 @@ BACK_REACH = (0.02, 0.98)
 """Quantiles of the positions across a torso between which its width lies."""
 BACK_GAP_VOXELS = 1.5
 """Depth of the back at the torso's sides."""
+BACK_SIDE = 0.5
+"""Distance from the middle, as a fraction of half of the width, from which a front has the color of
+its back: a collar is lower in front than behind."""
 
 
 @dataclass(frozen=True)
@@ -211,7 +214,7 @@ def _round_back(
 ) -> tuple[np.ndarray, np.ndarray]:
     """The neutral vertices (V, 3), those of the triangles `front` (F,) bool moved into the back of
     an elliptic torso as wide as these; at each of these triangles' heights, the median color (M, 3)
-    of the front's colors (F, 3)."""
+    of the front's sides, of colors (F, 3)."""
     across, up, ahead = at.axes
     reach_m = BACK_LEVELS * at.unit
     places = np.array(capture.neutral, np.float64)
@@ -219,14 +222,23 @@ def _round_back(
     triangles = places[capture.faces[front]].mean(1) - at.eyes
     width = triangles @ across
     level = triangles @ up
+
+    def around(y: float) -> tuple[np.ndarray, float, float]:
+        """Triangles (N,) bool near a height; the middle and the half of their width."""
+        near = abs(level - y) < reach_m
+        low, high = np.quantile(width[near] if near.any() else width, BACK_REACH)
+        return near, (low + high) / 2, max((high - low) / 2, 1e-9)
+
     behind = np.empty(len(vertices))
     for row, (x, y) in enumerate((places[vertices] - at.eyes) @ np.stack([across, up], 1)):
-        around = abs(level - y) < reach_m
-        low, high = np.quantile(width[around] if around.any() else width, BACK_REACH)
-        half = max((high - low) / 2, 1e-9)
-        beside = min(abs(x - (high + low) / 2) / half, 1)
+        _, middle, half = around(y)
+        beside = min(abs(x - middle) / half, 1)
         behind[row] = BACK_SHARE * half * np.sqrt(1 - beside**2)
     behind += BACK_GAP_VOXELS * voxel_size(places)
     places[vertices] -= behind[:, None] * ahead
-    median_color = [np.median(color[front][abs(level - y) < reach_m], axis=0) for y in level]
-    return places, np.array(median_color)
+    usual = np.empty((len(level), 3))
+    for row, y in enumerate(level):
+        near, middle, half = around(y)
+        beside = near & (abs(width - middle) > BACK_SIDE * half)
+        usual[row] = np.median(color[front][beside if beside.any() else near], axis=0)
+    return places, usual

@@ -53,19 +53,6 @@ EAR_ANGLE_DEG = 90.0
 """Angle of the ears' middle from straight ahead."""
 EAR_WIDTH_DEG = 14.0
 """Half the angle that an ear takes up."""
-BAND = 0.3
-"""Height within which the observed stretch of a region is measured."""
-MIN_BAND_TRIANGLES = 20
-"""Triangles in a band without which its stretch is not measured."""
-LEVELS = (0.04, 0.99)
-"""Quantiles of the heights at which a region is observed, between which it is a source."""
-STRETCH = (0.5, 0.9)
-"""Quantiles of the angles from straight ahead between which it is a source: its back gets the color
-of what is observed farthest back."""
-MIN_STRETCH_RAD = 0.05
-"""Narrowest range of these angles."""
-MIN_NARROWING = 0.2
-"""Least factor by which the range narrows toward the crown."""
 MIN_HAIR_CONTRAST = 0.9
 """A triangle of the scalp has hair if its color is this far from the skin's, as a fraction of the
 scalp's most different ones, in standard deviations of skin."""
@@ -207,33 +194,6 @@ def hairy_triangles(
     near = nearest_rows(centers[sources], centers[sources], SMOOTHED)
     contrast = np.quantile(contrast[near], 0.1, axis=1)
     return np.asarray(sources[contrast > MIN_HAIR_CONTRAST * np.quantile(contrast, 0.9)])
-
-
-def sources_around_head(
-    at: HeadCoordinates, sources: np.ndarray, targets: np.ndarray
-) -> np.ndarray:
-    """The source of each target: the stretch of azimuth that is seen at its height, back and forth,
-    on both sides of the head alike."""
-    angle = np.abs(at.azimuth)
-    lowest, highest = np.quantile(at.level[sources], LEVELS)
-    sources = sources[(at.level[sources] >= lowest) & (at.level[sources] <= highest)]
-    level = np.clip(at.level[targets], lowest, highest)
-    near = cKDTree(at.level[sources, None])
-    members = near.query_ball_point(level[:, None], BAND)
-    low, high = np.empty((2, len(targets)))
-    for n, rows in enumerate(members):
-        seen = angle[sources[rows]] if len(rows) >= MIN_BAND_TRIANGLES else angle[sources]
-        low[n], high[n] = np.quantile(seen, STRETCH)
-    width = np.maximum(high - low, MIN_STRETCH_RAD)
-    beyond = (angle[targets] - high) % (2 * width)
-    back = np.where(beyond < width, high - beyond, low + beyond - width)
-    wanted = np.where(angle[targets] > high, back, np.clip(angle[targets], low, high))
-    stretch = np.maximum(np.cos(at.elevation), MIN_NARROWING)
-    # along the head, that is, which is narrower at the top
-    places = np.stack([at.level, stretch * angle], 1)
-    goals = np.stack([level, stretch[targets] * wanted], 1)
-    _, nearest = cKDTree(places[sources]).query(goals)
-    return np.asarray(sources[nearest])
 
 
 def inside_colors(

@@ -11,18 +11,17 @@ from ...capture.model import Capture, View, evenly_spread, views_by_timestep
 from .initial_splats import mean_colors, mirror_images
 from .semantic_regions import (
     BROWS_LEVEL,
-    SMOOTHED,
     HeadCoordinates,
+    ears_of,
     face_of,
     hairy_triangles,
     inside_colors,
     lining_of,
     nearest_rows,
     skin_of,
-    sources_around_head,
     teeth_of,
 )
-from .surface import FACING_TIMESTEPS, GRAZING_COSINE, UNSEEN_COSINE, Surface
+from .surface import FACING_TIMESTEPS, UNSEEN_COSINE, Surface
 
 SPREAD_VIEWS = 12
 """Training views, spread over all, whose colors are measured."""
@@ -31,9 +30,11 @@ OPEN_VIEWS = 6
 MIN_TEETH_SHARE = 0.04
 """Of the pixels that show the mouth, that teeth fill at least; a slit between lips is as well one
 of the mesh alone."""
-SOURCE_COSINE = 0.5
-"""Cosine between a triangle and a camera below which others do not take its color, which may
-contain a matte's edge."""
+SOURCE_COSINE = 0.25
+"""Cosine between a triangle and the camera that it faces most above which others take its color:
+hair at the temples and a beard beside the jaw are seen from 60 to 75° aside at most."""
+WELL_SHOWN_COSINE = 0.5
+"""The same above which a face is shown better than its mirror image could tell."""
 FRINGE_COSINE = 0.2
 """The same for the scalp, which takes the color of a fringe where it is not visible itself."""
 FRINGE_SHARE = 0.2
@@ -41,18 +42,19 @@ FRINGE_SHARE = 0.2
 MIN_SHOWN_SHARE = 0.1
 """Fraction of the median of the pixels that show as much of the surface, below which it is not
 visible: a folded eyelid has less."""
+NEAREST = 24
+"""Visible triangles of whose colors a hidden one has the median."""
 SOURCE_TRIANGLES = 100
-"""Of whose colors a hidden triangle has the median."""
-MAX_LIGHT_RATIO = 2.0
-"""Of the light on one side of a face to that on the other."""
-SMOOTHING = {"scalp": (SMOOTHED, 1.0), "body": (2 * SMOOTHED, 3.0)}
-"""Triangles over which copied colors are smoothed, and by how much those above and below count as
-farther than those beside: collars are level, and shadows of a chin are on the neck's front only."""
-SOFTENING_FACTOR = 4
-"""Triangles over which colors are softened, in multiples of those they are smoothed over."""
+"""Triangles over which the light on a side of the face, and hair's color off axis, are medians, and
+over which unseen colors are softened."""
+LEVEL_WEIGHT = 3.0
+"""By how much shown triangles of neck and shoulders above and below a hidden one count as farther
+than those beside it: collars are level, and a chin's shadow is on a neck's front only."""
 SAME_COLOR_DEVIATION = 0.12
 """Largest difference in 0…1 of colors that differ by their shade alone: collars and hairlines stay
 sharp."""
+MAX_LIGHT_RATIO = 2.0
+"""Of the light on one side of a face to that on the other."""
 SHOWN_COSINE = 0.5
 """Cosine between a triangle and the camera that it faces most above which its color depends on no
 view."""
@@ -83,59 +85,56 @@ class UnseenSides:
 
 
 def unseen_sides(surface: Surface) -> UnseenSides:
-    """Triangles that no camera looks at, and of few cameras those of the face that turn away, look
-    as their mirror images that are shown well; of scalp, neck and shoulders else as shown ones of
-    their height, back and forth around the head, smoothed over those around; any other as the
-    nearest connected ones. What views show looks as there."""
+    """Triangles that no camera looks at. They look as the nearest that views show, on either side
+    of the head: those on the other side as their mirror images, in the light of this one. Hair has
+    one color where no view shows it, and ears look as ears. What views show looks as there, but for
+    faces of few cameras, which look as their mirror images where these are shown better."""
     capture = surface.capture
     cosine = surface.facing
     is_outside = surface.outside
     color, pixels = mean_colors(capture, _color_views(capture))
     density = pixels / np.maximum(face_areas(capture.neutral, capture.faces), MIN_DIVISOR)
-    facing = density[cosine > SOURCE_COSINE]
+    facing = density[cosine > WELL_SHOWN_COSINE]
     median = np.median(facing[facing > 0]) if facing.any() else 0.0
     shown = density > MIN_SHOWN_SHARE * median
     is_source = (pixels > 0) & is_outside & (cosine > SOURCE_COSINE) & ~surface.lids
-    sources = np.flatnonzero(is_source)
-    if not len(sources):
+    if not is_source.any():
         none = np.zeros_like(shown)
         return UnseenSides(none, shown, color, none, none.astype(float), color)
-    unseen = is_outside & (cosine < GRAZING_COSINE)
-    centers = np.asarray(capture.neutral)[capture.faces].mean(1)
-    found = _as_nearest(capture, color, sources, unseen | ~shown | surface.lids)
+    unseen = is_outside & (cosine < SOURCE_COSINE)
+    well_shown = is_source & (cosine > WELL_SHOWN_COSINE)
+    hair = _hair(surface, color, pixels > 0, is_source)
+    sides = _Sides(surface, color, well_shown, hair)
+    hidden = unseen | ~shown | surface.lids
+    found = color.copy()
+    ears = np.zeros_like(shown) if surface.at is None else ears_of(surface.at)
+    found[hidden] = sides.nearest(is_source & ~ears, hidden)
     turned = np.where(is_outside, surface.turned_from(SHOWN_COSINE), 0.0)
     off_axis = color.copy()
-    turns_away = np.zeros_like(shown)
-    hair = np.full(3, np.inf)
     is_hair = np.zeros_like(shown)
-    at = surface.at
-    if at is not None:
-        kinds = surface.kinds
-        of_face = is_outside & ~kinds["scalp"] & ~kinds["body"]
-        turns_away = of_face & (cosine < SOURCE_COSINE) & surface.has_few_cameras
-        is_skin = of_face & is_source & (at.level < BROWS_LEVEL)
-        for kind, members in kinds.items():
-            own = np.flatnonzero(members & is_source)
-            if kind == "scalp":
-                if not len(own):
-                    own = _fringe(at, is_outside & (pixels > 0) & (cosine > FRINGE_COSINE))
-                own = hairy_triangles(own, centers, color, color[is_skin])
-            if kind == "scalp" and len(own):
-                near = nearest_rows(centers[own], centers[members], SOURCE_TRIANGLES)
-                off_axis[members] = np.median(color[own[near]], axis=1)
-                is_hair |= members
-                hair = np.median(color[own], axis=0)
-            rows = np.flatnonzero(members & unseen)
-            if len(own) and len(rows):
-                copied = color[sources_around_head(at, own, rows)]
-                found[rows] = _smoothed(copied, centers[rows] @ at.axes.T, SMOOTHING[kind])
-    hidden, mirrored = _mirrored_colors(surface, color, unseen | turns_away, is_source, hair)
-    found[hidden] = mirrored
-    shown[hidden] = False
+    may_be_mirrored = unseen.copy()
+    if surface.at is not None:
+        kinds = {"body": surface.kinds["body"], "ears": ears}
+        for kind, own in kinds.items():
+            if (own & is_source).any() and (own & hidden).any():
+                is_level = kind == "body"
+                found[own & hidden] = sides.nearest(own & is_source, own & hidden, is_level)
+        found[unseen] = sides.softened(found, unseen)
+        if surface.has_few_cameras:
+            may_be_mirrored |= sides.of_face & is_outside & (cosine < WELL_SHOWN_COSINE)
+        scalp = surface.kinds["scalp"]
+        if len(hair):
+            near = nearest_rows(sides.centers[hair], sides.centers[scalp], SOURCE_TRIANGLES)
+            off_axis[scalp] = np.median(color[hair[near]], axis=1)
+            is_hair = scalp.copy()
+            found[scalp & unseen] = np.median(color[hair], axis=0)
+    rows, mirrored = sides.mirrored(may_be_mirrored, well_shown)
+    found[rows] = mirrored
+    shown[rows] = False
     inside = _unseen_inside(capture, pixels > 0, is_outside) | _unseen_teeth(capture, pixels, shown)
     within = inside | (~is_outside & ~shown)
     found[within] = inside_colors(capture, color, shown, within)
-    lids, of_skin = _lid_colors(surface, is_source, color)
+    lids, of_skin = _lid_colors(surface, well_shown, color)
     found[lids] = of_skin
     shown[lids] = False
     triangles = (is_outside & (cosine < UNSEEN_COSINE)) | inside
@@ -153,64 +152,106 @@ def plausible_off_axis(splats: Splats, along: np.ndarray, sides: UnseenSides) ->
     return colored_off_axis(splats, along[face], share, sides.off_axis[face])
 
 
-def _smoothed(color: np.ndarray, places: np.ndarray, smoothing: tuple[int, float]) -> np.ndarray:
-    """Colors (N, 3), of each the median of those around it, as SMOOTHING has it, and of such
-    medians the mean of similar ones: what is copied from a lit and a shaded side would have
-    patches of both. places (N, 3) to the head's left, up and ahead."""
-    count, level_weight = smoothing
-    places = places * [1, level_weight, 1]
-    median = np.median(color[nearest_rows(places, places, count)], axis=1)
-    around = median[nearest_rows(places, places, SOFTENING_FACTOR * count)]
-    difference = (around - median[:, None]) / SAME_COLOR_DEVIATION
-    weight = np.exp(-(difference**2).sum(2, keepdims=True) / 2)
-    return np.asarray((weight * around).sum(1) / weight.sum(1))
-
-
-def _as_nearest(
-    capture: Capture, color: np.ndarray, sources: np.ndarray, hidden: np.ndarray
+def _hair(
+    surface: Surface, color: np.ndarray, has_pixels: np.ndarray, is_source: np.ndarray
 ) -> np.ndarray:
-    """Colors (F, 3), those of `hidden` triangles (F,) bool as of the nearest sources (M,), of the
-    same connected part where it has any."""
-    found = color.copy()
-    centers = np.asarray(capture.neutral)[capture.faces].mean(1)
-    part = connected_parts(len(capture.neutral), capture.faces)[capture.faces[:, 0]]
-    for number in np.unique(part[hidden]):
-        rows = np.flatnonzero(hidden & (part == number))
-        own = sources[part[sources] == number] if (part[sources] == number).any() else sources
-        near = nearest_rows(centers[own], centers[rows], SOURCE_TRIANGLES)
-        found[rows] = np.median(color[own[near]], axis=1)
-    return found
+    """Triangles (M,) that show hair; of a head of which only a fringe is shown, that one."""
+    at = surface.at
+    if at is None:
+        return np.zeros(0, int)
+    scalp = surface.kinds["scalp"]
+    rows = np.flatnonzero(scalp & is_source)
+    if not len(rows):
+        rows = _fringe(at, surface.outside & has_pixels & (surface.facing > FRINGE_COSINE))
+    is_skin = is_source & ~scalp & ~surface.kinds["body"] & (at.level < BROWS_LEVEL)
+    centers = np.asarray(surface.capture.neutral)[surface.capture.faces].mean(1)
+    return hairy_triangles(rows, centers, color, color[is_skin])
 
 
-def _mirrored_colors(
-    surface: Surface,
-    color: np.ndarray,
-    unseen: np.ndarray,
-    is_source: np.ndarray,
-    hair: np.ndarray,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Unseen triangles whose mirror images are sources, and what they look like (N, 3): those of
-    the face in the light of their own side, as the nearest that are shown on both sides tell it;
-    what looks rather like hair (3,) stays as it is, as does the hair around."""
-    capture = surface.capture
-    hidden, partner = mirror_images(capture, unseen, is_source)
-    found = color[partner]
-    if surface.at is None:
-        return hidden, found
-    is_face = ~surface.kinds["scalp"] & ~surface.kinds["body"]
-    both, opposite = mirror_images(capture, is_source & is_face, is_source & is_face)
-    if not len(both):
-        return hidden, found
-    away_from_hair = np.linalg.norm(found - hair, axis=1)
-    away_from_skin = np.linalg.norm(found - np.median(color[both], axis=0), axis=1)
-    rows = np.flatnonzero(is_face[hidden] & (away_from_skin < away_from_hair))
-    if len(rows):
-        centers = np.asarray(capture.neutral)[capture.faces].mean(1)
-        near = nearest_rows(centers[both], centers[hidden[rows]], SOURCE_TRIANGLES)
-        here, there = (np.median(color[own[near]], axis=1) for own in (both, opposite))
+class _Sides:
+    """Colors of a surface's triangles by those that are shown on either side of the head."""
+
+    def __init__(
+        self, surface: Surface, color: np.ndarray, well_shown: np.ndarray, hair: np.ndarray
+    ) -> None:
+        capture = surface.capture
+        self._capture = capture
+        self._color = color
+        self.centers = np.asarray(capture.neutral, np.float64)[capture.faces].mean(1)
+        self.of_face = np.zeros_like(well_shown)
+        if surface.at is not None:
+            self.of_face = ~surface.kinds["scalp"] & ~surface.kinds["body"]
+            up = surface.at.axes[1]
+            self._raised = self.centers + np.outer((LEVEL_WEIGHT - 1) * (self.centers @ up), up)
+        self._hair = np.median(color[hair], axis=0) if len(hair) else np.full(3, np.inf)
+        own = well_shown & self.of_face
+        self._skin = np.median(color[own], axis=0) if own.any() else np.zeros(3)
+        self._both = mirror_images(capture, own, own)
+
+    def nearest(
+        self, sources: np.ndarray, hidden: np.ndarray, is_level: bool = False
+    ) -> np.ndarray:
+        """Colors (N, 3) of the triangles `hidden` (F,) bool: medians of those of the NEAREST
+        sources (F,) bool or mirror images of these, of the same connected part where it has
+        any. is_level: whether those above and below count as farther (LEVEL_WEIGHT)."""
+        centers = self._raised if is_level else self.centers
+        part = connected_parts(len(self._capture.neutral), self._capture.faces)
+        part = part[self._capture.faces[:, 0]]
+        own = np.flatnonzero(sources)
+        partner, image = mirror_images(self._capture, np.ones_like(sources), sources)
+        places = centers[np.concatenate([own, partner])]
+        colors = np.concatenate([self._color[own], self._in_light(partner, image)])
+        parts = part[np.concatenate([own, partner])]
+        found = self._color.copy()
+        for number in np.unique(part[hidden]):
+            rows = np.flatnonzero(hidden & (part == number))
+            known = parts == number
+            if not known.any():
+                known[:] = True
+            near = nearest_rows(places[known], centers[rows], NEAREST)
+            found[rows] = np.median(colors[known][near], axis=1)
+        return np.asarray(found[hidden])
+
+    def softened(self, color: np.ndarray, hidden: np.ndarray) -> np.ndarray:
+        """Colors (N, 3) of the triangles `hidden` (F,) bool, of colors (F, 3): means of similar
+        ones around. What is copied from a lit and a shaded side would have patches of both."""
+        own = color[hidden]
+        around = own[nearest_rows(self.centers[hidden], self.centers[hidden], SOURCE_TRIANGLES)]
+        difference = (around - own[:, None]) / SAME_COLOR_DEVIATION
+        weight = np.exp(-(difference**2).sum(2, keepdims=True) / 2)
+        return np.asarray((weight * around).sum(1) / weight.sum(1))
+
+    def mirrored(self, hidden: np.ndarray, shown: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Which of the triangles `hidden` (F,) bool have mirror images that are `shown`, and their
+        colors (N, 3)."""
+        rows, image = mirror_images(self._capture, hidden, shown)
+        return rows, self._in_light(rows, image)
+
+    def _in_light(self, rows: np.ndarray, image: np.ndarray) -> np.ndarray:
+        """Colors (N, 3) of mirror images, those of the face in the light of the side of `rows`, as
+        the nearest that are shown on both sides tell it."""
+        found = self._color[image]
+        both, opposite = self._both
+        away = (np.linalg.norm(found - usual, axis=1) for usual in (self._skin, self._hair))
+        from_skin, from_hair = away
+        own = np.flatnonzero(self.of_face[rows] & (from_skin < from_hair))
+        if not len(both) or not len(own):
+            return np.asarray(found)
+        near = nearest_rows(self.centers[both], self.centers[rows[own]], SOURCE_TRIANGLES)
+        here, there = (np.median(self._color[side[near]], axis=1) for side in (both, opposite))
         gain = here / np.maximum(there, MIN_DIVISOR)
-        found[rows] *= np.clip(gain, 1 / MAX_LIGHT_RATIO, MAX_LIGHT_RATIO)
-    return hidden, np.clip(found, 0, 1)
+        found[own] *= np.clip(gain, 1 / MAX_LIGHT_RATIO, MAX_LIGHT_RATIO)
+        return np.clip(found, 0, 1)
+
+
+def plausible_aside(splats: Splats, along: np.ndarray, sides: UnseenSides) -> Splats:
+    """Splats that views show along one direction only, that of their triangle (F, 3), with what is
+    plausible off-axis: hair, and of the rest what lies on it, not what hangs before it."""
+    face = splats.face
+    share = OFF_AXIS_WEIGHT * sides.view_dependence[face]
+    share[splats.unbound & ~sides.is_hair[face]] = 0
+    share[sides.triangles[face]] = 0  # they have one color from everywhere, and hair its locks
+    return colored_off_axis(splats, along[face], share, sides.off_axis[face])
 
 
 def _lid_colors(

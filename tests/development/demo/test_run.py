@@ -1,12 +1,15 @@
 """Demo with few of its capture's images: scene, selection, training, splats."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from PIL import Image
 
 from stga_addon.avatar.file import read_avatar
+from stga_addon.cli.commands import COMMANDS
+from stga_addon.cli.main import main
 from stga_addon.development.demo import run
 from stga_addon.development.demo.capture import unpack_capture
 from stga_addon.files import read_json, write_json
@@ -70,3 +73,25 @@ def test_demo(tmp_path, monkeypatch):
             "the viewport looks beside the head"
         )
         assert region.view_distance < 1, "the head is a dot on Blender's grid"
+
+
+@pytest.mark.parametrize(
+    ("given", "budget"),
+    [
+        ([], {"iterations": 300}),
+        (["--iterations", "40"], {"iterations": 40}),
+        (["--budget", "90s"], {"seconds": 90.0}),
+    ],
+)
+def test_the_demos_budget_is_iterations(given, budget, monkeypatch, tmp_path):
+    """Catches a demo that is worse on a busy machine, and options that footage ignores."""
+    budgets = []
+    requests = []
+    monkeypatch.setattr(run, "run_demo", lambda out, own, device: budgets.append(own))
+    command = replace(COMMANDS["avatar"], run=lambda options, head: requests.append(options))
+    monkeypatch.setitem(COMMANDS, "avatar", command)
+    assert main(["demo", "--out", str(tmp_path), "--device", "cpu", "--footage", *given]) == 0
+    (own,) = budgets
+    assert own == budget
+    (options,) = requests
+    assert vars(options).items() >= {"iterations": None, "seconds": None, **budget}.items()

@@ -1,0 +1,428 @@
+"""Takes that one camera filmed around a still head: how they are recognized, and their footage with
+the cameras that structure from motion finds."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from pathlib import Path
+from time import monotonic
+
+import numpy as np
+
+from ..capture.camera import Camera
+from ..capture.mesh_geometry import weighted_procrustes
+from ..capture.model import evenly_spread
+from ..errors import StgaError
+from ..flame.parts import flame_model
+from ..worker.helpers import Step
+from ..worker.machine import processors
+from . import folder
+from .face_networks import FaceNetworks, PersonNetwork
+from .fit import pose_from_one_camera
+from .footage.model import Footage, FootageCamera, ImageFrames
+from .footage.open import usual_focal
+from .footage.shots import Lens, listed, undistortion
+from .footage.video import VideoFrames
+from .landmarks import read_places
+from .opened import check_place, file_state
+from .recorded import BUNDLED_PLACES
+from .sharp_frames import choose_frames, reduced_to
+from .stages import Crew, Stage
+from .structure_from_motion import (
+    SearchOptions,
+    Structure,
+    find_structure,
+    require_pycolmap,
+)
+
+MAX_PHOTOS = 60
+"""Images up to which all are used; of more, the sharpest ones of FRAMES stretches."""
+FRAMES = 40
+"""Frames of a video that get a camera: some 5° apart in half a circle."""
+MIN_IMAGES = 8
+"""Images with a camera, below which the take is not one of many cameras."""
+MIN_IMAGES_SHARE = 0.5
+"""Of the images that were looked at."""
+MIN_ON_HEAD = 30
+"""Points on the face, below which it was the room alone whose structure was found."""
+TIME_LIMIT_S = 900.0
+"""Of structure from motion."""
+MAX_THREADS = 8
+"""That COLMAP uses: each takes up to 300 MB."""
+REMEDY = (
+    "film in even light and without blur, in steps of at most 15° around a head that keeps still, "
+    "before a room with detail"
+)
+
+# Recognition
+SAMPLES = 8
+"""Frames in which the head's pose is looked at."""
+SAMPLE_SIDE_PX = 720
+"""Longer side of these frames."""
+MIN_TURN_DEG = 30.0
+"""Largest angle between two poses of the head before the camera, below which nobody walked around
+it."""
+MAX_AXIS_COSINE = -0.1
+"""Between the head's axes up and ahead and the camera's down and ahead, of a face that is seen."""
+PAIR_S = 0.5
+"""Between the two frames of a video in which the room is compared."""
+USUAL_FPS = 30.0
+"""Frames per second where a take does not say."""
+PAIR_TURN_DEG = 1.0, 25.0
+"""Turns of the head between two frames that are compared."""
+MIN_MATCHES = 8
+"""Points of the room that two frames share, for these to tell whether it moves."""
+MIN_PAIRS = 3
+"""Pairs of frames that tell it."""
+MATCH_RATIO = 0.75
+"""Lowe's ratio test."""
+FACE_MARGIN = 0.6
+"""Of the face's size, around it, which is no part of the room."""
+PERSON_PROBABILITY = 0.3
+"""From which on a pixel is no part of the room."""
+MIN_PARALLAX = 0.2
+"""Radians that the room moves behind the head for each radian by which the head turns before the
+camera; 0 of a camera that stands still, 1 − (distance of the head / distance of the room) of one
+that goes around."""
+MIN_CORRELATION = 0.6
+"""Of the room's motion with the head's turns, below which a hand shook the camera."""
+
+
+class CamerasNotFound(StgaError):
+    """Structure from motion gives no cameras; says why, and what helps."""
+
+
+@dataclass(frozen=True)
+class Recognition:
+    """What frames of a single camera say of the take.
+
+    turn_deg     largest angle between two poses of the head before the camera
+    parallax     as MIN_PARALLAX; NaN where too little of a room is seen
+    correlation  of the room's motion with the head's turns
+    """
+
+    turn_deg: float
+    parallax: float
+    correlation: float
+
+    @property
+    def turns(self) -> bool:
+        """Whether the camera saw the head from sides."""
+        return self.turn_deg >= MIN_TURN_DEG
+
+    @property
+    def is_around(self) -> bool:
+        """Whether the room turned with the head."""
+        moves = self.parallax >= MIN_PARALLAX and self.correlation >= MIN_CORRELATION
+        return self.turns and moves
+
+
+def with_found_cameras(
+    footage: Footage, out: Path, take: str, crew: Crew
+) -> tuple[Footage, tuple[str, ...]]:
+    """The footage of a single camera without a calibration, as that of a camera for each image
+    where it was filmed around a still head; and sentences about that.
+
+    out: folder of the capture, in which what an interruption leaves is kept. take: "auto",
+    "around" or "talk". Raises StgaError for a folder that is no place for a capture, and
+    CamerasNotFound for a take that is said to be one around a head.
+    """
+    if take == "talk":
+        return footage, ()
+    check_place(footage, out)
+    if take == "around":
+        found, line = _with_cameras(footage, out, crew)
+        return found, (f"take: around a still head, as given; {line}",)
+    (camera,) = footage.cameras
+    seen = _recognized(footage, camera, crew)
+    photos = isinstance(camera.frames, ImageFrames) and len(camera.timesteps) <= MAX_PHOTOS
+    enough = len(camera.timesteps) >= MIN_IMAGES
+    plain_photos = photos and seen.turns and np.isnan(seen.parallax)
+    if not enough or not (seen.is_around or plain_photos):
+        return footage, ()
+    try:
+        found, line = _with_cameras(footage, out, crew)
+    except CamerasNotFound as error:
+        warning = (
+            f"take: looks like one around a still head, but {error}. It is tracked as one of a "
+            "head that turns before a camera"
+        )
+        return replace(footage, warnings=(*footage.warnings, warning)), ()
+    why = f"the camera sees it from directions {seen.turn_deg:.0f}° apart"
+    why += "" if plain_photos else ", and the room moves with it"
+    return found, (f"take: around a still head ({why}; else give --take talk); {line}",)
+
+
+def _with_cameras(footage: Footage, out: Path, crew: Crew) -> tuple[Footage, str]:
+    """The footage with a camera for each image, and a line on these. Raises CamerasNotFound."""
+    (camera,) = footage.cameras
+    require_pycolmap(str(footage.root))
+    timesteps = _chosen(camera, crew)
+    given = footage.focal != "usual"
+    focal = camera.camera.fl_x if given else None
+    threads = min(processors(), MAX_THREADS)
+    options = SearchOptions(focal, footage.focal == "given", threads, MIN_IMAGES, MIN_ON_HEAD)
+    scratch = out / folder.KEPT_FOLDER / f"structure-{file_state(camera.frames.files)}"
+    part = (camera, timesteps, options, scratch)
+    stages = [(stage, len(timesteps)) for stage in _SEARCH_STAGES]
+    report = _Stages(crew, stages, footage)
+    found = crew.helpers.run(find_structure, part, report, keep=True, apart=True)
+    structure = Structure.of_arrays(found)
+    _require_cameras(footage, structure, len(timesteps))
+    cameras = _cameras(camera, structure)
+    count = f"{len(cameras)} of {len(timesteps)} images"
+    share = structure.on_head / structure.points
+    lens = f"focal length {structure.focal_px:.0f} px"
+    lens += f", distortion {structure.distortion:.3f}" if structure.distortion else ""
+    line = (
+        f"cameras of {count} found, {lens}, {structure.error_px:.2f} px; {share:.0%} of "
+        f"{structure.points} points are on the face"
+    )
+    line += "; the room was left out, as it did not turn with the person" * structure.masked
+    known = set(structure.timesteps.tolist())
+    lost = [camera.source(t) for t in timesteps if t not in known]
+    told = (f"no camera was found of {listed(lost)}; left out",) if lost else ()
+    warnings = (*footage.warnings, *told)
+    return replace(footage, cameras=cameras, fps=None, focal="calibration", warnings=warnings), line
+
+
+_SEARCH_STAGES = (Stage.FEATURES, Stage.MATCHES, Stage.CAMERAS)
+
+
+class _Stages:
+    """Reports the steps of work that has several stages, as (stage, steps), one after another.
+    Raises CamerasNotFound beyond TIME_LIMIT_S."""
+
+    def __init__(self, crew: Crew, stages: Sequence[tuple[Stage, int]], footage: Footage) -> None:
+        self._crew = crew
+        self._stages = stages
+        self._root = footage.root
+        self._end = monotonic() + TIME_LIMIT_S
+
+    def __call__(self, steps: int) -> None:
+        if monotonic() > self._end:
+            raise CamerasNotFound(
+                f"{self._root}: structure from motion has taken {TIME_LIMIT_S / 60:.0f} minutes; "
+                "use fewer or smaller images"
+            )
+        for stage, total in self._stages[:-1]:
+            if steps < total:
+                self._crew.report(stage, steps, total)
+                return
+            steps -= total
+        stage, total = self._stages[-1]
+        self._crew.report(stage, min(steps, total), total)
+
+
+def _chosen(camera: FootageCamera, crew: Crew) -> list[int]:
+    """Timesteps whose images get a camera."""
+    timesteps = list(camera.timesteps)
+    limit = MAX_PHOTOS if isinstance(camera.frames, ImageFrames) else FRAMES
+    if len(timesteps) <= limit:
+        return timesteps
+    total = len(timesteps)
+    found = crew.helpers.run(
+        choose_frames,
+        (camera, timesteps, FRAMES),
+        lambda steps: crew.report(Stage.FRAMES, steps, total),
+    )
+    chosen: list[int] = found["timesteps"].tolist()
+    return chosen
+
+
+def _require_cameras(footage: Footage, structure: Structure, count: int) -> None:
+    """Raise CamerasNotFound where these are too few, or of the room alone."""
+    found = len(structure.timesteps)
+    least = max(MIN_IMAGES, round(MIN_IMAGES_SHARE * count))
+    if found < least:
+        raise CamerasNotFound(
+            f"{footage.root}: structure from motion places {found} of {count} images, expected at "
+            f"least {least}; {REMEDY}"
+        )
+    if structure.on_head < MIN_ON_HEAD:
+        raise CamerasNotFound(
+            f"{footage.root}: structure from motion finds {structure.points} points, but "
+            f"{structure.on_head} on the face, expected at least {MIN_ON_HEAD}: the head moved, or "
+            f"it is blurred; {REMEDY}"
+        )
+
+
+def _cameras(camera: FootageCamera, structure: Structure) -> tuple[FootageCamera, ...]:
+    """A camera for each image that has a pose, all at one timestep."""
+    width = camera.camera.width
+    height = camera.camera.height
+    lens = Lens(radial=(structure.distortion,)) if structure.distortion else Lens()
+    digits = len(str(max(camera.timesteps)))
+    cameras = []
+    for timestep, pose in zip(structure.timesteps.tolist(), structure.poses, strict=True):
+        focal = structure.focal_px
+        world_to_camera = np.vstack([pose, [0.0, 0.0, 0.0, 1.0]])
+        recorded = Camera(width, height, focal, focal, width / 2, height / 2, world_to_camera)
+        frames = camera.frames
+        if isinstance(frames, VideoFrames):
+            masks = frames.masks and {0: frames.masks[timestep]}
+            frames = VideoFrames(frames.video, {0: frames.numbers[timestep]}, masks)
+            name = f"{timestep:0{digits}d}"
+        else:
+            view = frames.views[timestep]
+            frames = ImageFrames({0: replace(view, timestep=0, camera=recorded)})
+            name = view.image.stem
+        resampled = undistortion(recorded, lens, camera.source(timestep))
+        ideal = recorded if resampled is None else resampled.camera
+        cameras.append(FootageCamera(name, ideal, frames, resampled))
+    return tuple(cameras)
+
+
+# Recognition
+
+
+def _recognized(footage: Footage, camera: FootageCamera, crew: Crew) -> Recognition:
+    """What some of the frames say."""
+    found = crew.helpers.run(
+        recognize,
+        (camera, footage.fps),
+        lambda steps: crew.report(Stage.OPENING, steps, SAMPLES),
+    )
+    return Recognition(*found["recognition"].tolist())
+
+
+def recognize(camera: FootageCamera, fps: float | None, step: Step) -> dict[str, np.ndarray]:
+    """`Recognition` of a take as (3,)."""
+    timesteps = list(camera.timesteps)
+    sampled = evenly_spread(range(len(timesteps)), SAMPLES)
+    look = _Look(camera)
+    samples = {}
+    for number in sampled:
+        sample = look.at(timesteps[number])
+        if sample is not None:
+            samples[number] = sample
+        step()
+    turn = max(
+        (_angle_deg(a.rotation, b.rotation) for a in samples.values() for b in samples.values()),
+        default=0.0,
+    )
+    pairs = []
+    if turn >= MIN_TURN_DEG and len(timesteps) >= MIN_IMAGES:
+        if isinstance(camera.frames, ImageFrames) and len(timesteps) <= MAX_PHOTOS:
+            row = sorted(samples.values(), key=lambda sample: sample.yaw)
+            pairs = list(pairwise(row))
+        else:
+            ahead = max(1, round(PAIR_S * (fps or USUAL_FPS)))
+            for number, sample in samples.items():
+                other = min(number + ahead, len(timesteps) - 1)
+                later = look.at(timesteps[other]) if other != number else None
+                pairs += [(sample, later)] if later is not None else []
+    parallax, correlation = _parallax(pairs)
+    return {"recognition": np.array([turn, parallax, correlation])}
+
+
+@dataclass(frozen=True)
+class _Sample:
+    """A frame in which a face was found.
+
+    rotation   (3, 3) of the head, to the camera's axes
+    center     (2,) the head's middle, in units of the focal length
+    points     (K, 2) features of the room, in units of the focal length
+    described  (K, 128) what they look like
+    """
+
+    rotation: np.ndarray
+    center: np.ndarray
+    points: np.ndarray
+    described: np.ndarray
+
+    @property
+    def yaw(self) -> float:
+        """Radians by which the head looks to the side."""
+        return float(np.arctan2(self.rotation[0, 2], -self.rotation[2, 2]))
+
+
+class _Look:
+    """Looks at frames of a camera for a head's pose, and for the room behind it."""
+
+    def __init__(self, camera: FootageCamera) -> None:
+        import cv2
+
+        model = flame_model(None)
+        places, reliable = read_places(BUNDLED_PLACES, len(model.faces))
+        self._rows = np.flatnonzero(reliable)
+        self._neutral = places.on(model.v_template, model.faces)[self._rows]
+        self._middle = model.v_template.mean(0)
+        self._faces = FaceNetworks()
+        self._person = PersonNetwork()
+        self._features = cv2.SIFT.create(1000)
+        self._camera = camera
+        self._near: np.ndarray | None = None
+
+    def at(self, timestep: int) -> _Sample | None:
+        """None where the frame shows no face."""
+        import cv2
+
+        image = reduced_to(self._camera.image(timestep), SAMPLE_SIDE_PX)
+        faces = self._faces.find(image, self._near)
+        if not faces:
+            return None
+        face = self._near = faces[0]
+        height, width = image.shape[:2]
+        focal = usual_focal(width, height)
+        size = width, height
+        lens = Camera(*size, focal, focal, width / 2, height / 2, np.eye(4))
+        posed = pose_from_one_camera(lens, face[self._rows], self._neutral)
+        rotation, shift = weighted_procrustes(self._neutral, posed, np.ones(len(posed)))
+        # upright, and towards the camera; else it is none, or its pose was mirrored
+        if max(rotation[1, 1], rotation[2, 2]) > MAX_AXIS_COSINE:
+            return None
+        middle = rotation @ self._middle + shift
+        room = 255 * (self._person.probability(image) < PERSON_PROBABILITY).astype(np.uint8)
+        margin = FACE_MARGIN * np.ptp(face, axis=0)
+        low = np.maximum(face.min(0) - margin, 0).astype(int)
+        high = np.maximum(face.max(0) + margin, 0).astype(int)
+        room[low[1] : high[1], low[0] : high[0]] = 0
+        gray = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+        points, described = self._features.detectAndCompute(gray, room)
+        pixels = np.array([point.pt for point in points]).reshape(-1, 2)
+        described = np.zeros((0, 128), np.float32) if described is None else described
+        return _Sample(rotation, middle[:2] / middle[2], lens.at_depth_one(pixels), described)
+
+
+def _parallax(pairs: Sequence[tuple[_Sample, _Sample]]) -> tuple[float, float]:
+    """`Recognition.parallax` and its correlation, of pairs of frames between which the head turns a
+    little."""
+    turns = []
+    moves = []
+    for first, second in pairs:
+        angle = _angle_deg(first.rotation, second.rotation)
+        flow = _room_flow(first, second)
+        if flow is None or not PAIR_TURN_DEG[0] <= angle <= PAIR_TURN_DEG[1]:
+            continue
+        # where the head looks, in the image: x right and y down
+        turned = second.rotation[:2, 2] - first.rotation[:2, 2]
+        turns.append(turned)
+        moves.append(flow - (second.center - first.center))
+    if len(turns) < MIN_PAIRS:
+        return float("nan"), 0.0
+    turned = np.ravel(turns)
+    moved = -np.ravel(moves)  # the room moves to the other side than the face
+    product = float(turned @ moved)
+    size = float(np.sqrt((turned @ turned) * (moved @ moved)))
+    return product / float(turned @ turned), product / max(size, 1e-12)
+
+
+def _room_flow(first: _Sample, second: _Sample) -> np.ndarray | None:
+    """(2,) median motion of the room's features; None where too few are found again."""
+    import cv2
+
+    if min(len(first.points), len(second.points)) < MIN_MATCHES:
+        return None
+    found = cv2.BFMatcher().knnMatch(first.described, second.described, k=2)
+    rows = [(m.queryIdx, m.trainIdx) for m, n in found if m.distance < MATCH_RATIO * n.distance]
+    if len(rows) < MIN_MATCHES:
+        return None
+    before, after = np.array(rows).T
+    flow: np.ndarray = np.median(second.points[after] - first.points[before], axis=0)
+    return flow
+
+
+def _angle_deg(first: np.ndarray, second: np.ndarray) -> float:
+    cosine = (np.sum(first * second) - 1) / 2
+    return float(np.degrees(np.arccos(np.clip(cosine, -1, 1))))

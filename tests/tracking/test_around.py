@@ -1,0 +1,129 @@
+"""Takes around a still head: recognized, and given cameras without a calibration."""
+
+import re
+
+import numpy as np
+import pytest
+from PIL import Image
+from refusal import refusal
+from scipy.spatial.transform import Rotation
+
+from stga_addon.capture.mesh_geometry import similarity
+from stga_addon.tracking.around import CamerasNotFound, with_found_cameras
+from stga_addon.tracking.footage.open import open_footage
+from stga_addon.tracking.footage.shots import Lens
+from stga_addon.tracking.sharp_frames import sharpest
+from stga_addon.tracking.stages import Crew
+from stga_addon.worker.helpers import Helpers
+
+from .walk import picture, walk
+
+COUNT = 9
+
+
+def write_pictures(folder, images):
+    folder.mkdir()
+    for number, image in enumerate(images):
+        Image.fromarray(image).save(folder / f"{number}.png")
+    return folder
+
+
+def distorted(image, camera, k):
+    """What a lens of radial distortion k records of a pinhole's image."""
+    import cv2
+
+    rows, columns = np.indices(image.shape[:2])
+    recorded = camera.at_depth_one(np.stack([columns, rows], axis=-1) + 0.5)
+    ideal = recorded
+    for _ in range(20):
+        ideal = recorded / (1 + k * (ideal**2).sum(-1, keepdims=True))
+    assert np.abs(Lens(radial=(k,)).distort(ideal) - recorded).max() < 1e-6
+    at = ideal * [camera.fl_x, camera.fl_y] + [camera.cx, camera.cy] - 0.5
+    return cv2.remap(image, at.astype(np.float32), None, cv2.INTER_CUBIC)
+
+
+@pytest.fixture(scope="module")
+def pictures():
+    return [picture(camera) for camera in walk(COUNT)]
+
+
+def found(folder, out, take="auto"):
+    with Helpers(1) as helpers:
+        footage, lines = with_found_cameras(open_footage(folder), out, take, Crew(helpers))
+    return footage, " ".join(lines)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("k", [0.0, -0.3])
+def test_cameras_are_those_that_filmed(tmp_path, pictures, k):
+    """Catches poses, a lens or a principal point of another convention, a distortion that is left
+    in, or made of noise, and a walk that is taken for a talk."""
+    pytest.importorskip("pycolmap")
+    cameras = walk(COUNT)
+    images = [distorted(*pair, k) for pair in zip(pictures, cameras, strict=True)]
+    footage, line = found(write_pictures(tmp_path / "photos", images), tmp_path / "out")
+    assert re.search(rf"around a still head.*cameras of {COUNT} of {COUNT} images found", line)
+    assert ("distortion" in line) == bool(k)
+    assert footage.timesteps == (0,)
+    assert footage.warnings == ()
+    placed = np.stack([own.camera.position for own in footage.cameras])
+    truth = np.stack([camera.position for camera in cameras])
+    world = similarity(placed, truth)
+    apart = np.linalg.norm(world.apply(placed) - truth, axis=1)
+    assert apart.max() < 0.005 * np.linalg.norm(truth[0])
+    for own, camera, image in zip(footage.cameras, cameras, pictures, strict=True):
+        turned = own.camera.world_to_camera[:3, :3] @ world.rotation.T
+        off = Rotation.from_matrix(turned @ camera.world_to_camera[:3, :3].T)
+        assert np.degrees(off.magnitude()) < 0.3
+        seen = own.image(0)
+        # of the pinhole's focal length, which keeps all pixels inside
+        zoom = own.camera.fl_x / camera.fl_x
+        assert zoom == pytest.approx(1.0, abs=0.02 if not k else 0.1)
+        middle = slice(112, 144)
+        if not k:
+            np.testing.assert_array_equal(seen[middle, middle], image[middle, middle])
+        else:
+            recorded = own.undistortion.recorded.fl_x
+            assert recorded == pytest.approx(camera.fl_x, rel=0.02)
+            assert own.undistortion.lens.radial[0] == pytest.approx(k, rel=0.1)
+
+
+def test_a_head_that_turns_before_a_camera_is_none(tmp_path):
+    """Catches a talk that pays for structure from motion, or loses its timesteps to it."""
+    still = walk(3)[1]
+    turns = [Rotation.from_euler("y", y, degrees=True).as_matrix() for y in np.linspace(-30, 30, 8)]
+    folder = write_pictures(tmp_path / "talk", [picture(still, turn) for turn in turns])
+    footage, line = found(folder, tmp_path / "out")
+    assert (footage.timesteps, footage.focal, line) == (tuple(range(8)), "usual", "")
+
+
+@pytest.mark.slow
+def test_why_no_cameras_are_found(tmp_path, monkeypatch):
+    """Catches a take without detail that is tracked by cameras of chance, that is refused where
+    the old way serves, and a refusal that does not help."""
+    pytest.importorskip("pycolmap")
+    images = [picture(camera, plain=True) for camera in walk(8)]
+    folder = write_pictures(tmp_path / "plain", images)
+    with refusal("places [0-7] of 8 images, expected at least 8; film in even light"):
+        found(folder, tmp_path / "out", "around")
+    footage, line = found(folder, tmp_path / "out")
+    assert (len(footage.cameras), line) == (1, "")
+    assert "looks like one around a still head, but" in footage.warnings[-1]
+    monkeypatch.setitem(__import__("sys").modules, "pycolmap", None)
+    with refusal("needs the package pycolmap"), pytest.raises(CamerasNotFound):
+        found(folder, tmp_path / "out", "around")
+
+
+def test_the_sharpest_of_each_stretch_is_chosen():
+    """Catches frames at equal times, where the camera stood, and blurred ones."""
+    random = np.random.default_rng(0)
+    speed = np.r_[np.zeros(30), np.full(60, 0.02), np.zeros(30)]
+    flows = np.stack([speed, 0 * speed], axis=1) + random.normal(0, 1e-3, (120, 2))
+    sharpness = random.uniform(1, 2, 120)
+    sharpness[40::10] = 3.0
+    chosen = sharpest(flows, sharpness, 6)
+    assert chosen.tolist() == sorted(set(chosen.tolist()))
+    assert len(chosen) == 6
+    assert (np.isin(chosen, np.arange(40, 120, 10))).sum() >= 5
+    path = np.cumsum(speed)[chosen]
+    assert np.diff(path).min() > 0
