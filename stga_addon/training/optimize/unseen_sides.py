@@ -244,16 +244,6 @@ class _Sides:
         return np.clip(found, 0, 1)
 
 
-def plausible_aside(splats: Splats, along: np.ndarray, sides: UnseenSides) -> Splats:
-    """Splats that views show along one direction only, that of their triangle (F, 3), with what is
-    plausible off-axis: hair, and of the rest what lies on it, not what hangs before it."""
-    face = splats.face
-    share = OFF_AXIS_WEIGHT * sides.view_dependence[face]
-    share[splats.unbound & ~sides.is_hair[face]] = 0
-    share[sides.triangles[face]] = 0  # they have one color from everywhere, and hair its locks
-    return colored_off_axis(splats, along[face], share, sides.off_axis[face])
-
-
 def _lid_colors(
     surface: Surface, is_source: np.ndarray, color: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
