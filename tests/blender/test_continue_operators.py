@@ -129,7 +129,7 @@ def test_a_result_waits_for_the_end_of_edit_mode(head, extension, monkeypatch, t
     assert state_of(Kind.PERFORMANCE).loading is not None
     bpy.ops.object.mode_set(mode="OBJECT")
     tick_until_done(extension, Kind.PERFORMANCE)
-    assert "gone.csv" in state_of(Kind.PERFORMANCE).error
+    assert "has no FLAME rig" in state_of(Kind.PERFORMANCE).error
 
 
 @pytest.mark.slow
