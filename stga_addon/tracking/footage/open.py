@@ -166,7 +166,8 @@ def _calibrated(
     fps = next((shot.fps for shot in shots if timed and shot.fps is not None), None)
     shots = shots if timed else _with_stills(shots, sources)
     unused = _unused(sources, calibration, [shot.image for shot in shots if shot.image is not None])
-    chosen = [shot for shot in shots if frames.selects(shot.timestep or 0)]
+    timesteps = frames.chosen(sorted({shot.timestep or 0 for shot in shots}))
+    chosen = [shot for shot in shots if (shot.timestep or 0) in timesteps]
     return Footage(sources.root, _listed_cameras(chosen, calibration), fps, warnings=unused)
 
 
