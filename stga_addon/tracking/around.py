@@ -10,6 +10,7 @@ from time import monotonic
 import numpy as np
 
 from ..capture.camera import Camera
+from ..capture.lens import Lens, undistortion
 from ..capture.mesh_geometry import weighted_procrustes
 from ..capture.model import evenly_spread
 from ..errors import StgaError
@@ -21,7 +22,7 @@ from .face_networks import FaceNetworks, PersonNetwork
 from .fit import pose_from_one_camera
 from .footage.model import Footage, FootageCamera, ImageFrames
 from .footage.open import usual_focal
-from .footage.shots import Lens, listed, undistortion
+from .footage.shots import listed
 from .footage.video import VideoFrames
 from .landmarks import read_places
 from .opened import check_place, file_state

@@ -8,10 +8,10 @@ from PIL import Image
 from refusal import refusal
 from scipy.spatial.transform import Rotation
 
+from stga_addon.capture.lens import Lens
 from stga_addon.capture.mesh_geometry import similarity
 from stga_addon.tracking.around import CamerasNotFound, with_found_cameras
 from stga_addon.tracking.footage.open import open_footage
-from stga_addon.tracking.footage.shots import Lens
 from stga_addon.tracking.sharp_frames import sharpest
 from stga_addon.tracking.stages import Crew
 from stga_addon.worker.helpers import Helpers
