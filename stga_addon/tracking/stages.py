@@ -77,7 +77,7 @@ def stage_spans(images: int, absent: Collection[Stage]) -> dict[Stage, tuple[flo
     needed, for so many images."""
     times = dict[Stage, float]()
     for stage in Stage:
-        if stage.end <= 1 and stage not in (*absent, Stage.CORRECTION):
+        if stage.begin >= 0 and stage.end <= 1 and stage not in (*absent, Stage.CORRECTION):
             share = stage.end - stage.begin
             times[stage] = FIXED_S.get(stage, 0.0) + IMAGE_S * images * share
     total = sum(times.values())
