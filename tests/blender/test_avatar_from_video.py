@@ -13,6 +13,8 @@ pytest.importorskip("cv2")
 from tracking.head_video import write_head_video
 
 from stga_addon.scene import tags
+from stga_addon.scene.display import splat_nodes
+from stga_addon.scene.display.splat_object import get_input, set_input
 
 from .session import failure, ops, panel, save
 
@@ -113,7 +115,8 @@ def test_mistakes_are_sentences(extension, video, tmp_path, monkeypatch):
 
 @pytest.mark.slow
 def test_from_a_video_to_splats_on_the_head(extension, tmp_path):
-    """Catches a head, splats, picture or run that does not arrive, or is another's."""
+    """Catches a head, splats, picture or run that does not arrive, or is another's; and what was
+    not filmed, which is not shown once, or again at every result."""
     pytest.importorskip("torch")
     video = tmp_path / "head.mp4"
     write_head_video(video, 3)
@@ -124,6 +127,8 @@ def test_from_a_video_to_splats_on_the_head(extension, tmp_path):
     assert settings.head[tags.RUN] == settings.run_folder == str(out / "run")
     assert (settings.avatar, settings.avatar_shown) == (str(out / "run/avatar.npz"), True)
     assert not settings.head.visible_get()
+    assert get_input(settings.splats, splat_nodes.SHOW_UNSEEN)
+    set_input(settings.splats, splat_nodes.SHOW_UNSEEN, False)
     with np.load(out / "job/picture.npz") as stored:
         assert stored["rgb"].std() > 10
     pixels, *_ = extension.operators.monitor.curves[out / "run"]
@@ -132,3 +137,4 @@ def test_from_a_video_to_splats_on_the_head(extension, tmp_path):
     ops.avatar_from_video(filepath=video, minutes=0.05, python=sys.executable)
     heads = [thing for thing in bpy.data.objects if thing.get(tags.KIND) == tags.HEAD]
     assert heads == [settings.head]
+    assert not get_input(settings.splats, splat_nodes.SHOW_UNSEEN)
