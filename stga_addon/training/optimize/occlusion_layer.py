@@ -95,7 +95,7 @@ def occlusion_layer(surface: Surface, sides: UnseenSides) -> OcclusionLayer:
     centers = neutral[faces].mean(1)
     color = sides.off_axis.copy()
     color[front] = median_color
-    skin = np.flatnonzero(grazed & ~sides.is_hair)
+    skin = np.flatnonzero(grazed & ~sides.is_hair & ~surface.kinds["body"])
     if len(skin):
         around = nearest_rows(centers[skin], centers[skin], SOURCE_TRIANGLES)
         color[skin] = np.median(color[skin][around], axis=1)

@@ -182,11 +182,13 @@ class Surface:
         1 where it faces away, 0 where it does not graze."""
         return self.turned_from(GRAZING_COSINE)
 
-    def turned_from(self, cosine: float) -> np.ndarray:
-        """(F,) 1 where a triangle faces away from all cameras, less the better it faces one, 0 from
-        this cosine of the angle on; with many cameras, which outlines tell enough, 1 or 0."""
-        beyond = cosine if self.has_few_cameras else UNSEEN_COSINE + 1e-9
-        return np.asarray(np.interp(self.facing, (UNSEEN_COSINE, beyond), (1, 0)))
+    def turned_from(self, cosine: float, away: float = UNSEEN_COSINE) -> np.ndarray:
+        """(F,) 1 where a triangle faces all cameras by less than the cosine `away`, less the better
+        it faces one, 0 from the other cosine on; with many cameras, which outlines tell enough, 1
+        or 0."""
+        if not self.has_few_cameras:
+            return np.asarray(self.facing <= UNSEEN_COSINE, float)
+        return np.asarray(np.interp(self.facing, (away, cosine), (1, 0)))
 
     @cached_property
     def hidden(self) -> np.ndarray:

@@ -58,9 +58,9 @@ SAME_COLOR_DEVIATION = 0.12
 sharp."""
 MAX_LIGHT_RATIO = 2.0
 """Of the light on one side of a face to that on the other."""
-SHOWN_COSINE = 0.5
+SHOWN_COSINE = 0.6
 """Cosine between a triangle and the camera that it faces most above which its color depends on no
-view."""
+view; up to SOURCE_COSINE, it depends wholly on the view."""
 OFF_AXIS_WEIGHT = 0.75
 """Fraction of the off-axis color at a right angle to the views."""
 
@@ -112,7 +112,7 @@ def unseen_sides(surface: Surface) -> UnseenSides:
     found = color.copy()
     ears = np.zeros_like(shown) if surface.at is None else ears_of(surface.at)
     found[hidden] = sides.nearest(is_source & ~ears, hidden)
-    turned = np.where(is_outside, surface.turned_from(SHOWN_COSINE), 0.0)
+    turned = np.where(is_outside, surface.turned_from(SHOWN_COSINE, SOURCE_COSINE), 0.0)
     off_axis = color.copy()
     is_hair = np.zeros_like(shown)
     may_be_mirrored = unseen.copy()
@@ -124,7 +124,9 @@ def unseen_sides(surface: Surface) -> UnseenSides:
                 found[own & hidden] = sides.nearest(own & is_source, own & hidden, is_level)
         found[unseen] = sides.softened(found, unseen)
         if surface.has_few_cameras:
-            may_be_mirrored |= sides.of_face & is_outside & (cosine < WELL_SHOWN_COSINE)
+            turns_away = sides.of_face & is_outside & (cosine < WELL_SHOWN_COSINE)
+            off_axis[turns_away] = sides.nearest(is_source & ~ears, turns_away)
+            may_be_mirrored |= turns_away
         scalp = surface.kinds["scalp"]
         if len(hair):
             near = nearest_rows(sides.centers[hair], sides.centers[scalp], SOURCE_TRIANGLES)
