@@ -201,7 +201,8 @@ class AvatarFromVideo(Action, bpy.types.Operator, FileImport):
     minutes: options.number("Minutes", "Training time", default=5.0, min=0.01)
     quick: options.boolean(
         "Quick Look",
-        "Every third frame at half size and half a minute of training, in a folder of its own",
+        f"At most {jobs.QUICK['most']} frames at half size and half a minute of training, in a "
+        "folder of its own",
         options=ONCE,
     )
     focal: options.field(Track, "focal", "Focal Length", options=ONCE)

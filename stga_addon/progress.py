@@ -16,7 +16,7 @@ Item = TypeVar("Item")
 PACE_SHARE = 0.1  # Share of the work, the last that was done, whose pace says how much time is left
 MAX_OVERRUN_RATIO = 1.25  # Times what was said to be left, from which on that was too little
 MIN_PACE_S = 5.0  # For which the work's own forecast is watched before it is corrected
-MAX_STEP_SHARE = 0.03  # Of a step; beyond, an interrupted call had done it before
+MAX_STEP_SHARE = 0.05  # Of a step; beyond, an interrupted call had done it before
 
 
 @dataclass(frozen=True)

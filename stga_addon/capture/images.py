@@ -89,7 +89,7 @@ def read_image(view: View, background: tuple[int, int, int] = WHITE) -> np.ndarr
     EXIF's orientation is applied unless the camera has the size of the pixels as stored. Raises
     StgaError naming the file where it is missing, truncated or not as large as the camera says.
     """
-    return _over(_decode(view.image, view, "image"), background)
+    return _over(_undistorted(view, _decode(view.image, view, "image")), background)
 
 
 def read_mask(view: View) -> np.ndarray | None:
@@ -97,9 +97,10 @@ def read_mask(view: View) -> np.ndarray | None:
     another number; an image's transparency where it has no mask file. None where there is neither.
     Raises StgaError as `read_image` does."""
     if view.mask is None:
-        return _transparency(_decode(view.image, view, "image"))
+        return _transparency(_undistorted(view, _decode(view.image, view, "image")))
     mask = stored_mask(view)
-    return np.where(mask > 0, np.uint8(255), np.uint8(0)) if is_labeled(mask) else mask
+    mask = np.where(mask > 0, np.uint8(255), np.uint8(0)) if is_labeled(mask) else mask
+    return _undistorted(view, mask)
 
 
 def stored_mask(view: View) -> np.ndarray:
@@ -128,12 +129,16 @@ def read_view(
     StgaError as `read_image` does."""
     if not 0 < scale <= 1:
         raise ValueError(f"scale {scale} is not in (0, 1]")
-    pixels = _decode(view.image, view, "image")
+    pixels = _undistorted(view, _decode(view.image, view, "image"))
     mask = _transparency(pixels) if view.mask is None else read_mask(view)
     small = view if scale == 1 else replace(view, camera=view.camera.scaled(scale))
     size = small.camera.height, small.camera.width
     image = area_mean(_over(pixels, background), *size)
     return small, image, None if mask is None else area_mean(mask, *size)
+
+
+def _undistorted(view: View, pixels: np.ndarray) -> np.ndarray:
+    return pixels if view.undistortion is None else view.undistortion(pixels)
 
 
 def area_mean(pixels: np.ndarray, height: int, width: int) -> np.ndarray:

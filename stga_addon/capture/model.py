@@ -12,6 +12,7 @@ import numpy as np
 from ..errors import StgaError
 from ..flame.sequence import FlameSequence
 from .camera import Camera
+from .lens import Undistortion
 
 Item = TypeVar("Item")
 
@@ -29,7 +30,9 @@ COMPARED = 8  # Views, and timesteps, of a take whose scale is looked at
 
 @dataclass(frozen=True)
 class View:
-    """One image: a camera at a timestep. `name` is its `file_path` with forward slashes."""
+    """One image: a camera at a timestep. `name` is its `file_path` with forward slashes;
+    `undistortion` leads from the recorded image to that of `camera`, None where that is the same.
+    """
 
     timestep: int
     camera_index: int
@@ -37,6 +40,7 @@ class View:
     name: str
     image: Path
     mask: Path | None = None
+    undistortion: Undistortion | None = None
 
 
 Views = Mapping[str, tuple[View, ...]]

@@ -37,7 +37,7 @@ from ..flame.sequence import (
     with_identity,
 )
 from . import meshes
-from .distortion import distortion
+from .distortion import distortion, undistorted
 from .mesh_geometry import pixels_of, without_head_motion
 from .model import Capture, Views, evenly_spread
 from .transforms import (
@@ -112,13 +112,14 @@ def open_capture(
     if transforms_files(root):
         transforms = read_splits(root, principal_point)
     _require_files(transforms.frames)
-    if distorted := distortion(transforms.frames):
-        raise StgaError(
-            f"{distorted}; captures are of pinholes: undistort the images, as stga track does "
-            "of footage, and remove these fields"
-        )
+    distorted = distortion(transforms.frames)
+    if distorted:
+        splits = {name: undistorted(own) for name, own in transforms.splits.items()}
+        transforms = replace(transforms, splits=splits)
     capture = _open_layout(root, transforms, flame)
     warnings = list(capture.warnings)
+    if distorted:
+        warnings.append(f"{distorted}; images are undistorted as they are read")
     warnings += transforms_warnings(transforms.frames, principal_point)
     warnings += _mask_warnings(transforms.frames)
     warnings += _unnamed_images(transforms.frames)

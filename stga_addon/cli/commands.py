@@ -258,7 +258,8 @@ def _refuse_changes(options: Namespace, run: Run) -> None:
 class AvatarOptions:
     out: Path = option("folder of capture, run and file", flag="--out", metavar="DIR")
     quick: bool = option(
-        "a first look: every third frame at half size, half a minute of training", False
+        f"a first look: at most {QUICK['most']} frames at half size, half a minute of training",
+        False,
     )
     no_blend: bool = option("write no .blend file", False)
 

@@ -24,8 +24,17 @@ from .commands import COMMANDS
 MIN_ADDRESS_SPACE_GB = 4.0
 """Below, a small training was seen to abort at 0.8; threads and libraries reserve what they never
 use."""
-LIBRARY_FAILURES = (MemoryError, ImportError, OSError, RuntimeError, SystemError)
-"""What libraries raise where they get no memory, while they load or later."""
+LIBRARY_FAILURES = (
+    MemoryError,
+    ImportError,
+    OSError,
+    RuntimeError,
+    SystemError,
+    AttributeError,
+    NameError,
+)
+"""What libraries raise where they get no memory, while they load or later; the last two are raised
+by a library of which a part was not loaded."""
 DROPPED_INTERRUPT_S = 0.05  # After which an interrupt that was dropped is raised again
 
 

@@ -27,7 +27,7 @@ from ..tracking.folder import (
     is_flame,
     is_written,
 )
-from ..tracking.stages import Draw, Stage
+from ..tracking.stages import Draw, Stage, stage_spans
 from ..training.run.folder import AVATAR
 from ..worker.helpers import Helpers
 from ..worker.lock import hold_folder
@@ -116,6 +116,13 @@ class Track:
     start: int = option("first timestep of the footage, counted from 0", 0, 0)
     stop: int | None = option("timestep to stop before (default: all)", None, 1)
     step: int = option("use every nth timestep", 1, 1)
+    most: int | None = option(
+        "use at most so many of these, evenly spread (default: all)",
+        None,
+        1,
+        flag="--timesteps",
+        metavar="COUNT",
+    )
     size: float = option(
         "of the images, as a share of the recorded size", 1.0, 0.1, 1.0, metavar="SHARE"
     )
@@ -203,8 +210,8 @@ class MakeAvatar:
             )
 
 
-QUICK: Mapping[str, Any] = {"step": 3, "size": 0.5}
-"""Fields of `Track` for a first look at an avatar."""
+QUICK: Mapping[str, Any] = {"most": 24, "size": 0.5}
+"""Fields of `Track` for a first look at an avatar, as soon of a long video as of a short one."""
 QUICK_S = 30.0
 """Of training, for one."""
 WRITER = "tracking is writing this capture"
@@ -284,7 +291,9 @@ def _open(request: Track, steps: "_Steps") -> tuple["Footage", tuple[str, ...]]:
 
     steps.report(Stage.OPENING, 0, 1)
     offset = dict(request.offset or {})
-    frames = FrameRange(request.start, request.stop, request.step, offset, request.sync)
+    frames = FrameRange(
+        request.start, request.stop, request.step, offset, request.sync, request.most
+    )
     mattes = None if request.mattes in MATTES else Path(request.mattes)
     cameras = request.cameras
     footage = open_footage(request.footage, cameras, frames, request.focal, mattes=mattes)
@@ -294,6 +303,7 @@ def _open(request: Track, steps: "_Steps") -> tuple["Footage", tuple[str, ...]]:
             raise StgaError(f"--take around: {request.footage} has a calibration already")
     elif request.landmarks is None:
         footage, told = _with_found_cameras(footage, request, steps)
+    steps.plan(footage)
     return (footage if request.size == 1 else sized(footage, request.size)), told
 
 
@@ -354,13 +364,25 @@ class _Steps:
         self._time_left = TimeLeft()
         self._share = tracking_share
         self._before = 0  # 1 where cameras are found before the head is tracked
+        self._spans: Mapping[Stage, tuple[float, float]] = {}
         self._now = Progress()
         self._quality = dict[str, float]()
 
+    def plan(self, footage: "Footage") -> None:
+        """Let each stage have as much of the progress as it takes of the time."""
+        absent = [Stage.ONLY_DENSE]
+        if len(footage.cameras) == 1:
+            absent = [Stage.DENSE, Stage.SURFACE, Stage.REFINEMENT]
+        if footage.focal != "usual":
+            absent.append(Stage.FOCAL_LENGTH)
+        images = sum(len(own.timesteps) for own in footage.cameras)
+        self._spans = stage_spans(images, absent)
+
     def report(self, stage: Stage, done: int, total: int) -> None:
         """Raises Cancelled where the report says to stop."""
-        self._before = max(self._before, -math.floor(stage.begin))
-        at = stage.begin + (stage.end - stage.begin) * done / max(total, 1)
+        begin, end = self._spans.get(stage, (stage.begin, stage.end))
+        self._before = max(self._before, -math.floor(begin))
+        at = begin + (end - begin) * done / max(total, 1)
         share = (at + self._before) / (1 / self._share + self._before)
         figures = {"left_s": self._time_left.after(share), **self._quality}
         detail = f"{done} of {total}" if total > 1 else ""

@@ -3,6 +3,7 @@ the cameras that structure from motion finds."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from importlib.util import find_spec
 from itertools import pairwise
 from pathlib import Path
 from time import monotonic
@@ -10,6 +11,7 @@ from time import monotonic
 import numpy as np
 
 from ..capture.camera import Camera
+from ..capture.lens import Lens, undistortion
 from ..capture.mesh_geometry import weighted_procrustes
 from ..capture.model import evenly_spread
 from ..errors import StgaError
@@ -21,19 +23,14 @@ from .face_networks import FaceNetworks, PersonNetwork
 from .fit import pose_from_one_camera
 from .footage.model import Footage, FootageCamera, ImageFrames
 from .footage.open import usual_focal
-from .footage.shots import Lens, listed, undistortion
+from .footage.shots import listed
 from .footage.video import VideoFrames
 from .landmarks import read_places
 from .opened import check_place, file_state
 from .recorded import BUNDLED_PLACES
 from .sharp_frames import choose_frames, reduced_to
 from .stages import Crew, Stage
-from .structure_from_motion import (
-    SearchOptions,
-    Structure,
-    find_structure,
-    require_pycolmap,
-)
+from .structure_from_motion import SearchOptions, Structure, find_structure
 
 MAX_PHOTOS = 60
 """Images up to which all are used; of more, the sharpest ones of FRAMES stretches."""
@@ -142,7 +139,7 @@ def with_found_cameras(
         return footage, ()
     try:
         found, line = _with_cameras(footage, out, crew)
-    except CamerasNotFound as error:
+    except StgaError as error:
         warning = (
             f"take: looks like one around a still head, but {error}. It is tracked as one of a "
             "head that turns before a camera"
@@ -156,7 +153,11 @@ def with_found_cameras(
 def _with_cameras(footage: Footage, out: Path, crew: Crew) -> tuple[Footage, str]:
     """The footage with a camera for each image, and a line on these. Raises CamerasNotFound."""
     (camera,) = footage.cameras
-    require_pycolmap(str(footage.root))
+    if find_spec("pycolmap") is None:
+        raise CamerasNotFound(
+            f"{footage.root}: finding cameras needs the package pycolmap, which this Python lacks; "
+            "install it, or give --cameras"
+        )
     timesteps = _chosen(camera, crew)
     given = footage.focal != "usual"
     focal = camera.camera.fl_x if given else None

@@ -18,7 +18,7 @@ from .solve import LANDMARK_SIGMA_M, Observation, person, residuals, solve_ident
 
 CANDIDATES = 64
 """Timesteps, spread over the take, among which the most differently turned ones are looked for."""
-TIMESTEPS = 12
+TIMESTEPS = 8
 """Timesteps whose landmarks are compared."""
 LANDMARKS = 80
 """Landmarks that are compared, spread over the reliable ones."""

@@ -29,7 +29,8 @@ MAX_PIXELS = 1e5
 MAX_CONFIDENCE = 1e6
 """Largest confidence of a landmark: some detectors write scores instead of 0…1."""
 MAX_TWO_FACES_SHARE = 0.34
-"""Share of a camera's frames with a second face, beyond which the footage is not of one person."""
+"""Share of a camera's frames, or of all where each camera has one, with a second face, beyond which
+the footage is not of one person: a pattern on a wall may look like one."""
 MIN_PART_TIMESTEPS = 50
 """Of a camera's parts, which are worked on at once, and as many as there may be helpers: each
 decodes a video from the key frame before it, or from the beginning."""
@@ -69,10 +70,12 @@ def detect_landmarks(
 
     detector: can be handed to helping processes; unbiased: what it finds (N, 2) in pixels of a
     camera, moved to where it belongs. A frame with several faces counts as one without a
-    face. Raises StgaError for a camera that often sees several.
+    face. Raises StgaError where there are often several.
     """
     total = sum(len(camera.timesteps) for camera in footage.cameras)
     found: dict[str, CameraLandmarks] = {}
+    crowded: list[tuple[FootageCamera, int]] = []
+    """Views with a second face, of cameras that see one moment."""
     done = 0
     for camera in footage.cameras:
         path = landmark_file(folder, camera.name)
@@ -85,7 +88,9 @@ def detect_landmarks(
                 for faces in part
             ]
             several = [t for t, own in zip(camera.timesteps, seen, strict=True) if len(own) > 1]
-            if len(several) > MAX_TWO_FACES_SHARE * len(camera.timesteps):
+            if len(camera.timesteps) == 1:
+                crowded += [(camera, timestep) for timestep in several]
+            elif len(several) > MAX_TWO_FACES_SHARE * len(camera.timesteps):
                 raise StgaError(
                     f"{camera.source(several[0])}: camera {camera.name} sees {len(several)} of "
                     f"{len(camera.timesteps)} frames with two faces, the first at timestep "
@@ -104,6 +109,12 @@ def detect_landmarks(
         found[camera.name] = read_camera(path, camera)
         done += len(camera.timesteps)
         crew.report(Stage.LANDMARKS, done, total)
+    if len(crowded) > MAX_TWO_FACES_SHARE * total:
+        camera, timestep = crowded[0]
+        raise StgaError(
+            f"{camera.source(timestep)}: is one of {len(crowded)} of {total} images with two "
+            "faces; expected one person"
+        )
     return found
 
 

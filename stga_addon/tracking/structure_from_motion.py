@@ -12,7 +12,6 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import StgaError
 from ..worker.helpers import Step
 from .face_networks import FaceNetworks, PersonNetwork
 from .footage.model import FootageCamera, write_png
@@ -104,17 +103,6 @@ class SearchOptions:
     threads: int
     min_images: int
     min_on_head: int
-
-
-def require_pycolmap(where: str) -> None:
-    """Raise StgaError, beginning with `where`, without the package."""
-    from importlib.util import find_spec
-
-    if find_spec("pycolmap") is None:
-        raise StgaError(
-            f"{where}: finding cameras needs the package pycolmap, which this Python lacks; "
-            "install it, or give --cameras"
-        )
 
 
 def find_structure(

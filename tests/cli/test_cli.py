@@ -322,7 +322,7 @@ def test_interruption_and_mistakes_have_their_codes(root, monkeypatch, capsys):
     with pytest.raises(RuntimeError, match="a bug"):
         stga("info", root)
     monkeypatch.setattr("stga_addon.cli.main.address_space_gb", lambda: 0.8)
-    for kind in (ImportError, OSError, RuntimeError, SystemError):
+    for kind in (ImportError, OSError, RuntimeError, SystemError, AttributeError):
         fails_with(kind("failed to map\nsegment"))
         assert stga("info", root) == 2
         sentence = capsys.readouterr().err.splitlines()[-1]

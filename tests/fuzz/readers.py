@@ -26,6 +26,7 @@ from training.test_folder import make_checkpoint, make_run
 from stga_addon.avatar.file import Avatar, read_avatar, write_avatar
 from stga_addon.capture.camera import Camera
 from stga_addon.capture.images import read_image, read_mask
+from stga_addon.capture.lens import undistortion
 from stga_addon.capture.meshes import read_mesh, read_regions
 from stga_addon.capture.model import View
 from stga_addon.capture.open import read_face_ids, read_soup
@@ -47,7 +48,6 @@ from stga_addon.tracking.footage.realitycapture import (
     read_realitycapture_csv,
     read_realitycapture_xmp,
 )
-from stga_addon.tracking.footage.shots import undistortion
 from stga_addon.tracking.footage.sources import Sources, sequence_names
 from stga_addon.tracking.head_model import read_head_model
 from stga_addon.tracking.landmarks import read_camera, read_places

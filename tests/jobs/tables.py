@@ -50,6 +50,7 @@ REQUESTS = (
         focal=900.0,
         stop=9,
         step=3,
+        most=40,
         offset={"left": -3},
         meshes=True,
         mattes="none",

@@ -25,6 +25,7 @@ from stga_addon.files import read_npz
 from stga_addon.format import describe_left
 from stga_addon.jobs import analyze as analysis
 from stga_addon.jobs import perform as jobs
+from stga_addon.jobs import track as tracking_jobs
 from stga_addon.jobs import train
 from stga_addon.jobs.analyze import Analyze
 from stga_addon.jobs.export import Export
@@ -34,6 +35,7 @@ from stga_addon.jobs.table import JOBS, Result
 from stga_addon.jobs.track import SolveAgain, Track
 from stga_addon.jobs.train import Resume, Train
 from stga_addon.progress import Clock, Progress, TimeLeft, Written
+from stga_addon.tracking.stages import Stage
 from stga_addon.training import preset_timing
 from stga_addon.training.effect_catalog import RELIGHT, WORLD, EffectDecision
 from stga_addon.training.effects import plan
@@ -160,6 +162,43 @@ def test_time_left_is_told_by_the_pace_of_what_was_done_last():
         now += 1
         told = left.after(share)
     assert told == pytest.approx(0.15 * 100)
+
+
+QUICK_LOOK_S = {
+    Stage.HEAD_MODEL: 0.3,
+    Stage.LANDMARKS: 1.1,
+    Stage.FOCAL_LENGTH: 48.4,
+    Stage.FIT: 18.2,
+    Stage.ONLY_DENSE: 35.4,
+    Stage.MATTES: 4.7,
+    Stage.TORSO: 24.3,
+    Stage.CLOTH: 5.7,
+    Stage.CONTACT_SHEET: 6.1,
+    Stage.HEADS: 2.7,
+}
+"""Seconds of the stages of a video of ten frames, on a busy machine."""
+
+
+def test_the_time_left_of_a_quick_look(monkeypatch):
+    """Catches time that is left which stands still, as stages of a short video take another part of
+    the time than those of a long one."""
+    now = 0.0
+    told = []
+    monkeypatch.setattr("stga_addon.jobs.track.TimeLeft", lambda: TimeLeft(lambda: now))
+    steps = tracking_jobs._Steps(lambda progress: told.append((now, progress.figures()["left_s"])))
+    frames = SimpleNamespace(timesteps=range(10))
+    steps.plan(SimpleNamespace(cameras=[frames], focal="usual"))
+    for stage, seconds in QUICK_LOOK_S.items():
+        for done in range(8):
+            steps.report(stage, done, 7)
+            now += seconds / 7 if done < 7 else 0.0
+    assert told[-1] == (pytest.approx(now), pytest.approx(0.0, abs=1e-6))
+    late = [(at, left) for at, left in told if 20 < at < 130]
+    assert len(late) > 30
+    assert all(0.5 < left / (now - at) < 2 for at, left in late)
+    lowest = np.minimum.accumulate([left for _, left in late])
+    fell_at = [at for (at, left), low in zip(late, lowest, strict=True) if left == low]
+    assert np.diff([*fell_at, late[-1][0]]).max() < 15
 
 
 def test_a_clock_never_goes_back(tmp_path):

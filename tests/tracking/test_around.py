@@ -1,6 +1,7 @@
 """Takes around a still head: recognized, and given cameras without a calibration."""
 
 import re
+import sys
 
 import numpy as np
 import pytest
@@ -8,17 +9,17 @@ from PIL import Image
 from refusal import refusal
 from scipy.spatial.transform import Rotation
 
+from stga_addon.capture.lens import Lens
 from stga_addon.capture.mesh_geometry import similarity
-from stga_addon.tracking.around import CamerasNotFound, with_found_cameras
+from stga_addon.tracking.around import with_found_cameras
 from stga_addon.tracking.footage.open import open_footage
-from stga_addon.tracking.footage.shots import Lens
 from stga_addon.tracking.sharp_frames import sharpest
 from stga_addon.tracking.stages import Crew
 from stga_addon.worker.helpers import Helpers
 
 from .walk import picture, walk
 
-COUNT = 9
+COUNT = 8
 
 
 def write_pictures(folder, images):
@@ -102,15 +103,16 @@ def test_why_no_cameras_are_found(tmp_path, monkeypatch):
     """Catches a take without detail that is tracked by cameras of chance, that is refused where
     the old way serves, and a refusal that does not help."""
     pytest.importorskip("pycolmap")
-    images = [picture(camera, plain=True) for camera in walk(8)]
+    images = [picture(camera, plain=True) for camera in walk(COUNT)]
     folder = write_pictures(tmp_path / "plain", images)
-    with refusal("places [0-7] of 8 images, expected at least 8; film in even light"):
-        found(folder, tmp_path / "out", "around")
     footage, line = found(folder, tmp_path / "out")
     assert (len(footage.cameras), line) == (1, "")
-    assert "looks like one around a still head, but" in footage.warnings[-1]
-    monkeypatch.setitem(__import__("sys").modules, "pycolmap", None)
-    with refusal("needs the package pycolmap"), pytest.raises(CamerasNotFound):
+    why = (
+        f"still head, but .*places [0-7] of {COUNT} images, expected at least 8; film in even light"
+    )
+    assert re.search(why, footage.warnings[-1])
+    monkeypatch.setitem(sys.modules, "pycolmap", None)
+    with refusal("needs the package pycolmap"):
         found(folder, tmp_path / "out", "around")
 
 

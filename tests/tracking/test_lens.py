@@ -7,7 +7,7 @@ import pytest
 from refusal import refusal
 
 from stga_addon.capture.camera import look_at
-from stga_addon.tracking.footage.shots import Lens, undistortion
+from stga_addon.capture.lens import Lens, undistortion
 
 POINTS = np.dstack(np.meshgrid(np.linspace(-0.6, 0.6, 9), np.linspace(-0.5, 0.5, 7))).reshape(-1, 2)
 BROWN = Lens(radial=(-0.2, 0.07, 0.01), tangential=(0.003, -0.002))

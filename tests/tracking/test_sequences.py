@@ -53,6 +53,8 @@ def test_range_step_and_offset(tmp_path):
     footage = open_footage(tmp_path, frames=FrameRange(1, 8, 3, {"b": 2}))
     assert footage.timesteps == (1, 4, 7)
     assert red(footage) == {"a": [102, 105, 108], "b": [204, 207, 210]}
+    footage = open_footage(tmp_path, frames=FrameRange(0, 8, most=3))
+    assert footage.timesteps == (0, 4, 7)
     footage = open_footage(tmp_path, frames=FrameRange(offsets={"b": -1}))
     assert footage.timesteps == tuple(range(1, 8))
     assert red(footage) == {"a": [*range(102, 109)], "b": [*range(201, 208)]}

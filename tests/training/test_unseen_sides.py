@@ -197,12 +197,13 @@ def middles(capture):
 
 
 def painted(capture, hair=HAIR, fringe=0.75):
-    """(F, 3): hair, skin, clothes and eyes; behind the ears, skin beside gray hair is in shade."""
+    """(F, 3): hair, skin, eyes, and clothes, whose collar is higher behind than in front; behind
+    the ears, skin beside gray hair is in shade."""
     centers, level = middles(capture)
     hairline = np.interp(centers[:, 2], (-0.06, 0.02), (-1.1, fringe))
     color = np.where(centers[:, 2:] < 0.02, shaded_skin(hair), SKIN)
     color[level > hairline] = hair
-    color[level < -2.2] = CLOTH
+    color[level + 0.3 * centers[:, 2] / 0.07 < -2.4] = CLOTH
     color[eyeballs_of(capture)] = EYES
     return color
 
@@ -241,7 +242,7 @@ def test_hair_goes_round_the_head(angles, height, fringe, hair, bundled, tmp_pat
     centers, level = middles(bundled)
     back = sides.triangles & (centers[:, 2] < -0.03) & (np.abs(centers[:, 0]) < 0.05)
     skin = shaded_skin(hair)
-    expected = {(0.2, 1.0): hair, (-0.9, -0.2): hair, (-1.9, -1.4): skin, (-3.0, -2.5): CLOTH}
+    expected = {(0.2, 1.0): hair, (-0.9, -0.2): hair, (-1.8, -1.4): skin, (-3.0, -2.5): CLOTH}
     for part, own in expected.items():
         rows = back & (level > part[0]) & (level < part[1])
         assert rows.sum() > 8, part

@@ -73,6 +73,7 @@ def test_results_are_those_of_one_process_in_order():
         assert {pid for part in found for _, pid in part} == {os.getpid()}
         assert told == list(range(1, 22))
         assert {pid for _, pid in alone.run(squares, (0, 3), told.append)} == {os.getpid()}
+        assert os.getpid() not in {p for _, p in alone.run(squares, (0, 3), print, apart=True)}
 
 
 def halves(numbers, folder, step):

@@ -9,10 +9,11 @@ from pathlib import Path
 
 import numpy as np
 
+from ...capture.lens import Lens
 from ...errors import StgaError, shorten
 from ...files import is_file, read_bytes, read_text
 from ...flame.quaternions import to_matrices
-from .shots import Calibrated, Lens, Shot, numbers, pinhole
+from .shots import Calibrated, Shot, numbers, pinhole
 from .sources import natural_order
 
 _Camera = tuple[int, tuple[str, tuple[int, int], Sequence[float]]]

@@ -8,8 +8,9 @@ from xml.etree.ElementTree import Element
 import numpy as np
 
 from ...capture.camera import MAX_FOCAL_PIXELS
+from ...capture.lens import Lens
 from ...errors import StgaError, shorten
-from .shots import Calibrated, Lens, Shot, listed, numbers, pinhole, read_xml
+from .shots import Calibrated, Shot, listed, numbers, pinhole, read_xml
 
 PROJECTIONS = {
     "frame": "perspective",

@@ -9,9 +9,9 @@ import numpy as np
 
 from ...capture.camera import Camera
 from ...capture.images import image_size, is_plain, read_image, read_mask
+from ...capture.lens import Undistortion
 from ...capture.model import View
 from ...files import replacing
-from .shots import Undistortion
 from .video import VideoFrames
 
 

@@ -3,13 +3,11 @@
 from dataclasses import replace
 from pathlib import Path
 
-from ...capture.distortion import PERSPECTIVES, PINHOLES
+from ...capture.distortion import lens_of
 from ...capture.model import FPS_LIMIT
-from ...capture.transforms import Record, read_transforms, repairs, with_principal_point
-from ...errors import StgaError, shorten
-from .shots import Calibrated, Lens, Shot
+from ...capture.transforms import read_transforms, repairs, with_principal_point
+from .shots import Calibrated, Shot
 
-FISHEYE_MODELS = ("OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
 MARKS = b'"frames"', b'"transform_matrix"'
 HEAD_BYTES = 1 << 16
 
@@ -44,26 +42,8 @@ def read_nerfstudio(path: Path) -> Calibrated:
         mask = mask or record.path_of("mask_path")  # nerfstudio's
         fps = record.number("fps", 0, FPS_LIMIT) if record.has("fps") else None
         keeps_world = record.values.get("world") == "keep"
-        shot = Shot(view.name, camera, _lens(record), frame.where, view.image, timestep, mask, name)
+        shot = Shot(
+            view.name, camera, lens_of(record), frame.where, view.image, timestep, mask, name
+        )
         shots.append(replace(shot, fps=fps, keeps_world=keeps_world))
     return shots, repairs(frames)
-
-
-def _lens(record: Record) -> Lens:
-    """The lens of a frame."""
-    usual = "OPENCV_FISHEYE" if record.values.get("is_fisheye") else "OPENCV"
-    model = record.values.get("camera_model") or usual
-    known = PERSPECTIVES + FISHEYE_MODELS
-    if model not in known:
-        raise StgaError(
-            f"{record.where('camera_model')}: {shorten(model)} is not one of {', '.join(known)}"
-        )
-    if model in PINHOLES:
-        return Lens()
-    names = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
-    *k, p1, p2 = (record.number(name) if record.has(name) else 0.0 for name in names)
-    if model in FISHEYE_MODELS:
-        return Lens("fisheye", radial=tuple(k[:4]))
-    if model == "FULL_OPENCV":
-        return Lens(radial=tuple(k[:3]), rational=tuple(k[3:]), tangential=(p1, p2))
-    return Lens(radial=tuple(k[:4]), tangential=(p1, p2))  # nerfstudio's k4 is that of r⁸

@@ -12,6 +12,7 @@ import numpy as np
 
 from ...capture.camera import camera_from_gl
 from ...capture.images import image_size
+from ...capture.lens import Lens, Undistortion, undistortion
 from ...capture.model import View
 from ...capture.transforms import IMAGE_SUFFIXES
 from ...errors import StgaError
@@ -21,7 +22,7 @@ from .colmap import is_distorted, model_suffix
 from .focal_tags import photo_focal, video_focal
 from .model import Footage, FootageCamera, Frames, ImageFrames
 from .sequences import FrameRange, Sequence, open_sequence, sequence_size, synchronized
-from .shots import Lens, Shot, Undistortion, listed, undistortion
+from .shots import Shot, listed
 from .sources import (
     CONTAINERS,
     ORIGINALS,
@@ -166,7 +167,8 @@ def _calibrated(
     fps = next((shot.fps for shot in shots if timed and shot.fps is not None), None)
     shots = shots if timed else _with_stills(shots, sources)
     unused = _unused(sources, calibration, [shot.image for shot in shots if shot.image is not None])
-    chosen = [shot for shot in shots if frames.selects(shot.timestep or 0)]
+    timesteps = frames.chosen(sorted({shot.timestep or 0 for shot in shots}))
+    chosen = [shot for shot in shots if (shot.timestep or 0) in timesteps]
     return Footage(sources.root, _listed_cameras(chosen, calibration), fps, warnings=unused)
 
 

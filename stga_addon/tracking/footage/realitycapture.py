@@ -6,10 +6,11 @@ from pathlib import Path
 import numpy as np
 
 from ...capture.camera import GL_TO_CV
+from ...capture.lens import Lens
 from ...errors import StgaError, shorten
 from ...files import LINES_BEFORE_COLUMNS, read_table, table_rows
 from ...flame.forward import axis_angle_matrices
-from .shots import Calibrated, ImageSize, Lens, Shot, listed, numbers, pinhole, read_xml
+from .shots import Calibrated, ImageSize, Shot, listed, numbers, pinhole, read_xml
 
 FILM_WIDTH_MM = 36.0
 """Of the 35 mm film that focal lengths are given for; it stands for the image's longer side."""

@@ -1,7 +1,7 @@
 """Frames of cameras that recorded a sequence each, in step: by offsets that are given, or found in
 sound or motion."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from itertools import chain
 from pathlib import Path
@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from ...capture.images import image_size
-from ...capture.model import FPS_LIMIT, View
+from ...capture.model import FPS_LIMIT, View, evenly_spread
 from ...errors import StgaError
 from .model import Frames, ImageFrames
 from .shots import Shot
@@ -40,6 +40,7 @@ class FrameRange:
              named
     sync     how offsets that are not given are found, "sound", "motion" or "auto" as in
              `clock_offsets`, or "none"
+    most     at most so many of the frames are used, evenly spread; None: all
     """
 
     start: int = 0
@@ -47,6 +48,7 @@ class FrameRange:
     step: int = 1
     offsets: Mapping[str, int] = field(default_factory=dict)
     sync: str = "none"
+    most: int | None = None
 
     def __post_init__(self) -> None:
         if self.start < 0 or self.step < 1 or (self.stop is not None and self.stop <= self.start):
@@ -56,9 +58,11 @@ class FrameRange:
                 "least one"
             )
 
-    def selects(self, timestep: int) -> bool:
-        before_stop = self.stop is None or timestep < self.stop
-        return before_stop and timestep >= self.start and (timestep - self.start) % self.step == 0
+    def chosen(self, timesteps: Iterable[int]) -> list[int]:
+        """Those of ascending timesteps that are used."""
+        found = [t for t in timesteps if t >= self.start and (t - self.start) % self.step == 0]
+        found = [t for t in found if self.stop is None or t < self.stop]
+        return found if self.most is None else evenly_spread(found, self.most)
 
 
 Sequence = Video | list[Path]  # A camera's recording: a video, or images in order
@@ -109,7 +113,7 @@ def synchronized(
         recorded[name] = {timestep - offsets[name]: number for number, timestep in pairs}
     first, last = _common_range(sequences, frames, offsets)
     shared = sorted(set.intersection(*(set(own) for own in recorded.values())))
-    timesteps = [t for t in shared if first <= t < last and frames.selects(t)]
+    timesteps = frames.chosen(t for t in shared if first <= t < last)
     if not timesteps:
         raise StgaError(f"Frames from {frames.start} on: the cameras have only {last} in common")
     _require_same_gaps(sequences, offsets, timesteps)

@@ -8,6 +8,7 @@ from ...avatar.embedding import MIN_DIVISOR, face_areas
 from ...avatar.splats import Splats, colored_off_axis
 from ...capture.mesh_geometry import connected_parts
 from ...capture.model import Capture, View, evenly_spread, views_by_timestep
+from ...flame.quaternions import unit
 from .initial_splats import mean_colors, mirror_images
 from .semantic_regions import (
     BROWS_LEVEL,
@@ -47,9 +48,11 @@ NEAREST = 24
 SOURCE_TRIANGLES = 100
 """Triangles over which the light on a side of the face, and hair's color off axis, are medians, and
 over which unseen colors are softened."""
+COLLAR_SLOPE = 0.3
+"""Rise of a collar from front to back, by its depth."""
 LEVEL_WEIGHT = 3.0
-"""By how much shown triangles of neck and shoulders above and below a hidden one count as farther
-than those beside it: collars are level, and a chin's shadow is on a neck's front only."""
+"""By how much visible triangles of neck and shoulders above and below the collar's plane through a
+hidden one count as farther than those beside it: a chin's shadow is on a neck's front only."""
 SAME_COLOR_DEVIATION = 0.12
 """Largest difference in 0…1 of colors that differ by their shade alone: collars and hairlines stay
 sharp."""
@@ -181,8 +184,10 @@ class _Sides:
         self.of_face = np.zeros_like(well_shown)
         if surface.at is not None:
             self.of_face = ~surface.kinds["scalp"] & ~surface.kinds["body"]
-            up = surface.at.axes[1]
-            self._raised = self.centers + np.outer((LEVEL_WEIGHT - 1) * (self.centers @ up), up)
+            _, up, ahead = surface.at.axes
+            tilted = unit(up + COLLAR_SLOPE * ahead)
+            farther = (LEVEL_WEIGHT - 1) * (self.centers @ tilted)
+            self._raised = self.centers + np.outer(farther, tilted)
         self._hair = np.median(color[hair], axis=0) if len(hair) else np.full(3, np.inf)
         own = well_shown & self.of_face
         self._skin = np.median(color[own], axis=0) if own.any() else np.zeros(3)
