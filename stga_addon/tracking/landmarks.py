@@ -74,8 +74,8 @@ def detect_landmarks(
     """
     total = sum(len(camera.timesteps) for camera in footage.cameras)
     found: dict[str, CameraLandmarks] = {}
+    # Views with a second face, of cameras that see one moment
     crowded: list[tuple[FootageCamera, int]] = []
-    """Views with a second face, of cameras that see one moment."""
     done = 0
     for camera in footage.cameras:
         path = landmark_file(folder, camera.name)
