@@ -200,13 +200,13 @@ class Prepared:
 
     def train_as_asked(self, report: Report) -> "Trained":
         """Train on the device of the request, or the one chosen for it. Raises as
-        `training.run.session.train_and_measure`."""
-        from ..training.run.session import train_and_measure, train_more, train_run_or_fall_back
+        `training.run.session.train_run`."""
+        from ..training.run.session import train_more, train_run, train_run_or_fall_back
 
         if isinstance(self.request, Resume) and self.request.more_s is not None:
             return train_more(self.capture, self.request.run, self.run, self.request.more_s, report)
         is_auto = self.request.device == "auto"
-        train = train_run_or_fall_back if is_auto else train_and_measure
+        train = train_run_or_fall_back if is_auto else train_run
         resumes = isinstance(self.request, Resume)
         return train(self.capture, self.request.run, self.run, self.selection, resumes, report)
 

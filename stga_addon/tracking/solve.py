@@ -142,7 +142,7 @@ def solve_identity(
             matrix += block[:shared, :shared] - eliminated[:, :-1]
             right += gradient[:shared] - eliminated[:, -1]
         step = np.linalg.solve(matrix, right)
-        moves = np.stack([inside[:, -1] - inside[:, :-1] @ step for inside in solved])
+        moves: np.ndarray = np.stack([inside[:, -1] - inside[:, :-1] @ step for inside in solved])
         common = common + step
         frames = frames + moves
         if max(np.abs(step).max(), np.abs(moves).max()) < CONVERGED_STEP:

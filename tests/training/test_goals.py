@@ -91,7 +91,7 @@ def test_a_reached_target_ends_the_run(toy, tmp_path, monkeypatch):
     blurred = Quality(30.5, 0.5, detail_difference=0.2)
     found = iter([Quality(25.0, 0.5, detail_difference=0.1), blurred, blurred])
     monkeypatch.setattr(evaluator, "evaluate", lambda *arguments, **named: next(found))
-    path = train_run(toy, tmp_path / "sharper", run)
+    path = train_run(toy, tmp_path / "sharper", run).path
     end = read_checkpoint(tmp_path / "sharper")
     assert end.iteration == 20
     np.testing.assert_array_equal(read_avatar(path).splats.xyz, end.state.average.xyz)

@@ -268,7 +268,7 @@ def test_transparent_images_lie_over_the_settings_background(toy, tmp_path):
     assert_array_equal(target[0, 0], [51, 102, 153])
     plain = {"background": gray, "random_background": False}
     run = run_of(capture, lattice=0, iterations=2, **plain)
-    path = train_run(capture, tmp_path / "run", run)
+    path = train_run(capture, tmp_path / "run", run).path
     # behind the cameras: nothing but the background is rendered
     outside = np.ones(capture.neutral.shape) * 10
     avatar = read_avatar(path)

@@ -39,7 +39,7 @@ def test_a_run_writes_the_range_of_what_it_trained(toy, tmp_path):
     """Catches a range of held-out expressions, one that clips, and one nobody needs."""
     capture = replace(toy, mesh=lambda timestep: deformed(toy, timestep))
     run = run_of(capture, iterations=4, lattice=0, driven_offsets=COLORS)
-    found = read_avatar(train_run(capture, tmp_path / "on", run))
+    found = read_avatar(train_run(capture, tmp_path / "on", run).path)
     basis = strain_basis(toy.neutral, toy.faces, trained_range(len(toy.faces)))
     timesteps = {view.timestep for view in toy.views["train"]}
     trained = np.stack([deformation(basis, deformed(toy, t)) for t in timesteps])
@@ -48,7 +48,7 @@ def test_a_run_writes_the_range_of_what_it_trained(toy, tmp_path):
     assert (trained.max(0) <= limits[:, 1]).all()
     assert (trained.max(0) * 1.21 + 1e-6 >= limits[:, 1])[trained.max(0) > 0].all()
     without = run_of(capture, iterations=4, lattice=0)
-    assert read_avatar(train_run(capture, tmp_path / "off", without)).strain_range is None
+    assert read_avatar(train_run(capture, tmp_path / "off", without).path).strain_range is None
 
 
 def test_a_continuation_keeps_what_its_parent_saw(toy, tmp_path):
@@ -121,7 +121,7 @@ def test_evaluation_while_training_measures_the_avatar_that_is_written(toy, tmp_
     rates = Rates(strain_color=0.5)
     capture = replace(toy, mesh=mesh, views={**toy.views, "train": weak})
     run = run_of(capture, driven_offsets=COLORS, rates=rates, **plain)
-    path = train_run(capture, tmp_path / "run", run)
+    path = train_run(capture, tmp_path / "run", run).path
     best = kept_line(read_metrics(tmp_path / "run"), run.settings)
     found = evaluate_avatar(read_avatar(path), capture, "val").psnr
     assert found == pytest.approx(best["psnr"], abs=1e-3)

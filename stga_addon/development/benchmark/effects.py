@@ -72,7 +72,7 @@ def trained(
     )
     with tempfile.TemporaryDirectory() as folder:
         run = Run(capture.root, flame, "vhap", settings, plan)
-        avatar = read_avatar(train_run(capture, Path(folder), run))
+        avatar = read_avatar(train_run(capture, Path(folder), run).path)
         seconds = read_metrics(Path(folder))[-1]["seconds"]
         shown = with_refined_tracking(capture, Path(folder), fitted=False)
     splits = [split for split in ("val", "test") if shown.views.get(split)]

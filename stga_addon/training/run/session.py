@@ -115,30 +115,17 @@ def train_run_or_fall_back(
     resume: bool = False,
     report: Report = ignore,
 ) -> Trained:
-    """`train_and_measure`; where a GPU fails, on the CPU from the last checkpoint on."""
+    """`train_run`; where a GPU fails, on the CPU from the last checkpoint on."""
     try:
-        return train_and_measure(capture, out, run, selection, resume, report)
+        return train_run(capture, out, run, selection, resume, report)
     except DeviceError as error:
         _log.warning("%s; continuing on the CPU from the last checkpoint", error.cause)
     # Outside the handler: the error's traceback would keep the failed loop and its buffers alive.
     report(Progress(stage="Continuing on the CPU"))
-    run = replace(run, device="cpu")
-    return train_and_measure(capture, out, run, selection, True, report)
+    return train_run(capture, out, replace(run, device="cpu"), selection, True, report)
 
 
 def train_run(
-    capture: Capture,
-    out: Path,
-    run: Run,
-    selection: Selection | None = None,
-    resume: bool = False,
-    report: Report = ignore,
-) -> Path:
-    """`train_and_measure`; the path of the avatar file."""
-    return train_and_measure(capture, out, run, selection, resume, report).path
-
-
-def train_and_measure(
     capture: Capture,
     out: Path,
     run: Run,
@@ -185,7 +172,7 @@ def train_more(
     capture: Capture, out: Path, run: Run, seconds: float, report: Report = ignore
 ) -> Trained:
     """Train the run in the folder `out` for so many seconds more than it was, whether its budget is
-    spent or not, by the later part of its schedule. Raises as `train_and_measure` does."""
+    spent or not, by the later part of its schedule. Raises as `train_run` does."""
     lpips.load_network()
     with folders.locked(out):
         run = replace(run, identity=folders.check_identity(out, run, capture))

@@ -87,7 +87,7 @@ def test_timesteps_that_are_left_out_look_like_the_recording(drifting, tmp_path)
     for choice in ("on", "off"):
         settings, _ = planned(drifting, iterations=100, exposure=choice)
         run = Run(drifting.root, None, "vhap", replace(settings, effects=None))
-        avatar = train_run(drifting, tmp_path / choice, run)
+        avatar = train_run(drifting, tmp_path / choice, run).path
         quality = evaluate_avatar(read_avatar(avatar), drifting, "val")
         assert quality.psnr_unmatched is None
         psnr[choice] = quality.psnr
