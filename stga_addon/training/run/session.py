@@ -56,7 +56,14 @@ from .continuation import (
     starting_state,
 )
 from .folder import AVATAR, CHECKPOINT, TRACKING, Run
-from .metrics_log import METRICS, TRACKING_GAIN, append_metrics, cut_metrics, read_metrics
+from .metrics_log import (
+    METRICS,
+    REGION_PSNR,
+    TRACKING_GAIN,
+    append_metrics,
+    cut_metrics,
+    read_metrics,
+)
 
 _log = logging.getLogger(__name__)
 CHECKPOINT_S = 30.0
@@ -558,6 +565,7 @@ class _Session:
             "psnr": last.get("psnr"),
             "psnr_unmatched": last.get(UNMATCHED),
             "splats": len(self.trainer),
+            **self._gain(),
             **more,
         }
 
@@ -572,6 +580,12 @@ class _Session:
 
         share = min(1.0, spent.share)
         return self.report(Progress(share, stage, evaluator.forecast_text, known, preview))
+
+    def _gain(self) -> dict[str, float]:
+        """Accuracy of the region of a refinement before it, and now."""
+        lines = self.evaluator.lines
+        known = [line[REGION_PSNR] for line in lines if REGION_PSNR in line]
+        return {} if len(known) < 2 else {"before_db": known[0], "after_db": known[-1]}
 
     def _avatar(self) -> Avatar:
         return self.trainer.avatar(self.run.principal_point, self._strain_limits())
