@@ -44,8 +44,25 @@ QUALITIES_DB = {"Good": 30.0, "Usable": 25.0, "Rough": -math.inf}
 """Word for a held-out PSNR -> from which on."""
 
 
+MIN_SEEN_GAIN_DB = 0.1
+"""Gains that nobody sees are smaller."""
+MORE_GAIN = "what may help: Growth, which adds splats there, or footage that shows it larger"
+"""What there is to do where training a region further gains nothing that is seen."""
+
+
+def describe_gain(before_db: float, after_db: float) -> str:
+    """Accuracy of a region before and after it was trained further, and what would help."""
+    gain = after_db - before_db
+    told = f"{before_db:.2f} dB before, {after_db:.2f} dB after ({gain:+.2f})"
+    return told if gain >= MIN_SEEN_GAIN_DB else f"{told}; {MORE_GAIN}"
+
+
 def describe_quality(figures: Mapping[str, float]) -> str:
-    """A word for how good an avatar is; "" before its first evaluation."""
+    """A word for how good an avatar is, or for what was gained in its region; "" before its first
+    evaluation."""
+    if "before_db" in figures:
+        gain = figures["after_db"] - figures["before_db"]
+        return "Better" if gain >= MIN_SEEN_GAIN_DB else "No Better"
     psnr = figures.get("psnr", math.nan)
     return next((word for word, least in QUALITIES_DB.items() if psnr >= least), "")
 
@@ -63,6 +80,7 @@ def describe_figures(figures: Mapping[str, float]) -> list[str]:
     and the time that is left.
 
     per_second  iterations
+    before_db, after_db  of the region that is trained further, `describe_gain`
     psnr, psnr_unmatched   of the last evaluation, dB, the second one without fitting the exposure
                            of views
     error_px, unexplained  of a tracked head: median distance from its landmarks, share of the face
@@ -83,6 +101,8 @@ def describe_figures(figures: Mapping[str, float]) -> list[str]:
         (("splats", "{:,.0f} splats"), ("memory_mb", "{:.0f} MB memory")),
     )
     lines = []
+    if "before_db" in figures:
+        lines.append(describe_gain(figures["before_db"], figures["after_db"]))
     for pair in pairs:
         parts = []
         for name, text in pair:

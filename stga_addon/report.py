@@ -12,7 +12,7 @@ import numpy as np
 
 from .errors import StgaError
 from .files import replacing
-from .format import format_duration
+from .format import describe_gain, format_duration
 from .training.evaluate import forecast as forecasts
 from .training.evaluate.forecast import (
     DETAIL,
@@ -22,7 +22,7 @@ from .training.evaluate.forecast import (
     detail_curve,
 )
 from .training.run.folder import read_run
-from .training.run.metrics_log import TRACKING_GAIN, read_metrics
+from .training.run.metrics_log import REGION_PSNR, TRACKING_GAIN, read_metrics
 from .training.settings import TrainingSettings
 
 # imported when a chart is drawn: it takes half a second, and the command line starts without it
@@ -150,6 +150,8 @@ def summarize_continuation(metrics: Sequence[Mapping[str, Any]]) -> list[str]:
         before = first[name]
         after = last.get(name, math.nan)
         change = f"{before:.2f} dB before, {after:.2f} dB after ({after - before:+.2f})"
+        if name == REGION_PSNR:
+            change = describe_gain(before, after)
         lines.append(f"{label}: {change}")
     return lines
 

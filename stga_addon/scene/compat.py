@@ -1,11 +1,13 @@
 """Differences between Blender 4.2 and 5.3: every version switch of the add-on."""
 
-from collections.abc import Callable
+from collections.abc import Mapping
 from contextlib import suppress
-from typing import Any
+from typing import Any, NamedTuple
 
 import bpy
 import numpy as np
+
+from . import tags
 
 SLOTTED_ACTIONS = bpy.app.version >= (4, 4, 0)
 MODIFIER_INPUT_PROPERTIES = bpy.app.version >= (5, 2, 0)
@@ -45,6 +47,13 @@ def action_curves(owner: Any) -> Any:
     layer = action.layers[0] if action.layers else action.layers.new("Layer")
     strip = layer.strips[0] if layer.strips else layer.strips.new(type="KEYFRAME")
     return strip.channelbag(animation.action_slot, ensure=True).fcurves
+
+
+def strip_curves(strip: Any) -> Any:
+    """The f-curves of an NLA strip that was an action of `action_curves`."""
+    if not SLOTTED_ACTIONS:
+        return strip.action.fcurves
+    return strip.action.layers[0].strips[0].channelbag(strip.action_slot, ensure=True).fcurves
 
 
 def animation_curves(owner: Any) -> list[Any]:
@@ -113,43 +122,83 @@ STRIP_FIELDS = (
     "influence",
     "mute",
 )
-"""What `keep_strips` keeps of an NLA strip, in an order in which it can be set."""
+"""What `keep_animation` keeps of an NLA strip, in an order in which it can be set."""
 
 
-def keep_strips(owner: Any) -> Callable[[Any], None]:
-    """What gives the NLA tracks that `owner` has now to another owner, above the action that it has
-    then; not the strip at the bottom, which its last import was pushed down to."""
-    kept = []
+class KeptAnimation(NamedTuple):
+    """What performances gave an owner: NLA tracks, as name, whether muted and strips; values that
+    shape keys have beside them, by data path; and the action in place of its own, with the slot's
+    identifier, None for its own."""
+
+    tracks: list[tuple[str, bool, list[tuple[Any, ...]]]]
+    held: Mapping[str, float]
+    action: Any = None
+    slot: str | None = None
+
+
+def slot_of(user: Any) -> str | None:
+    """Identifier of the slot of a strip or of animation data; None without one."""
+    slot = user.action_slot if SLOTTED_ACTIONS else None
+    return None if slot is None else str(slot.identifier)
+
+
+def keep_animation(owner: Any) -> KeptAnimation:
+    """The animation of performances, not the strips at the bottom, which that of the last import
+    was pushed down to; nothing of None."""
     animation = owner.animation_data if owner is not None else None
-    for row, track in enumerate(animation.nla_tracks if animation else ()):
+    tracks = animation.nla_tracks if animation else ()
+    lowest = [strip for strip in tracks[0].strips if strip.action] if tracks else []
+    holding = [strip for strip in lowest if tags.HELD in strip.action]
+    held = dict[str, float]()
+    for strip in holding if holding and owner.id_type == "KEY" else ():
+        held |= {each.data_path: each.evaluate(0) for each in strip_curves(strip)}
+    own_rows = 1 + bool(holding)
+    kept = []
+    for row, track in enumerate(tracks):
         strips = []
         for strip in track.strips:
-            if strip.action is None or (row == 0 and strip.action.name.startswith(owner.name)):
+            is_own = row < own_rows and strip.action and strip.action.name.startswith(owner.name)
+            if strip.action is None or is_own:
                 continue
             strip.action.use_fake_user = True
-            slot = strip.action_slot.identifier if SLOTTED_ACTIONS and strip.action_slot else None
             fields = {name: getattr(strip, name) for name in STRIP_FIELDS}
-            strips.append((strip.name, strip.action, slot, fields))
+            strips.append((strip.name, strip.action, slot_of(strip), fields))
         if strips:
             kept.append((track.name, track.mute, strips))
+    action = animation.action if animation else None
+    if action is None or tags.PERFORMANCE not in action:
+        return KeptAnimation(kept, held)
+    action.use_fake_user = True
+    return KeptAnimation(kept, held, action, slot_of(animation))
 
-    def give_back(other: Any) -> None:
-        if not kept:
-            return
-        push_down_action(other)
-        tracks = (other.animation_data or other.animation_data_create()).nla_tracks
-        for name, is_muted, strips in kept:
-            track = tracks.new()
-            track.name = name
-            track.mute = is_muted
-            for title, action, slot, fields in strips:
-                strip = track.strips.new(title, int(fields["frame_start_raw"]), action)
-                if slot is not None:
-                    strip.action_slot = action.slots[slot]
-                for field, value in fields.items():
-                    setattr(strip, field, value)
 
-    return give_back
+def give_animation(owner: Any, kept: KeptAnimation) -> None:
+    """Give an owner kept tracks above those that it has, and the kept action in place of its
+    own, which stays in the file."""
+    if not kept.tracks and kept.action is None:
+        return
+    animation = owner.animation_data or owner.animation_data_create()
+    for name, is_muted, strips in kept.tracks:
+        track = animation.nla_tracks.new()
+        track.name = name
+        track.mute = is_muted
+        for title, action, slot, fields in strips:
+            strip = track.strips.new(title, int(fields["frame_start_raw"]), action)
+            if slot is not None:
+                strip.action_slot = action.slots[slot]
+            for field, value in fields.items():
+                setattr(strip, field, value)
+    if kept.action is not None:
+        if animation.action is not None:
+            animation.action.use_fake_user = True
+        assign_action(animation, kept.action, kept.slot)
+
+
+def assign_action(animation: Any, action: Any, slot: str | None) -> None:
+    """Let an action animate the owner of `animation`, by the slot of an identifier."""
+    animation.action = action
+    if slot is not None:
+        animation.action_slot = action.slots[slot]
 
 
 def select_bones(rig: Any, names: set[str]) -> None:

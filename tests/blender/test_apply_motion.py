@@ -11,6 +11,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from stga_addon.capture.open import open_capture
 from stga_addon.flame.forward import FlameFrame, flame_forward
+from stga_addon.scene.arrays import key_points
 from stga_addon.scene.rig.head import rig_of
 from stga_addon.training.optimize.avatar_tracking import RefinedTracking
 from stga_addon.training.run.folder import with_refined_tracking, write_tracking
@@ -112,7 +113,55 @@ def test_importing_again_keeps_the_shot(scene):
         for time, expected in zip(times, before, strict=True):
             assert_allclose(mesh_at(time), expected, atol=TOLERANCE)
     for owner in (rig_of(panel().head), panel().head.data.shape_keys):
-        assert len(owner.animation_data.nla_tracks) == 3
+        assert len(owner.animation_data.nla_tracks) == 4  # held, own, and two performances
+    ops.apply_motion(filepath=scene.file, start=0)
+    before = [mesh_at(time) for time in times]
+    for _ in range(2):
+        ops.import_capture(directory=scene.folder, flame=scene.model_file)
+        for time, expected in zip(times, before, strict=True):
+            assert_allclose(mesh_at(time), expected, atol=TOLERANCE)
+
+
+def test_a_mesh_sequence_keeps_its_performances(tmp_path):
+    """Catches performances, and the shapes that they move, which another import of the same
+    capture takes away."""
+    folder = write_mesh_capture(tmp_path / "capture")
+    ops.import_capture(directory=folder)
+    head = panel().head
+    shape = head.shape_key_add(name="jawOpen", from_mix=False)
+    shape.value = 0.0
+    for point in shape.points:
+        point.co.z -= 0.02
+    table = "Timecode,BlendshapeCount,JawOpen\n00:00:00:00,1,0\n00:00:01:00,1,1\n"
+    (tmp_path / "take.csv").write_text(table)
+    times = (0, 1, 3, 20, 30, 40)
+    for place in ("strip", "action"):
+        ops.apply_motion(filepath=tmp_path / "take.csv", start=12, place=place, blend=0)
+        before = [mesh_at(time) for time in times]
+        assert np.abs(before[4] - before[5]).max() > 0.005
+        neutral = key_points(panel().head.data.shape_keys.reference_key)
+        if place == "strip":
+            assert_allclose(mesh_at(70), neutral, atol=TOLERANCE)
+        for _ in range(2):
+            ops.import_capture(directory=folder)
+            for time, expected in zip(times, before, strict=True):
+                assert_allclose(mesh_at(time), expected, atol=TOLERANCE)
+
+
+def test_the_head_is_neutral_beside_strips(scene):
+    """Catches the capture's last grimace held beside performances, a head that jumps there, and one
+    that is neutral where its capture plays."""
+    last = max(scene.own.timesteps)
+    own = [mesh_at(frame) for frame in scene.own.timesteps]
+    ops.apply_motion(filepath=scene.file, start=20, place="strip", blend=0)
+    for frame, expected in zip(scene.own.timesteps, own, strict=True):
+        assert_allclose(mesh_at(frame), expected, atol=TOLERANCE)
+    zero = np.zeros(3)
+    tracked = vars(scene.own.frame(last))
+    quiet = {"expr": np.zeros(2), "neck_pose": zero, "jaw_pose": zero, "eyes_pose": np.zeros(6)}
+    for frame in (last + 5, 40):
+        assert_allclose(mesh_at(frame), scene.mesh(**{**tracked, **quiet}), atol=TOLERANCE)
+    assert_allclose(mesh_at(22), scene.mesh(**scene.theirs(2)), atol=TOLERANCE)
 
 
 def test_undo(scene):

@@ -13,7 +13,7 @@ from PIL import Image
 from stga_addon import report
 from stga_addon.development.benchmark.benchmark import benchmark_chart, report_text
 from stga_addon.development.benchmark.statistics import MeanCurve, Outcome
-from stga_addon.format import describe_figures
+from stga_addon.format import MORE_GAIN, describe_figures, describe_quality
 from stga_addon.jobs.analyze import Analyze
 from stga_addon.jobs.perform import perform
 from stga_addon.report import CURVE, report_run, run_chart, summarize_run
@@ -112,6 +112,22 @@ def test_summary_of_a_continuation():
         "held-out views (exposure not fitted): 15.00 dB before, 15.00 dB after (+0.00)",
         "take 2 (exposure fitted): 20.00 dB before, 19.50 dB after (-0.50)",
     ]
+
+
+@pytest.mark.parametrize(("after", "word"), [(37.47, "No Better"), (38.1, "Better")])
+def test_a_refinement_says_what_it_gained(after, word):
+    """Catches "Good" of a refinement that gained nothing, and one that does not say what would
+    help."""
+    first, last = metrics([30.0, 30.0], splats=9)
+    lines = report.summarize_continuation(
+        [{**first, "psnr_region": 37.44}, {**last, "psnr_region": after}]
+    )
+    gain = f"37.44 dB before, {after:.2f} dB after ({after - 37.44:+.2f})"
+    told = gain if word == "Better" else f"{gain}; {MORE_GAIN}"
+    assert f"region: {told}" in [line.replace(" (exposure fitted)", "") for line in lines]
+    figures = {"psnr": 37.0, "before_db": 37.44, "after_db": after}
+    assert describe_quality(figures) == word
+    assert describe_figures(figures)[0] == told
 
 
 def test_report_of_a_finished_run(toy, tmp_path, monkeypatch):

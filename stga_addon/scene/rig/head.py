@@ -8,7 +8,8 @@ child of a hidden bone `<name>_joint`, driven to d, and the parent of a hidden b
 driven to -d, which the vertices follow. All drivers are arithmetic, which Blender evaluates without
 Python."""
 
-from collections.abc import Sequence
+import re
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import bpy
@@ -22,7 +23,7 @@ from ...flame.model import JOINTS, FlameModel
 from ...flame.sequence import MIN_JOINT_ANGLE_DEG, FlameSequence, joint_angles
 from .. import arrays, tags
 from ..arrays import Z_UP_TO_Y_UP, add_driver, flat_floats, key_points
-from ..compat import keep_strips
+from ..compat import KeptAnimation, give_animation, keep_animation
 from ..objects import Warn, capture_root, leave_edit_mode, log_warning, place, remove, reset
 from . import keyframes
 from .keyframes import MAX_SLIDER, key_value_path, location_path, property_path, rotation_path
@@ -33,36 +34,72 @@ def import_head(capture: Capture, warn: Warn = log_warning, correctives: str = "
     timestep. A FLAME capture becomes a rig (see `add_rig`, also for `correctives`); any other gets
     a shape key per timestep, `t00012`, which is 1 at its own frame. Object coordinates are the
     capture's (meters, y up). Regions become boolean face attributes. Importing the same source
-    again replaces the last import; vertex groups and materials stay if the triangles are the same,
-    and the NLA strips of performances.
+    again replaces the last import; performances stay, and, if the triangles are the same, vertex
+    groups, materials and other shape keys of a mesh without FLAME.
     `warn` receives one sentence per problem. Raises StgaError where a timestep cannot be read, and
     leaves the scene."""
     sequence = capture.flame
-    if sequence is not None:
-        frames = sequence.frames()
-        before = next(iter(tags.find(tags.HEAD, capture.root)), None)
-        rig = next(iter(_rigs(before)), None) if before is not None else None
-        give_keys = keep_strips(before.data.shape_keys if before is not None else None)
-        give_bones = keep_strips(rig)
-        head = _place_head(capture)
-        rig = add_rig(head, sequence, frames, warn, correctives)
-        give_keys(head.data.shape_keys)
-        give_bones(rig)
-        return head
-    meshes = [flat_floats(capture.mesh(timestep)) for timestep in capture.timesteps]
+    frames = [] if sequence is None else sequence.frames()
+    meshes = []
+    if sequence is None:
+        meshes = [flat_floats(capture.mesh(timestep)) for timestep in capture.timesteps]
+    before = next(iter(tags.find(tags.HEAD, capture.root)), None)
+    kept_keys = keep_animation(before.data.shape_keys if before is not None else None)
+    kept_bones = keep_animation(next(iter(_rigs(before)), None) if before is not None else None)
+    others = _other_keys(before, capture)
     head = _place_head(capture)
+    if sequence is not None:
+        _give_back(add_rig(head, sequence, frames, warn, correctives), kept_bones)
+    else:
+        _add_timesteps(head, capture.timesteps, meshes)
+        _add_keys(head, others)
+    _give_back(head.data.shape_keys, kept_keys)
+    return head
+
+
+def _give_back(owner: Any, kept: KeptAnimation) -> None:
+    if kept.tracks:
+        keyframes.push_down_own(owner)
+    if kept.held:
+        keyframes.hold_beside_strips(owner, kept.held)
+    give_animation(owner, kept)
+
+
+def _add_timesteps(head: Any, timesteps: Sequence[int], meshes: Sequence[np.ndarray]) -> None:
+    """A shape key for each timestep, and no rig of an earlier import."""
     rigs = _rigs(head)
     _remove_bone_groups(head, rigs)
     for modifier in list(head.modifiers):
         if modifier.type == "ARMATURE" and modifier.object in rigs:
             head.modifiers.remove(modifier)
     remove(rigs)
-    names = [f"t{timestep:05d}" for timestep in capture.timesteps]
+    names = [f"t{timestep:05d}" for timestep in timesteps]
     for name, mesh in zip(names, meshes, strict=True):
         head.shape_key_add(name=name, from_mix=False).points.foreach_set("co", mesh)
     keys = head.data.shape_keys
-    arrays.write_triangle_curves(keys, [key_value_path(name) for name in names], capture.timesteps)
-    return head
+    arrays.write_triangle_curves(keys, [key_value_path(name) for name in names], timesteps)
+
+
+TIMESTEP_KEY = re.compile(r"t\d{5,}")
+
+
+def _other_keys(head: Any, capture: Capture) -> dict[str, tuple[np.ndarray, float]]:
+    """Displacements (V, 3) and values of the shape keys of a mesh without FLAME that its import did
+    not make, such as ARKit's; none where the triangles change."""
+    keys = head.data.shape_keys if head is not None else None
+    if keys is None or find_rig(head) or not arrays.has_triangles(head.data, capture.faces):
+        return {}
+    basis = key_points(keys.reference_key)
+    own = [each for each in keys.key_blocks[1:] if not TIMESTEP_KEY.fullmatch(each.name)]
+    return {each.name: (key_points(each) - basis, each.value) for each in own}
+
+
+def _add_keys(head: Any, keys: Mapping[str, tuple[np.ndarray, float]]) -> None:
+    basis = key_points(head.data.shape_keys.reference_key)
+    for name, (displacement, value) in keys.items():
+        key = head.shape_key_add(name=name, from_mix=False)
+        key.points.foreach_set("co", flat_floats(basis + displacement))
+        key.value = value
 
 
 def _place_head(capture: Capture) -> Any:

@@ -1,6 +1,6 @@
 """Keyframes of a FLAME head, names and data paths of what they move, and ARKit's 52 shapes."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import partial
 from typing import Any, NamedTuple
@@ -16,8 +16,16 @@ from ...flame.forward import FlameFrame, flame_forward, joint_positions
 from ...flame.model import JOINTS, FlameModel
 from ...flame.quaternions import continuous, from_axis_angle
 from ...flame.sequence import PARTS, FlameSequence
+from .. import tags
 from ..arrays import add_driver, flat_floats, key_points, write_curves, write_triangle_curves
-from ..compat import action_curves, copy_action, push_down_action
+from ..compat import (
+    action_curves,
+    assign_action,
+    copy_action,
+    push_down_action,
+    slot_of,
+    strip_curves,
+)
 from ..objects import Warn, log_warning
 
 IDENTITY_SLIDERS = 10
@@ -175,6 +183,49 @@ class Placement(NamedTuple):
     blend: float = 0.0
 
 
+def push_down_own(owner: Any) -> None:
+    """Turn the action of rig or shape keys into a strip with effect only where it lasts: beside it
+    the face is neutral, and the head stays where it was."""
+    animation = owner.animation_data
+    if animation is None or animation.action is None:
+        return
+    curves = action_curves(owner)
+    if owner.id_type == "KEY":
+        hold_beside_strips(owner, {each.data_path: 0.0 for each in curves})
+    elif not animation.nla_tracks and any(is_of_parts(each.data_path, ["head"]) for each in curves):
+        action = animation.action
+        slot = slot_of(animation)
+        held = copy_action(owner, f"{owner.name} place")
+        for curve in [each for each in held if not is_of_parts(each.data_path, ["head"])]:
+            held.remove(curve)
+        animation.action[tags.HELD] = True
+        push_down_action(owner)
+        assign_action(animation, action, slot)
+    push_down_action(owner, "NOTHING")
+
+
+def hold_beside_strips(owner: Any, values: Mapping[str, float]) -> None:
+    """Let shape keys have these values by data path where no strip animates them, unless they have
+    some already: there, Blender's own are 1."""
+    animation = owner.animation_data
+    is_new = not animation.nla_tracks
+    lowest = None if is_new else next(iter(animation.nla_tracks[0].strips), None)
+    if not is_new and (lowest is None or not lowest.action or tags.HELD not in lowest.action):
+        return  # of an older version
+    action = animation.action
+    slot = slot_of(animation)
+    if is_new:
+        animation.action = bpy.data.actions.new(f"{owner.name} place")
+        animation.action[tags.HELD] = True
+    curves = action_curves(owner) if is_new else strip_curves(lowest)
+    for path, value in values.items():
+        if curves.find(path) is None:
+            curves.new(path).keyframe_points.insert(0, value)
+    if is_new:
+        push_down_action(owner)
+        assign_action(animation, action, slot)
+
+
 @contextmanager
 def new_actions(
     owners: Sequence[Any], placement: Placement, replaces: Callable[[str], bool]
@@ -183,7 +234,7 @@ def new_actions(
     for owner in owners:
         title = f"{owner.name} {placement.name}"
         if placement.as_strip:
-            push_down_action(owner)
+            push_down_own(owner)
             animation = owner.animation_data or owner.animation_data_create()
             animation.action = bpy.data.actions.new(title)
             continue
@@ -193,7 +244,11 @@ def new_actions(
     yield
     for owner in owners:
         owner.animation_data.action.use_fake_user = True
+        owner.animation_data.action[tags.PERFORMANCE] = True
         if placement.as_strip:
+            if owner.id_type == "KEY":
+                paths = [each.data_path for each in action_curves(owner)]
+                hold_beside_strips(owner, {path: owner.path_resolve(path) for path in paths})
             push_down_action(owner, extrapolation="NOTHING")
             strip = owner.animation_data.nla_tracks[-1].strips[0]
             # both, also where the motion is too short for the two

@@ -56,7 +56,13 @@ from .continuation import (
     starting_state,
 )
 from .folder import AVATAR, CHECKPOINT, TRACKING, Run
-from .metrics_log import METRICS, TRACKING_GAIN, append_metrics, cut_metrics
+from .metrics_log import (
+    METRICS,
+    REGION_PSNR,
+    TRACKING_GAIN,
+    append_metrics,
+    cut_metrics,
+)
 
 _log = logging.getLogger(__name__)
 
@@ -572,6 +578,7 @@ class _Session:
             "psnr": last.get("psnr"),
             "psnr_unmatched": last.get(UNMATCHED),
             "splats": len(self.trainer),
+            **self._gain(),
             **more,
         }
 
@@ -588,6 +595,12 @@ class _Session:
         detail = evaluator.forecast_text
         lines = tuple(evaluator.lines)
         return self.report(Progress(share, stage, detail, known, preview, metrics=lines))
+
+    def _gain(self) -> dict[str, float]:
+        """Accuracy of the region of a refinement before it, and now."""
+        lines = self.evaluator.lines
+        known = [line[REGION_PSNR] for line in lines if REGION_PSNR in line]
+        return {} if len(known) < 2 else {"before_db": known[0], "after_db": known[-1]}
 
     def _avatar(self) -> Avatar:
         return self.trainer.avatar(self.run.principal_point, self._strain_limits())
