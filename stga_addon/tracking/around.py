@@ -162,7 +162,9 @@ def _with_cameras(footage: Footage, out: Path, crew: Crew) -> tuple[Footage, str
     given = footage.focal != "usual"
     focal = camera.camera.fl_x if given else None
     threads = min(processors(), MAX_THREADS)
-    options = SearchOptions(focal, footage.focal == "given", threads, MIN_IMAGES, MIN_ON_HEAD)
+    in_order = isinstance(camera.frames, VideoFrames) or len(camera.timesteps) > MAX_PHOTOS
+    keeps_focal = footage.focal == "given"
+    options = SearchOptions(focal, keeps_focal, in_order, threads, MIN_IMAGES, MIN_ON_HEAD)
     scratch = out / folder.KEPT_FOLDER / f"structure-{file_state(camera.frames.files)}"
     part = (camera, timesteps, options, scratch)
     stages = [(stage, len(timesteps)) for stage in _SEARCH_STAGES]
