@@ -202,7 +202,7 @@ class _Search:
         size = self._camera.camera.width, self._camera.camera.height
         focal = self._options.focal_px
         if focal is not None:
-            reader.camera_params = f"{focal!r},{size[0] / 2!r},{size[1] / 2!r}"
+            reader.camera_params = f"{float(focal)!r},{size[0] / 2!r},{size[1] / 2!r}"
         if masked:
             reader.mask_path = str(self._folder / MASKS_FOLDER)
         extraction = colmap.FeatureExtractionOptions()
