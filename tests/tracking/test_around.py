@@ -63,12 +63,12 @@ def test_cameras_are_those_that_filmed(tmp_path, pictures, k):
     pytest.importorskip("pycolmap")
     cameras = walk(COUNT)
     source = tmp_path / "walk.mp4"
-    if k:
+    if k:  # of so few frames, the room tells too little for the take to be recognized
         images = [distorted(*pair, k) for pair in zip(pictures, cameras, strict=True)]
         encode(source, images, options={"crf": "8"}, rate=2)
     else:
         source = write_pictures(tmp_path / "photos", pictures)
-    footage, line = found(source, tmp_path / "out")
+    footage, line = found(source, tmp_path / "out", "around" if k else "auto")
     assert re.search(rf"around a still head.*cameras of {COUNT} of {COUNT} images found", line)
     assert ("distortion" in line) == bool(k)
     assert footage.timesteps == (0,)
