@@ -131,11 +131,12 @@ def with_found_cameras(
         found, line = _with_cameras(footage, out, crew)
         return found, (f"take: around a still head, as given; {line}",)
     (camera,) = footage.cameras
+    if len(camera.timesteps) < MIN_IMAGES:
+        return footage, ()
     seen = _recognized(footage, camera, crew)
     photos = isinstance(camera.frames, ImageFrames) and len(camera.timesteps) <= MAX_PHOTOS
-    enough = len(camera.timesteps) >= MIN_IMAGES
-    plain_photos = photos and seen.turns and np.isnan(seen.parallax)
-    if not enough or not (seen.is_around or plain_photos):
+    plain_photos = photos and seen.turns and bool(np.isnan(seen.parallax))
+    if not (seen.is_around or plain_photos):
         return footage, ()
     try:
         found, line = _with_cameras(footage, out, crew)
@@ -162,7 +163,9 @@ def _with_cameras(footage: Footage, out: Path, crew: Crew) -> tuple[Footage, str
     given = footage.focal != "usual"
     focal = camera.camera.fl_x if given else None
     threads = min(processors(), MAX_THREADS)
-    options = SearchOptions(focal, footage.focal == "given", threads, MIN_IMAGES, MIN_ON_HEAD)
+    in_order = isinstance(camera.frames, VideoFrames) or len(camera.timesteps) > MAX_PHOTOS
+    keeps_focal = footage.focal == "given"
+    options = SearchOptions(focal, keeps_focal, in_order, threads, MIN_IMAGES, MIN_ON_HEAD)
     scratch = out / folder.KEPT_FOLDER / f"structure-{file_state(camera.frames.files)}"
     part = (camera, timesteps, options, scratch)
     stages = [(stage, len(timesteps)) for stage in _SEARCH_STAGES]
@@ -255,6 +258,7 @@ def _cameras(camera: FootageCamera, structure: Structure) -> tuple[FootageCamera
     lens = Lens(radial=(structure.distortion,)) if structure.distortion else Lens()
     digits = len(str(max(camera.timesteps)))
     cameras = []
+    stems = set[str]()
     for timestep, pose in zip(structure.timesteps.tolist(), structure.poses, strict=True):
         focal = structure.focal_px
         world_to_camera = np.vstack([pose, [0.0, 0.0, 0.0, 1.0]])
@@ -267,7 +271,8 @@ def _cameras(camera: FootageCamera, structure: Structure) -> tuple[FootageCamera
         else:
             view = frames.views[timestep]
             frames = ImageFrames({0: replace(view, timestep=0, camera=recorded)})
-            name = view.image.stem
+            name = view.image.name if view.image.stem in stems else view.image.stem
+            stems.add(view.image.stem)
         resampled = undistortion(recorded, lens, camera.source(timestep))
         ideal = recorded if resampled is None else resampled.camera
         cameras.append(FootageCamera(name, ideal, frames, resampled))
@@ -303,7 +308,7 @@ def recognize(camera: FootageCamera, fps: float | None, step: Step) -> dict[str,
         default=0.0,
     )
     pairs = []
-    if turn >= MIN_TURN_DEG and len(timesteps) >= MIN_IMAGES:
+    if turn >= MIN_TURN_DEG:
         if isinstance(camera.frames, ImageFrames) and len(timesteps) <= MAX_PHOTOS:
             row = sorted(samples.values(), key=lambda sample: sample.yaw)
             pairs = list(pairwise(row))

@@ -28,6 +28,12 @@ PEAK_THRESHOLD = 0.002
 times as many points and an error of the focal length of 2 instead of 12 %."""
 EDGE_THRESHOLD = 20.0
 """Largest ratio of a feature's curvatures, twice COLMAP's: lashes, lips and seams are edges."""
+MAX_FEATURES = 4096
+"""Of an image, the largest ones: comparing two images takes the time of its square."""
+NEAR_IMAGES = 10
+"""Images of a video that are compared with one before them."""
+LOOP_STEP = 4
+"""Of every so many, all are compared: a camera may come back."""
 MIN_MODEL_IMAGES = 3
 """Images of the smallest model that COLMAP keeps."""
 LENS_GAIN = 0.03
@@ -93,6 +99,7 @@ class SearchOptions:
 
     focal_px      focal length that is known or assumed; None: found without
     keeps_focal   whether it is exact
+    in_order      whether images follow each other in time
     threads       that COLMAP may use
     min_images, min_on_head   images and points on the face below which only the person is looked
                   at
@@ -100,6 +107,7 @@ class SearchOptions:
 
     focal_px: float | None
     keeps_focal: bool
+    in_order: bool
     threads: int
     min_images: int
     min_on_head: int
@@ -194,13 +202,14 @@ class _Search:
         size = self._camera.camera.width, self._camera.camera.height
         focal = self._options.focal_px
         if focal is not None:
-            reader.camera_params = f"{focal!r},{size[0] / 2!r},{size[1] / 2!r}"
+            reader.camera_params = f"{float(focal)!r},{size[0] / 2!r},{size[1] / 2!r}"
         if masked:
             reader.mask_path = str(self._folder / MASKS_FOLDER)
         extraction = colmap.FeatureExtractionOptions()
         extraction.num_threads = self._options.threads
         extraction.max_image_size = MAX_IMAGE_PX
         extraction.sift.first_octave = -1 if max(size) <= DOUBLED_IMAGE_PX else 0
+        extraction.sift.max_num_features = MAX_FEATURES
         extraction.sift.peak_threshold = PEAK_THRESHOLD
         extraction.sift.edge_threshold = EDGE_THRESHOLD
         extraction.sift.upright = True
@@ -221,7 +230,7 @@ class _Search:
                 step()
 
     def _match(self, step: Step) -> None:
-        """All pairs, image by image."""
+        """Image by image, its pairs with those before it: all, or of a video the near ones."""
         colmap = self._colmap
         matching = colmap.FeatureMatchingOptions()
         matching.num_threads = self._options.threads
@@ -231,7 +240,7 @@ class _Search:
         names = list(self._names)
         for number, name in enumerate(names):
             if number:
-                lines = (f"{other} {name}" for other in names[:number])
+                lines = (f"{names[other]} {name}" for other in self._compared(number))
                 pairs.write_text("\n".join(lines), encoding="ascii")
                 pairing = colmap.ImportedPairingOptions()
                 pairing.match_list_path = str(pairs)
@@ -242,6 +251,13 @@ class _Search:
                     verification_options=verification,
                 )
             step()
+
+    def _compared(self, number: int) -> list[int]:
+        """The images before one that it is compared with."""
+        if not self._options.in_order:
+            return list(range(number))
+        loops = range(0, number, LOOP_STEP) if number % LOOP_STEP == 0 else ()
+        return sorted({*range(max(0, number - NEAR_IMAGES), number), *loops})
 
     def _mapped(self, step: Step) -> Any | None:
         """COLMAP's model of most images; None where it finds none."""

@@ -61,6 +61,10 @@ $ render {avatar} --video v.mp4 --capture {root} --principal-point opencv
 --principal-point: has no effect without --cameras
 $ export {avatar} --format ply --out {o}.ply --motion take.csv
 --motion: has no effect with --format ply without --timestep
+$ track {root} --out {o} --take around --cameras {cameras}
+--take around: does not go with --cameras
+$ track {root} --out {o} --take around
+--take around: {root} has a calibration already
 # A resumed run goes on as it began
 $ train {root} --out {run} --resume --stop-when-flat
 --stop-when-flat: this run began with

@@ -17,6 +17,7 @@ from stga_addon.tracking.sharp_frames import sharpest
 from stga_addon.tracking.stages import Crew
 from stga_addon.worker.helpers import Helpers
 
+from .scenes import encode
 from .walk import picture, walk
 
 COUNT = 8
@@ -58,11 +59,16 @@ def found(folder, out, take="auto"):
 @pytest.mark.parametrize("k", [0.0, -0.3])
 def test_cameras_are_those_that_filmed(tmp_path, pictures, k):
     """Catches poses, a lens or a principal point of another convention, a distortion that is left
-    in, or made of noise, and a walk that is taken for a talk."""
+    in, or made of noise, and a walk that is taken for a talk; photos, and a video with a lens."""
     pytest.importorskip("pycolmap")
     cameras = walk(COUNT)
-    images = [distorted(*pair, k) for pair in zip(pictures, cameras, strict=True)]
-    footage, line = found(write_pictures(tmp_path / "photos", images), tmp_path / "out")
+    source = tmp_path / "walk.mp4"
+    if k:  # of so few frames, the room tells too little for the take to be recognized
+        images = [distorted(*pair, k) for pair in zip(pictures, cameras, strict=True)]
+        encode(source, images, options={"crf": "8"}, rate=2)
+    else:
+        source = write_pictures(tmp_path / "photos", pictures)
+    footage, line = found(source, tmp_path / "out", "around" if k else "auto")
     assert re.search(rf"around a still head.*cameras of {COUNT} of {COUNT} images found", line)
     assert ("distortion" in line) == bool(k)
     assert footage.timesteps == (0,)
@@ -76,17 +82,14 @@ def test_cameras_are_those_that_filmed(tmp_path, pictures, k):
         turned = own.camera.world_to_camera[:3, :3] @ world.rotation.T
         off = Rotation.from_matrix(turned @ camera.world_to_camera[:3, :3].T)
         assert np.degrees(off.magnitude()) < 0.3
-        seen = own.image(0)
-        # of the pinhole's focal length, which keeps all pixels inside
-        zoom = own.camera.fl_x / camera.fl_x
-        assert zoom == pytest.approx(1.0, abs=0.02 if not k else 0.1)
-        middle = slice(112, 144)
-        if not k:
-            np.testing.assert_array_equal(seen[middle, middle], image[middle, middle])
+        if k:
+            lens = own.undistortion
+            assert lens.recorded.fl_x == pytest.approx(camera.fl_x, rel=0.02)
+            assert lens.lens.radial[0] == pytest.approx(k, rel=0.1)
+            assert own.image(0).shape == image.shape
         else:
-            recorded = own.undistortion.recorded.fl_x
-            assert recorded == pytest.approx(camera.fl_x, rel=0.02)
-            assert own.undistortion.lens.radial[0] == pytest.approx(k, rel=0.1)
+            assert own.camera.fl_x == pytest.approx(camera.fl_x, rel=0.02)
+            np.testing.assert_array_equal(own.image(0), image)
 
 
 def test_a_head_that_turns_before_a_camera_is_none(tmp_path):
