@@ -34,7 +34,8 @@ def test_objects_without_splats_are_not_asked():
     unread = SimpleNamespace(mode="VIEWPORT")
     assert visible_layers(unread, SplatCache(), SimpleNamespace()) == []
     shown_avatar()
-    plain = SimpleNamespace(view_layer=SimpleNamespace(objects=[PlainObject()] * 3))
+    view_layer = SimpleNamespace(objects=[PlainObject()] * 3)
+    plain = SimpleNamespace(view_layer=view_layer, scene=SimpleNamespace(background_set=None))
     assert visible_layers(plain, SplatCache(), SimpleNamespace()) == []
     layer = SimpleNamespace(exclude=False, children=())
     layer.collection = SimpleNamespace(hide_render=False, objects=[PlainObject()])

@@ -15,8 +15,8 @@ ALWAYS = """
 --filmed-only --flame --focal --footage --format --fps --frames --gray-card --growth --iterations
 --knobs --landmarks --light --mattes --meshes --model --neutral --no-blend --offset --only --out
 --preset --principal-point --quick --region --resume --schedule --seed --seeds
---size --split --start --step --stop --stop-when-flat --strategy --strength --sync --target-psnr
---threads --threshold --turntable --video --world --zero-pose
+--size --split --start --step --stop --stop-when-flat --strategy --strength --sync --take
+--target-psnr --threads --threshold --timesteps --turntable --video --world --zero-pose
 """
 """Options that serve wherever their command does not say otherwise (`needs`)."""
 VALUES = """

@@ -84,7 +84,7 @@ def test_cameras_are_those_that_filmed(tmp_path, pictures, k):
         assert np.degrees(off.magnitude()) < 0.3
         if k:
             lens = own.undistortion
-            assert lens.recorded.fl_x == pytest.approx(camera.fl_x, rel=0.02)
+            assert lens.recorded.fl_x == pytest.approx(camera.fl_x, rel=0.05)
             assert lens.lens.radial[0] == pytest.approx(k, rel=0.1)
             assert own.image(0).shape == image.shape
         else:

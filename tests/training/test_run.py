@@ -37,7 +37,7 @@ def make_run(capture, strategy="selective", **changes):
 def unbroken(toy, tmp_path_factory):
     """A run from start to end."""
     out = tmp_path_factory.mktemp("unbroken") / "run"
-    assert train_run(toy, out, make_run(toy)) == out / "avatar.npz"
+    assert train_run(toy, out, make_run(toy)).path == out / "avatar.npz"
     return out
 
 
