@@ -252,10 +252,10 @@ def _track_head(request: Track, report: Report) -> Written:
     from ..tracking.track import track as track_footage
 
     steps = _Steps(report)
-    footage, told = _open(request, steps)
+    footage, messages = _open(request, steps)
     options = _options(request)
     found = track_footage(footage, request.model, request.out, options, steps.report, steps.show)
-    return _written(request.out, found, report, told)
+    return _written(request.out, found, report, messages)
 
 
 def _track_by_avatar(request: Track, run: Path, report: Report) -> Written:
@@ -267,7 +267,7 @@ def _track_by_avatar(request: Track, run: Path, report: Report) -> Written:
 
     steps = _Steps(report, TRACKING_SHARE)
     out = request.out
-    footage, told = _open(request, steps)
+    footage, messages = _open(request, steps)
     person, model = avatar_person(run)
     options = replace(_options(request), person=person)
     found = track_footage(footage, model, out, options, steps.report, steps.show)
@@ -278,7 +278,7 @@ def _track_by_avatar(request: Track, run: Path, report: Report) -> Written:
     found = replace(found, median_px=report_errors(out, model))
     end_tracking(out)
     share = float(np.median(tracked.misfit))
-    lines = [*told, f"avatar: does not explain {share:.0%} of the head's pixels (median)"]
+    lines = [*messages, f"avatar: does not explain {share:.0%} of the head's pixels (median)"]
     if share > MAX_MISFIT:
         lines.append("warning: the avatar does not look like the person of this footage")
     return _written(out, found, report, lines)
@@ -297,14 +297,14 @@ def _open(request: Track, steps: "_Steps") -> tuple["Footage", tuple[str, ...]]:
     mattes = None if request.mattes in MATTES else Path(request.mattes)
     cameras = request.cameras
     footage = open_footage(request.footage, cameras, frames, request.focal, mattes=mattes)
-    told: tuple[str, ...] = ()
+    messages: tuple[str, ...] = ()
     if footage.focal == "calibration":
         if request.take == "around":
             raise StgaError(f"--take around: {request.footage} has a calibration already")
     elif request.landmarks is None:
-        footage, told = _with_found_cameras(footage, request, steps)
+        footage, messages = _with_found_cameras(footage, request, steps)
     steps.plan(footage)
-    return (footage if request.size == 1 else sized(footage, request.size)), told
+    return (footage if request.size == 1 else sized(footage, request.size)), messages
 
 
 def _with_found_cameras(
@@ -334,7 +334,7 @@ def _options(request: Track) -> "TrackingOptions":
 
 
 def _written(
-    out: Path, found: "TrackingReport", report: Report, told: Sequence[str] = ()
+    out: Path, found: "TrackingReport", report: Report, messages: Sequence[str] = ()
 ) -> Written:
     lines = [f"warning: {warning}" for warning in found.warnings]
     if found.focal_length is not None:
@@ -343,7 +343,7 @@ def _written(
         lines.append(f"torso: {found.torso.description}")
     error = f"{found.median_px:.2f} px (median)"
     report(Progress(1.0, "Tracked", f"Reprojection error {error}"))
-    lines += [*told, f"reprojection error: {error}; by camera and timestep in tracking.json"]
+    lines += [*messages, f"reprojection error: {error}; by camera and timestep in tracking.json"]
     return Written(out, (*lines, f"capture: {out}"))
 
 

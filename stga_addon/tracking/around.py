@@ -127,11 +127,16 @@ def with_found_cameras(
     if take == "talk":
         return footage, ()
     check_place(footage, out)
+    (camera,) = footage.cameras
+    count = len(camera.timesteps)
     if take == "around":
+        if count < MIN_IMAGES:
+            raise CamerasNotFound(
+                f"{footage.root}: --take around: has {count} images, expected at least {MIN_IMAGES}"
+            )
         found, line = _with_cameras(footage, out, crew)
         return found, (f"take: around a still head, as given; {line}",)
-    (camera,) = footage.cameras
-    if len(camera.timesteps) < MIN_IMAGES:
+    if count < MIN_IMAGES:
         return footage, ()
     seen = _recognized(footage, camera, crew)
     photos = isinstance(camera.frames, ImageFrames) and len(camera.timesteps) <= MAX_PHOTOS
@@ -185,8 +190,8 @@ def _with_cameras(footage: Footage, out: Path, crew: Crew) -> tuple[Footage, str
     line += "; the room was left out, as it did not turn with the person" * structure.masked
     known = set(structure.timesteps.tolist())
     lost = [camera.source(t) for t in timesteps if t not in known]
-    told = (f"no camera was found of {listed(lost)}; left out",) if lost else ()
-    warnings = (*footage.warnings, *told)
+    lost_text = (f"no camera was found of {listed(lost)}; left out",) if lost else ()
+    warnings = (*footage.warnings, *lost_text)
     return replace(footage, cameras=cameras, fps=None, focal="calibration", warnings=warnings), line
 
 

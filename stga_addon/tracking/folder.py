@@ -5,6 +5,7 @@ from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -41,11 +42,12 @@ FOCAL_SOURCES = {
     "given": "as given",
     "file": "as the file says",
     "usual": "that of a phone",
+    "solved": "solved from the turns of the head",
     "estimated": "estimated from the head's landmarks",
     "avatar": "that of the avatar's camera",
 }
-"""Where the focal length of a camera without calibration is from (`Footage.focal`), and what a
-person reads of it."""
+"""Where the focal length of a camera without calibration is from (`Footage.focal`; "usual" and
+"solved" in captures of earlier versions) -> its description."""
 POINTS_FILE = "torso_points.npz"
 
 AVATAR_MISFIT = "avatar"
@@ -89,11 +91,17 @@ def _content(out: Path) -> list[Path]:
     return [path for path in out.iterdir() if not path.name.startswith(LOCK_FILE)]
 
 
+def _read_report(capture: Path) -> dict[str, Any]:
+    """The report of a tracked capture; empty where it has none."""
+    path = capture / REPORT_FILE
+    report = read_json(path) if path.is_file() else None
+    return report if isinstance(report, dict) else {}
+
+
 def is_in_order(out: Path) -> bool | None:
     """Whether the timesteps of a tracked capture follow each other in time; None where no report
     says so."""
-    report = read_json(out / REPORT_FILE) if (out / REPORT_FILE).is_file() else None
-    return report.get("in_order") if isinstance(report, dict) else None
+    return _read_report(out).get("in_order")
 
 
 def is_flame(out: Path) -> bool:
@@ -155,8 +163,7 @@ def read_torso_motion(capture: Path) -> TorsoMotion | None:
     Raises StgaError where the report is malformed.
     """
     path = capture / REPORT_FILE
-    report = read_json(path) if path.is_file() else None
-    found = report.get(TORSO_KEY) if isinstance(report, dict) else None
+    found = _read_report(capture).get(TORSO_KEY)
     if found is None:
         return None
     if isinstance(found, dict):
@@ -190,12 +197,11 @@ class FocalLength:
 def describe_focal_length(capture: Path) -> str:
     """`FocalLength.description` of what the report of a tracked capture says; "" where it has no
     report, or where a calibration told it. Raises StgaError where the report is malformed."""
-    path = capture / REPORT_FILE
-    report = read_json(path) if path.is_file() else None
-    if not isinstance(report, dict) or report.get(FOCAL_KEYS["pixels"]) is None:
+    report = _read_report(capture)
+    if report.get(FOCAL_KEYS["pixels"]) is None:
         return ""
     values = {name: report.get(key) for name, key in FOCAL_KEYS.items()}
-    found: FocalLength = from_json(FocalLength, values, str(path))
+    found: FocalLength = from_json(FocalLength, values, str(capture / REPORT_FILE))
     return found.description
 
 

@@ -102,7 +102,7 @@ def _write(head: SeenHead, crew: Crew) -> TrackingReport:
     fit = head.fitted.fit
     torso = head.torso
     focal = _focal_length(head)
-    told = dict.fromkeys(folder.FOCAL_KEYS) if focal is None else to_json(focal)
+    focal_values = dict.fromkeys(folder.FOCAL_KEYS) if focal is None else to_json(focal)
     median = median_px(head.errors)
     pixels = {name: {t: px for t, (px, _) in own.items()} for name, own in head.errors.items()}
     values = {
@@ -113,7 +113,7 @@ def _write(head: SeenHead, crew: Crew) -> TrackingReport:
         "warnings": list(head.warnings),
         "reprojection_px": folder.rounded(pixels),
         "image_misfit": folder.rounded(head.fitted.misfits),
-        **{key: told[name] for name, key in folder.FOCAL_KEYS.items()},
+        **{key: focal_values[name] for name, key in folder.FOCAL_KEYS.items()},
         folder.TORSO_KEY: None if torso.motion is None else to_json(torso.motion),
     }
     write_json(out / folder.REPORT_FILE, values)

@@ -9,10 +9,11 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from stga_addon.capture.camera import camera_from_gl
-from stga_addon.files import read_json
+from stga_addon.files import read_json, write_json
 from stga_addon.flame.forward import FlameFrame, flame_forward
 from stga_addon.tracking.fit import HeadFit, RecordedTake, TimestepLandmarks
 from stga_addon.tracking.focal_length import estimated_focal
+from stga_addon.tracking.folder import describe_focal_length
 from stga_addon.tracking.footage.open import open_footage, usual_focal
 from stga_addon.tracking.footage.video import VideoFrames
 from stga_addon.tracking.known_person import KnownPerson
@@ -244,3 +245,23 @@ def test_a_phones_video_is_decoded_once_and_its_lens_is_told(tmp_path, head, mon
     assert frame["fl_x"] == pytest.approx(found.focal_length.pixels, abs=0.05)
     written = np.asarray(Image.open(tmp_path / "out" / frame["file_path"]))
     np.testing.assert_array_equal(written, footage.cameras[0].image(5))
+
+
+@pytest.mark.parametrize(
+    ("source", "interval", "expected"),
+    [
+        ("solved", None, "924 px, solved from the turns of the head"),
+        ("usual", None, "924 px, that of a phone"),
+        ("estimated", [465.2, 1518.0], "465 to 1518 px with a probability of 90 %"),
+    ],
+)
+def test_reports_of_earlier_versions_are_described(tmp_path, source, interval, expected):
+    """Catches captures of earlier versions that are refused by what told their focal length, and an
+    interval that is not said."""
+    values = {"focal_length_px": 924.3, "focal_length_from": source}
+    if interval is not None:
+        values["focal_length_interval_px"] = interval
+    write_json(tmp_path / "tracking.json", values)
+    assert expected in describe_focal_length(tmp_path)
+    write_json(tmp_path / "tracking.json", {"focal_length_px": None, "in_order": True})
+    assert describe_focal_length(tmp_path) == ""

@@ -236,9 +236,9 @@ def _round_back(
         behind[row] = BACK_SHARE * half * np.sqrt(1 - beside**2)
     behind += BACK_GAP_VOXELS * voxel_size(places)
     places[vertices] -= behind[:, None] * ahead
-    usual = np.empty((len(level), 3))
+    median_color = np.empty((len(level), 3))
     for row, y in enumerate(level):
         near, middle, half = around(y)
         beside = near & (abs(width - middle) > BACK_SIDE * half)
-        usual[row] = np.median(color[front][beside if beside.any() else near], axis=0)
-    return places, usual
+        median_color[row] = np.median(color[front][beside if beside.any() else near], axis=0)
+    return places, median_color

@@ -33,7 +33,7 @@ MIN_TEETH_SHARE = 0.04
 of the mesh alone."""
 SOURCE_COSINE = 0.25
 """Cosine between a triangle and the camera that it faces most above which others take its color:
-hair at the temples and a beard beside the jaw are seen from 60 to 75° aside at most."""
+hair at the temples and a beard beside the jaw are seen at 60 to 75° at least."""
 WELL_SHOWN_COSINE = 0.5
 """The same above which a face is shown better than its mirror image could tell."""
 FRINGE_COSINE = 0.2
@@ -239,8 +239,8 @@ class _Sides:
         the nearest that are shown on both sides tell it."""
         found = self._color[image]
         both, opposite = self._both
-        away = (np.linalg.norm(found - usual, axis=1) for usual in (self._skin, self._hair))
-        from_skin, from_hair = away
+        from_skin = np.linalg.norm(found - self._skin, axis=1)
+        from_hair = np.linalg.norm(found - self._hair, axis=1)
         own = np.flatnonzero(self.of_face[rows] & (from_skin < from_hair))
         if not len(both) or not len(own):
             return np.asarray(found)
