@@ -34,7 +34,7 @@ class KnownPerson:
     camera: Camera | None
 
 
-def without_bias(take: RecordedTake, person: KnownPerson, crew: Crew) -> RecordedTake:
+def without_own_bias(take: RecordedTake, person: KnownPerson, crew: Crew) -> RecordedTake:
     """The take, each camera's landmarks corrected by the networks' bias: how far, in the median,
     they are off in pictures of the avatar, drawn with fitted heads as the camera sees them.
 

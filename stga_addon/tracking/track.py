@@ -11,7 +11,7 @@ from ..schema import to_json
 from ..worker.helpers import Helpers
 from . import folder
 from .footage.model import Footage
-from .known_person import KnownPerson, without_bias
+from .known_person import KnownPerson, without_own_bias
 from .landmarks import landmark_file, write_camera, write_places
 from .opened import USUAL_OPTIONS, OpenedFootage, TrackingOptions, open_take
 from .pictures import PosedHead, write_contact_sheet
@@ -83,7 +83,7 @@ def _known(opened: OpenedFootage, person: KnownPerson, crew: Crew) -> SeenHead:
     recorded = record(opened, crew)
     recorded = in_world(with_focal(recorded, crew, person.camera))
     if opened.options.landmarks is None:
-        recorded = replace(recorded, take=without_bias(recorded.take, person, crew))
+        recorded = replace(recorded, take=without_own_bias(recorded.take, person, crew))
     fitted = fit_landmarks(recorded, crew)
     fitted = fit_expressions(fitted, person.fit, crew)
     return with_torso(fitted, crew, bends=False)
