@@ -14,6 +14,9 @@ from gui.layouts import filled
 
 from stga_addon.progress import Progress
 from stga_addon.report import CURVE_COLOR, DETAIL_COLOR, FORECAST_COLOR, MARGIN, SIZE, curve_image
+from stga_addon.scene import tags
+from stga_addon.scene.display import splat_nodes
+from stga_addon.scene.display.splat_object import set_input
 
 from .session import ops, panel
 from .test_operators import write_ball_avatar, write_ball_run
@@ -95,6 +98,20 @@ def test_panels(extension, trained, monkeypatch, capsys):
     assert "Monitoring stopped after an unexpected error (ZeroDivisionError" in " ".join(
         draw(extension)
     )
+
+
+def test_what_was_not_filmed_and_the_lens_are_said(extension, trained):
+    """Catches a color in the viewport that nothing explains, or that is explained after it was
+    turned off, and a guessed focal length that only a file tells."""
+    settings = panel()
+    settings.splats[tags.FILMED] = "filmed from 30° on its right to 40° on its left; what is beyond"
+    settings.head[tags.FOCAL_LENGTH] = "924 px, estimated"
+    settings.head[tags.TRACKED] = True
+    for is_shown in (True, False):
+        set_input(settings.splats, splat_nodes.SHOW_UNSEEN, is_shown)
+        text = " ".join(draw(extension))
+        assert ("40° on its left. Blue was not filmed" in text) == is_shown
+    assert "Focal length: 924 px, estimated" in text
 
 
 def test_a_word_for_the_quality_and_more_training(extension, trained, tmp_path):
