@@ -4,7 +4,8 @@ A matte is the coverage of each pixel by the person whose head was tracked. What
 person (by a network, or by the difference from a clean plate) and the tracked head are the seeds of
 OpenCV's GrabCut (Rother et al. 2004), which finds the outline in between. In a band along it,
 coverage is that share of the way from the backdrop's color around the pixel to the person's that
-the pixel's color lies at; where both colors are alike, the band is a smooth edge.
+the pixel's color lies at; where both colors are alike, the band is a smooth edge. Hair that stands
+off the head, before an even backdrop, has a wider band: the backdrop is seen between its strands.
 """
 
 import math
@@ -48,6 +49,17 @@ HEAD_MARGIN_SHARE = 0.06
 """Error of the tracked head's outline, of the head's size: further inside are surely persons."""
 BAND_SHARE = 0.018
 """Half of the soft band's width as a fraction of the head's size."""
+HAIR_BAND_SHARE = 0.1
+"""The same within the outline where hair stands out from the tracked head: the backdrop is seen
+between strands."""
+HAIR_ROWS_SHARE = 0.6
+"""Of the tracked head's height, from its top, in which such hair is; below it are clothes."""
+OPAQUE_HAIR_SHARE = 0.7
+"""Of the way from the backdrop's color to the hair's, from which hair is opaque: gloss is as near
+to a bright backdrop as that."""
+EVEN_COLORS_WEIGHT = 4.0
+"""Of the variance of both sides' colors, beside SIMILAR_COLORS_LEVELS, in what hair's coverage is
+trusted: before a room and in dyed hair, a pixel's color tells nothing."""
 NEIGHBORHOOD_SHARES = (0.03, 0.12)
 """Standard deviations of the neighborhoods that colors are means of, as fractions of the head's
 size."""
@@ -220,28 +232,50 @@ def find_matte(image: np.ndarray, probability: np.ndarray, head: np.ndarray) -> 
     band = max(1.0, BAND_SHARE * size)
     matte = np.where(person, np.uint8(255), np.uint8(0))
     near = box_of(person, math.ceil(band) + 2)
-    inside = _shrunk(cv2, person[near], band)
-    outside = ~_grown(cv2, person[near], band)
+    outline = person[near]
+    outside = ~_grown(cv2, outline, band)
+    narrow = _shrunk(cv2, outline, band)
+    is_hair = narrow & ~_shrunk(cv2, outline, HAIR_BAND_SHARE * size)
+    is_hair &= _may_be_hair(cv2, head, band)[near]
+    inside = narrow & ~is_hair
     unknown = np.nonzero(~inside & ~outside)
     if not (len(unknown[0]) and inside.any() and outside.any()):
         return matte
     places = np.stack([own + side.start for own, side in zip(unknown, near, strict=True)], axis=1)
-    means = []
     deviations = [share * size for share in NEIGHBORHOOD_SHARES]
+    in_hair = is_hair[unknown]
+    squares = cv2.pow(image.astype(np.float32), 2)
+    means = []
+    variance = np.zeros(len(places), np.float32)
     for known, beyond in ((outside, 1), (inside, 0)):
         everywhere = np.full(person.shape, beyond, np.uint8)
         everywhere[near] = known
         means.append(mean_around(image, everywhere, deviations, places))
+        if in_hair.any():
+            square = mean_around(squares, everywhere, deviations, places[in_hair])
+            variance[in_hair] += np.maximum(square - means[-1][in_hair] ** 2, 0).sum(axis=1)
     (backdrop, color) = means
     towards = color - backdrop
     contrast = (towards**2).sum(axis=1)
     colors = image[near][unknown]
     share = ((colors - backdrop) * towards).sum(axis=1) / np.maximum(contrast, 1e-3)
-    edge = cv2.GaussianBlur(person[near].astype(np.float32), (0, 0), max(0.7, band / 3))
-    trust = contrast / (contrast + 3 * SIMILAR_COLORS_LEVELS**2)
+    share[in_hair] /= OPAQUE_HAIR_SHARE
+    edge = cv2.GaussianBlur(outline.astype(np.float32), (0, 0), max(0.7, band / 3))
+    doubt = 3 * SIMILAR_COLORS_LEVELS**2 + EVEN_COLORS_WEIGHT * variance
+    trust = contrast / (contrast + doubt)
     coverage = trust * np.clip(share, 0, 1) + (1 - trust) * edge[unknown]
     matte[near][unknown] = (255 * coverage + 0.5).astype(np.uint8)
     return matte
+
+
+def _may_be_hair(cv2: Any, head: np.ndarray, margin: float) -> np.ndarray:
+    """(H, W) bool: pixels beside and above a tracked head (H, W) bool, where hair may stand out."""
+    rows = np.flatnonzero(head.any(axis=1))
+    if not len(rows):
+        return np.zeros_like(head)
+    found = ~_grown(cv2, head, margin)
+    found[int(rows[0] + HAIR_ROWS_SHARE * np.ptp(rows)) :] = False
+    return np.asarray(found)
 
 
 def by_plate(image: np.ndarray, plate: np.ndarray) -> np.ndarray:

@@ -70,6 +70,26 @@ def test_hair_is_soft():
     assert np.abs(matte - coverage)[edge].mean() < 0.6 * hard
 
 
+def test_the_wall_is_seen_between_strands():
+    """Catches hair that stands off the head as an opaque lump in the wall's color: a network and
+    GrabCut see one person there. Gloss on hair beside it stays opaque."""
+    coverage, head, colors = person()
+    colors[:] = np.where(head[..., None], colors, 30)
+    y, x = np.mgrid[:HEIGHT, :WIDTH] + 0.5
+    off = np.hypot((x - 100) / 48, (y - 100) / 62)
+    hair = (off > 1) & (off < 1.25) & (y < 100)
+    strands = hair & (x < 90)
+    true = np.where(strands, 0.5 + 0.5 * np.sin(1.2 * x + 0.9 * y), np.maximum(coverage, hair))
+    gloss = hair & (np.abs(x - 130) < 6) & (off < 1.1)
+    colors[gloss] = 70
+    wall = np.full((HEIGHT, WIDTH, 3), 200.0)
+    whole = np.maximum(coverage, hair).astype(np.float32)
+    matte = find_matte(filmed(true, colors, wall), whole, head) / 255
+    rim = strands & (off > 1.08) & (off < 1.22)
+    assert np.abs(matte - true)[rim].mean() < 0.7 * np.abs(1 - true)[rim].mean()
+    assert matte[gloss & (off < 1.05)].min() > 0.95
+
+
 def test_somebody_else_in_the_room():
     """Catches a second person who becomes part of the first: only what hangs together with the
     tracked head is kept."""
