@@ -201,14 +201,20 @@ def sh_color(sh: np.ndarray, direction: np.ndarray) -> np.ndarray:
 
 
 def colored_off_axis(
-    splats: Splats, direction: np.ndarray, share: np.ndarray, color: np.ndarray
+    splats: Splats,
+    direction: np.ndarray,
+    share: np.ndarray,
+    color: np.ndarray,
+    steepness: np.ndarray | float = 1.0,
 ) -> Splats:
     """Splats of degree 0 that look as they do along a unit direction (N, 3) from the eye, and the
-    more it turns from there, as a color (N, 3), sRGB: by a share (N,) of the way times the squared
-    sine of the angle. Of degree 2, which holds just that."""
+    more it turns from there, as a color (N, 3), sRGB: by a share (N,) of the way times
+    (1 - c) (1 + steepness c), where c is the cosine of the angle and steepness (N,); the squared
+    sine where that is 1. Of degree 2, which holds just that."""
     directions = unit(np.random.default_rng(0).normal(size=(64, 3)))
-    squared_sine = 1 - (directions @ direction.T) ** 2
-    terms = np.linalg.pinv(_basis(directions, 9)) @ squared_sine
+    cosine = directions @ direction.T
+    way = (1 - cosine) * (1 + steepness * cosine)
+    terms = np.linalg.pinv(_basis(directions, 9)) @ way
     change = share[:, None] * (color - sh_color(splats.sh, direction))
     sh = at_degree(splats, 2).sh + terms.T[:, :, None] * change[:, None]
     return replace(splats, sh=sh.astype(np.float32))

@@ -41,6 +41,7 @@ from stga_addon.training.optimize.surface_prior import (
 from stga_addon.training.optimize.trainer import Trainer
 from stga_addon.training.optimize.unseen_sides import (
     SOURCE_COSINE,
+    UnseenSides,
     plausible_off_axis,
     unseen_sides,
 )
@@ -583,7 +584,37 @@ def test_hair_off_axis(bundled, tmp_path):
     assert Trainer(around, trainer.settings, {}).avatar("", None).filmed_along is None
 
 
-def test_colors_off_axis_by_the_squared_sine():
+def test_hair_behind_a_cheek_is_no_streak_on_it():
+    """Catches strands that one camera sees beside a face, on triangles of the mesh that turn away
+    from it, as streaks on skin from aside; what is as dark as hair where views show it well, as
+    brows, stays."""
+    places = np.random.default_rng(0).normal(size=(12, 3))
+    splats = lattice_splats(places, np.arange(12).reshape(4, 3), 0, 0)
+    skin = np.array([0.8, 0.6, 0.5])
+    hair = np.array([0.1, 0.1, 0.1])
+    splats.sh[:, 0] = (np.array([skin, hair + 0.05, hair + 0.05, hair]) - 0.5) / SH_C0
+    none = np.zeros(4, bool)
+    sides = UnseenSides(
+        triangles=none,
+        shown=~none,
+        color=np.tile(skin, (4, 1)),
+        is_hair=np.array([False, False, False, True]),
+        view_dependence=np.array([0.5, 0.2, 0.0, 1.0]),
+        off_axis=np.array([skin, skin, hair + 0.05, hair]),
+    )
+    along = np.tile([0.0, 0, -1], (4, 1))
+    found = plausible_off_axis(splats, along, sides)
+    seen, aside, half = (
+        sh_color(found.sh, np.tile(way, (4, 1)))
+        for way in ([0.0, 0, -1], [1.0, 0, 0], [np.sqrt(0.5), 0, -np.sqrt(0.5)])
+    )
+    assert_allclose(seen, 0.5 + SH_C0 * splats.sh[:, 0], atol=1e-5)
+    assert_allclose(aside[1], skin, atol=1e-4)
+    assert np.abs(half[1] - skin).max() < 0.4 * np.abs(seen[1] - skin).max()
+    assert_allclose(aside[2], hair + 0.05, atol=1e-4)
+
+
+def test_colors_off_axis_by_the_angle():
     """Catches coefficients of other signs or directions than those that splats are drawn with."""
     rng = np.random.default_rng(0)
     splats = lattice_splats(rng.normal(size=(4, 3)), np.array([[0, 1, 2], [1, 2, 3]]), 1, 0)
@@ -593,11 +624,14 @@ def test_colors_off_axis_by_the_squared_sine():
     axes = np.linalg.qr(rng.normal(size=(len(splats), 3, 3)))[0]
     direction = axes[:, 0]
     away = axes[:, 1]
-    colored = colored_off_axis(splats, direction, share, color)
+    steepness = np.where(np.arange(len(splats)) % 2, 1.0, 1.5)
+    colored = colored_off_axis(splats, direction, share, color, steepness)
     seen = sh_color(splats.sh, direction)
     for angle in (0, 0.3, 1.1, np.pi / 2, 2.5, np.pi):
         looked = np.cos(angle) * direction + np.sin(angle) * away
-        expected = seen + (np.sin(angle) ** 2 * share)[:, None] * (color - seen)
+        way = np.where(steepness > 1, (1 - np.cos(angle)) * (1 + 1.5 * np.cos(angle)), 0)
+        way[1::2] = np.sin(angle) ** 2
+        expected = seen + (way * share)[:, None] * (color - seen)
         assert_allclose(sh_color(colored.sh, looked), expected, atol=1e-5)
 
 

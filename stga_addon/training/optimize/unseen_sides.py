@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ...avatar.embedding import MIN_DIVISOR, face_areas
-from ...avatar.splats import Splats, colored_off_axis
+from ...avatar.splats import Splats, colored_off_axis, sh_color
 from ...capture.mesh_geometry import connected_parts
 from ...capture.model import Capture, View, evenly_spread, views_by_timestep
 from ...flame.quaternions import unit
@@ -63,6 +63,9 @@ SHOWN_COSINE = 0.6
 view; up to SOURCE_COSINE, it depends wholly on the view."""
 OFF_AXIS_WEIGHT = 0.75
 """Fraction of the off-axis color at a right angle to the views."""
+BEHIND_STEEPNESS = 1.73
+"""`steepness` of the way to the off-axis color where hair behind a face looks as if it were on it:
+two thirds at 45°."""
 
 
 @dataclass(frozen=True)
@@ -149,12 +152,22 @@ def unseen_sides(surface: Surface) -> UnseenSides:
 
 def plausible_off_axis(splats: Splats, along: np.ndarray, sides: UnseenSides) -> Splats:
     """Splats that views show along one direction only, that of their triangle (F, 3), with what is
-    plausible off-axis: hair, and of the rest what lies on it, not what hangs before it."""
+    plausible off-axis: hair, and of the rest what lies on it, not what hangs before it. What looks
+    like hair on skin that turns away is hair behind it: it is skin off-axis."""
     face = splats.face
     share = OFF_AXIS_WEIGHT * sides.view_dependence[face]
     share[splats.unbound & ~sides.is_hair[face]] = 0
     share[sides.triangles[face]] = 0  # they have one color from everywhere, and hair its locks
-    return colored_off_axis(splats, along[face], share, sides.off_axis[face])
+    plausible = sides.off_axis[face]
+    steepness = np.ones(len(face))
+    if sides.is_hair.any():
+        shown = sh_color(splats.sh, along[face])
+        hair = np.median(sides.off_axis[sides.is_hair], axis=0)
+        from_hair, from_skin = (np.linalg.norm(shown - own, axis=1) for own in (hair, plausible))
+        is_behind = (share > 0) & ~sides.is_hair[face] & (from_hair < from_skin)
+        share[is_behind] = 1
+        steepness[is_behind] = BEHIND_STEEPNESS
+    return colored_off_axis(splats, along[face], share, plausible, steepness)
 
 
 def _hair(
