@@ -54,9 +54,9 @@ HAIR_BAND_SHARE = 0.1
 between strands."""
 HAIR_ROWS_SHARE = 0.6
 """Of the tracked head's height, from its top, in which such hair is; below it are clothes."""
-OPAQUE_HAIR_SHARE = 0.7
-"""Of the way from the backdrop's color to the hair's, from which hair is opaque: gloss is as near
-to a bright backdrop as that."""
+OPAQUE_HAIR_SHARE = 0.9
+"""Of the way from the backdrop's color to the hair's, from which hair is opaque: gloss is a little
+nearer to a bright backdrop."""
 EVEN_COLORS_WEIGHT = 4.0
 """Of the variance of both sides' colors, beside SIMILAR_COLORS_LEVELS, in what hair's coverage is
 trusted: before a room and in dyed hair, a pixel's color tells nothing."""
