@@ -23,19 +23,21 @@ from stga_addon.flame.parts import flame_model, key_regions
 from stga_addon.flame.quaternions import to_matrices
 from stga_addon.render.render import render
 from stga_addon.training.optimize.frames import FrameStore
+from stga_addon.training.optimize.hidden_layers import (
+    OCCLUSION_OPACITY,
+    above_unseen_hair,
+    hidden_splats,
+    splats_behind,
+)
 from stga_addon.training.optimize.initial_splats import hull_points, voxel_size
 from stga_addon.training.optimize.state import new_state
 from stga_addon.training.optimize.step_hook import Schedule
 from stga_addon.training.optimize.surface import GRAZING_COSINE, Surface
 from stga_addon.training.optimize.surface_prior import (
     BEHIND_COSINE,
-    OCCLUSION_OPACITY,
     WELL_SEEN_COSINE,
     SurfacePrior,
-    above_unseen_hair,
     flattened,
-    hidden_splats,
-    splats_behind,
     thickness,
     width,
 )

@@ -25,19 +25,18 @@ from stga_addon.flame.quaternions import to_matrices
 from stga_addon.render.render import render, render_avatar
 from stga_addon.tracking.torso_cloth import draped, torso_sheet
 from stga_addon.training.optimize.frames import FrameStore
+from stga_addon.training.optimize.hidden_layers import (
+    OCCLUSION_OPACITY,
+    hidden_splats,
+    splats_behind,
+)
 from stga_addon.training.optimize.initial_splats import flat_points
 from stga_addon.training.optimize.occlusion_layer import GRAZED_COSINE
 from stga_addon.training.optimize.semantic_regions import ears_of, face_of, head_coordinates
 from stga_addon.training.optimize.state import new_state, state_of_avatar
 from stga_addon.training.optimize.step_hook import Schedule
 from stga_addon.training.optimize.surface import GRAZING_COSINE, Surface
-from stga_addon.training.optimize.surface_prior import (
-    OCCLUSION_OPACITY,
-    SurfacePrior,
-    hidden_splats,
-    splats_behind,
-    width,
-)
+from stga_addon.training.optimize.surface_prior import SurfacePrior, width
 from stga_addon.training.optimize.trainer import Trainer
 from stga_addon.training.optimize.unseen_sides import (
     SOURCE_COSINE,

@@ -1,24 +1,22 @@
-"""Pulls splats of which training views tell little to what is plausible: what shines through the
-front, and a pixel of an outline, would give them any color, size and place."""
+"""Priors of what training views tell little of: what shines through the front, and a pixel of an
+outline, would give such splats any color, size and place."""
 
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import dataclass
 from functools import cached_property
+from typing import Protocol
 
 import numpy as np
 
-from ...avatar.embedding import face_frames, to_local, to_world
 from ...avatar.lattice import NORMAL_AXIS, SCALE, lattice_splats
-from ...avatar.splats import SH_C0, Splats, joined
+from ...avatar.splats import SH_C0, Splats
 from ...flame.quaternions import from_matrices, to_matrices
-from ..settings import TrainingSettings
 from .backend import Backend
 from .frames import FrameStore
-from .occlusion_layer import CELL_VOXELS
+from .hidden_layers import HIDDEN_OPACITY, hidden_order, inner_layer, layer_on
 from .semantic_regions import eyeballs_of, lining_of
 from .state import parameters_and_average
 from .step_hook import Schedule
-from .surface import Surface
 from .unseen_hair import UnseenHair
 
 WELL_SEEN_COSINE = 0.8
@@ -31,30 +29,13 @@ DOUBT = 0.3
 halfway to what is plausible."""
 MIN_PULL = 0.02
 """Least fraction of that way that is worth a change."""
-HIDDEN_SPACING_VOXELS = 1.0
-"""Spacing of the lattice on hidden triangles where no order is chosen."""
-MAX_HIDDEN_ORDER = 4
-"""Largest order of that lattice."""
-HIDDEN_OPACITY = 3.0
-"""Logit of the opacity of splats on hidden triangles."""
-HIDDEN_FLATNESS = 0.25
-"""Their thickness as a fraction of that of the lattice's splats."""
 LEAST_WIDTH_SHARE = 0.9
-"""Width below which they may not shrink, as a fraction of what the lattice begins with."""
-OCCLUSION_OPACITY = 5.0
-"""Logit of the opacity of the occlusion layer."""
-CELL_WIDTH = 0.6
-"""Least standard deviation of the occlusion layer's splats, in cells."""
-BESIDE_LID_SHARE = 0.6
-"""Of the scale of the layer under lids, at their edges and in the mouth, where it would stand out
-beside the eye and the lips."""
+"""Width below which splats of the hidden layer may not shrink, as a fraction of what the lattice
+begins with."""
 LINING_SHARE = 0.5
-"""Of the scale of a triangle's only splat: the largest behind closed lips."""
+"""Largest scale behind closed lips, as a fraction of that of a triangle's only splat."""
 EYE_DEPTH_M = 0.0005
 """Least depth of splats below the eyeballs that they are on."""
-BORDER_INSET = 0.6
-"""Of the distance from the middle of a triangle, and of the scale, at the mesh's edge, of a lattice
-of order 1; a finer one reaches less beyond."""
 FLAT_VOXELS = 0.25
 """Largest standard deviation along the normal of splats on skin and clothes; views of a narrow cone
 do not determine it."""
@@ -82,9 +63,41 @@ INNER_PARAMETERS = ("xyz", "rotation", "log_scale", "opacity")
 """Parameters of the inner layer, and of the occlusion layer's end, that do not change."""
 
 
+@dataclass(frozen=True)
+class BoundSplats:
+    """The bound splats that priors may change, as they were before the first prior.
+
+    rows       (N,) their rows in the backend
+    columns    PULLED_COLUMNS, (N, …) each
+    reference  MOMENTS of well observed splats, (M, …) each
+    is_inner   (N,) bool: splats of the `inner_layer`
+    """
+
+    backend: Backend
+    rows: np.ndarray
+    columns: Mapping[str, np.ndarray]
+    reference: Mapping[str, np.ndarray]
+    is_inner: np.ndarray
+
+    @property
+    def face(self) -> np.ndarray:
+        return self.columns["face"]
+
+    def assign(self, which: np.ndarray, values: Mapping[str, np.ndarray | float]) -> None:
+        """Give the splats `which` (K,), numbers among these, new columns (K, …)."""
+        self.backend.assign(self.rows[which], values)
+
+
+class Prior(Protocol):
+    """What is plausible of some splats; made once for the frames of a training."""
+
+    def apply(self, splats: BoundSplats) -> None:
+        """Pull or keep what the views do not tell."""
+        ...
+
+
 class SurfacePrior:
-    """Pulls bound splats towards what is plausible, the more the less the views tell of them: the
-    color of what they lie on, opaque and flat on the surface, or in the outer layer of hair.
+    """Pulls bound splats towards what is plausible, the more the less the views tell of them.
 
     How much views tell is read from Adam's second moments, root mean squares of gradients. Without
     this, its steps, which are of one length for strong and weak gradients, would let splats that
@@ -103,7 +116,7 @@ class SurfacePrior:
         surface = self._surface
         sides = self._frames.sides
         may_be = sides.triangles | ~sides.shown | surface.lids | surface.is_flat
-        may_be |= self._frames.occlusion_layer.triangles | self._eyeballs
+        may_be |= self._frames.occlusion_layer.triangles | eyeballs_of(self._frames.capture)
         return np.asarray(may_be | (surface.turned_away > 0))
 
     def prepare(self) -> None:
@@ -112,224 +125,24 @@ class SurfacePrior:
     def apply(self, backend: Backend, schedule: Schedule) -> None:
         where = backend.columns(("face", "unbound"))
         is_bound = ~where["unbound"]
-        bound = np.flatnonzero(is_bound & self.may_be_pulled[where["face"]])
-        if not len(bound):
+        rows = np.flatnonzero(is_bound & self.may_be_pulled[where["face"]])
+        if not len(rows):
             return
         well_seen = is_bound & (self._surface.facing > WELL_SEEN_COSINE)[where["face"]]
         reference = np.flatnonzero(well_seen if well_seen.any() else is_bound)
         moments = backend.columns(MOMENTS, reference)
-        columns = backend.columns(PULLED_COLUMNS, bound)
-        is_inner = self._is_inner(columns)
-        self._pull_colors(backend, bound, columns, moments["second/color"], is_inner)
-        self._pull_shapes(backend, bound, columns, moments["second/opacity"])
-        self._shorten_steps(backend, bound, columns, moments)
-        self._flatten(backend, bound, columns)
-        self._keep_layer(backend, bound, columns, is_inner)
-        self._keep_end(backend, bound, columns, is_inner)
-        self._shrink_lining(backend, bound, columns)
-        self._sink_eyes(backend, bound, columns)
-
-    def _pull_colors(
-        self,
-        backend: Backend,
-        bound: np.ndarray,
-        columns: Mapping[str, np.ndarray],
-        reference: np.ndarray,
-        is_inner: np.ndarray,
-    ) -> None:
-        sides = self._frames.sides
-        face = columns["face"]
-        share = doubt(columns["second/color"], reference) * ~sides.shown[face]
-        # the avatar is made of averages, which only steps move
-        is_untouched = ~sides.shown[face] & ~columns["second/color"].any(1)
-        # of a lid, the edge of a fold is seen, in the fold's shade
-        is_folded = self._surface.folded_lids[face] & ~sides.shown[face]
-        is_pinned = sides.triangles[face] | is_inner | is_untouched | is_folded
-        rows = np.flatnonzero((share > MIN_PULL) & ~is_pinned)
-        colors = sides.color[face]
-        hair = np.flatnonzero(sides.is_hair[face])
-        if len(hair):
-            shades = self._hair.shades(face[hair], columns["parameters/xyz"][hair])
-            colors[hair] *= shades[:, None]
-        plausible = ((colors - 0.5) / SH_C0).astype(np.float32)
-        inner = np.searchsorted(self._inner.face, face[is_inner])
-        plausible[is_inner] = self._inner.sh[inner, 0]
-        color = columns["parameters/color"][rows]
-        color += share[rows, None] * (plausible[rows] - color)
-        backend.assign(bound[rows], {"parameters/color": color})
-        rows = np.flatnonzero(is_pinned)
-        zeros = dict.fromkeys((f"{kind}/sh" for kind in PINNED_KINDS), 0.0)
-        values = parameters_and_average({"color": plausible[rows]})
-        backend.assign(bound[rows], {**zeros, **values})
-
-    def _pull_shapes(
-        self,
-        backend: Backend,
-        bound: np.ndarray,
-        columns: Mapping[str, np.ndarray],
-        reference: np.ndarray,
-    ) -> None:
-        face = columns["face"]
-        share = doubt(columns["second/opacity"][:, None], reference[:, None])
-        surface = self._surface
-        turned_away = np.where(surface.sticks_out, 0, surface.turned_away)
-        share = (share * turned_away[face]) ** 2  # little of what outlines show
-        # no view has stepped these: beyond images' edges also lies what faces cameras
-        beyond = surface.outside & ~surface.sticks_out & ~self._frames.sides.shown
-        share[beyond[face] & ~columns["second/opacity"].astype(bool)] = 1
-        rows = np.flatnonzero(share > MIN_PULL)
-        share = share[rows]
-        opacity = columns["parameters/opacity"][rows]
-        opacity += share * (HIDDEN_OPACITY - opacity)
-        xyz = columns["parameters/xyz"][rows]
-        axis = NORMAL_AXIS[self._frames.convention]
-        height = self._hair.height(face[rows], xyz)
-        xyz[:, axis] += share * (height - xyz[:, axis])
-        values = {"opacity": opacity, "xyz": xyz}
-        backend.assign(bound[rows], parameters_and_average(values))
-
-    def _shorten_steps(
-        self,
-        backend: Backend,
-        bound: np.ndarray,
-        columns: Mapping[str, np.ndarray],
-        reference: Mapping[str, np.ndarray],
-    ) -> None:
-        """Where gradients are below DOUBT times those of well seen splats, Adam moves and shapes
-        splats by steps that are as much shorter: a layer that hardly shows would get holes."""
-        least = {name: DOUBT**2 * np.median(reference[name].mean(1)) for name in GEOMETRY_MOMENTS}
-        moments = {name: np.maximum(columns[name], least[name]) for name in GEOMETRY_MOMENTS}
-        backend.assign(bound, moments)
-
-    def _flatten(
-        self, backend: Backend, bound: np.ndarray, columns: Mapping[str, np.ndarray]
-    ) -> None:
-        """Splats on skin and clothes stay thin, those of the layer behind as wide as closes it."""
-        face = columns["face"]
-        limit = FLAT_VOXELS * self._frames.voxel
-        axis = NORMAL_AXIS[self._frames.convention]
-        rows = np.flatnonzero(self._surface.is_flat[face])
-        rotation = columns["parameters/rotation"][rows]
-        log_scale = columns["parameters/log_scale"][rows]
-        limits = limit / self._frames.unit_lengths[face[rows]]
-        least = self._least_width[face[rows]]
-        is_off = thickness(rotation, log_scale, axis) > FLAT_TOLERANCE * limits
-        layer = np.flatnonzero(least > 0)
-        widths = width(rotation[layer], log_scale[layer], axis)
-        is_off[layer] |= widths * FLAT_TOLERANCE < least[layer]
-        off = np.flatnonzero(is_off)
-        flat = flattened(rotation[off], log_scale[off], axis, limits[off], least[off])
-        values = parameters_and_average(dict(zip(("rotation", "log_scale"), flat, strict=True)))
-        moments = dict.fromkeys(("first/rotation", "first/log_scale"), 0.0)
-        backend.assign(bound[rows[off]], {**values, **moments})
+        columns = backend.columns(PULLED_COLUMNS, rows)
+        splats = BoundSplats(backend, rows, columns, moments, self._is_inner(columns))
+        for prior in self._priors:
+            prior.apply(splats)
 
     @cached_property
-    def _least_width(self) -> np.ndarray:
-        """(F,) of the `width` of the layer on triangles that face away from all cameras, in local
-        units; smaller, it has gaps. 0 elsewhere."""
-        surface = self._surface
-        is_layer = surface.closed & (surface.facing < BEHIND_COSINE)
-        hair = self._hair.least_width
-        skin = LEAST_WIDTH_SHARE * SCALE * self._frames.units / hidden_order(self._frames)
-        return np.where(is_layer, np.where(hair > 0, hair, skin), 0.0)
-
-    def _keep_layer(
-        self,
-        backend: Backend,
-        bound: np.ndarray,
-        columns: Mapping[str, np.ndarray],
-        is_inner: np.ndarray,
-    ) -> None:
-        """Splats of the mouth's unseen inside, and those behind lids and sides, stay as
-        `inner_layer` has them: views would make them any size."""
-        face = columns["face"]
-        is_inside = (self._frames.sides.triangles & ~self._surface.outside)[face]
-        rows = np.flatnonzero(is_inside | is_inner)
-        inner = self._inner.rows(np.searchsorted(self._inner.face, face[rows]))
-        kept = {name: getattr(inner, name) for name in INNER_PARAMETERS}
-        backend.assign(bound[rows], parameters_and_average(kept))
-
-    def _keep_end(
-        self,
-        backend: Backend,
-        bound: np.ndarray,
-        columns: Mapping[str, np.ndarray],
-        is_inner: np.ndarray,
-    ) -> None:
-        """Splats of the layer where the mesh ends, the first ones of their triangles, stay as its
-        lattice has them: masks would fray the end."""
-        lattice = self._end
-        triangles = len(self._surface.border)
-        size = np.bincount(lattice.face, minlength=triangles)
-        count = np.bincount(columns["face"][~is_inner], minlength=triangles)
-        is_whole = (size > 0) & (count >= size)  # not where another lattice was chosen
-        rows = np.flatnonzero(is_whole[columns["face"]] & ~is_inner)
-        rows = rows[np.argsort(columns["face"][rows], kind="stable")]
-        face = columns["face"][rows]
-        number = np.arange(len(rows)) - np.searchsorted(face, face)
-        is_first = number < size[face]
-        place = (np.searchsorted(lattice.face, face) + number)[is_first]
-        kept = {name: getattr(lattice, name)[place] for name in INNER_PARAMETERS}
-        backend.assign(bound[rows[is_first]], parameters_and_average(kept))
+    def _known(self) -> "_Known":
+        return _Known(self._frames)
 
     @cached_property
-    def _end(self) -> Splats:
-        """The layer on triangles at the mesh's end, sorted by triangle."""
-        surface = self._surface
-        order = hidden_order(self._frames)
-        is_end = surface.closed & surface.border & ~self._hair.has_strands
-        layer = layer_on(self._frames, is_end, order, 0)
-        return layer.rows(np.argsort(layer.face, kind="stable"))
-
-    def _shrink_lining(
-        self, backend: Backend, bound: np.ndarray, columns: Mapping[str, np.ndarray]
-    ) -> None:
-        """Splats on the lips' inner side, which few cameras do not show well, stay small: they
-        would hang before the teeth when the lips part."""
-        limits = self._lining_limits[columns["face"], None]
-        rows = np.flatnonzero((columns["parameters/log_scale"] > limits).any(1))
-        log_scale = np.minimum(columns["parameters/log_scale"][rows], limits[rows])
-        values = parameters_and_average({"log_scale": log_scale})
-        backend.assign(bound[rows], {**values, "first/log_scale": 0.0})
-
-    @cached_property
-    def _lining_limits(self) -> np.ndarray:
-        """(F,) largest log scale, in local units; infinite elsewhere."""
-        capture = self._frames.capture
-        sides = self._frames.sides
-        limits = np.full(len(capture.faces), np.inf, np.float32)
-        lining = lining_of(capture) & ~self._surface.outside & ~sides.shown & ~sides.triangles
-        single = lattice_splats(
-            capture.neutral, capture.faces, 0, 0, convention=self._frames.convention
-        )
-        lining &= self._surface.has_few_cameras
-        limits[lining] = single.log_scale.max(1)[lining] + np.log(LINING_SHARE)
-        return limits
-
-    def _sink_eyes(
-        self, backend: Backend, bound: np.ndarray, columns: Mapping[str, np.ndarray]
-    ) -> None:
-        """Splats on eyeballs lie below them: lids, whose splats are as deep, close over them."""
-        axis = NORMAL_AXIS[self._frames.convention]
-        face = columns["face"]
-        highest = (-EYE_DEPTH_M / self._frames.unit_lengths)[face]
-        rises = columns["parameters/xyz"][:, axis] > highest
-        rows = np.flatnonzero(rises & self._eyeballs[face])
-        xyz = columns["parameters/xyz"][rows]
-        xyz[:, axis] = highest[rows]
-        backend.assign(bound[rows], parameters_and_average({"xyz": xyz}))
-
-    @cached_property
-    def _eyeballs(self) -> np.ndarray:
-        return eyeballs_of(self._frames.capture)
-
-    @cached_property
-    def _hair(self) -> UnseenHair:
-        return UnseenHair(self._frames)
-
-    @cached_property
-    def _inner(self) -> Splats:
-        return inner_layer(self._frames)
+    def _priors(self) -> list[Prior]:
+        return [prior(self._known) for prior in PRIORS]
 
     def _is_inner(self, columns: Mapping[str, np.ndarray]) -> np.ndarray:
         """(N,) bool: the splats of the layer behind lids and sides, each the nearest to its place.
@@ -338,13 +151,242 @@ class SurfacePrior:
         has_inner = self._surface.lids | self._frames.occlusion_layer.triangles
         rows = np.flatnonzero(has_inner[columns["face"]])
         face = columns["face"][rows]
-        place = self._inner.xyz[np.searchsorted(self._inner.face, face)]
+        inner = self._known.inner
+        place = inner.xyz[np.searchsorted(inner.face, face)]
         distance = np.linalg.norm(columns["parameters/xyz"][rows] - place, axis=1)
         order = np.lexsort((distance, face))
         _, first = np.unique(face[order], return_index=True)
         is_inner = np.zeros(len(columns["face"]), bool)
         is_inner[rows[order[first]]] = True
         return is_inner
+
+
+class _Known:
+    """What the priors of a training share."""
+
+    def __init__(self, frames: FrameStore) -> None:
+        self.frames = frames
+        self.surface = frames.surface
+        self.sides = frames.sides
+        self.normal_axis = NORMAL_AXIS[frames.convention]
+
+    @cached_property
+    def hair(self) -> UnseenHair:
+        return UnseenHair(self.frames)
+
+    @cached_property
+    def inner(self) -> Splats:
+        return inner_layer(self.frames)
+
+
+class PlausibleColor:
+    """What views do not show has the color of `UnseenSides`, and keeps it where no view can tell:
+    of a folded lid, views show only the edge, in the fold's shade."""
+
+    def __init__(self, known: _Known) -> None:
+        self._known = known
+
+    def apply(self, splats: BoundSplats) -> None:
+        known = self._known
+        sides = known.sides
+        face = splats.face
+        moments = splats.columns["second/color"]
+        is_inner = splats.is_inner
+        share = doubt(moments, splats.reference["second/color"]) * ~sides.shown[face]
+        # the avatar is made of averages, which only steps move
+        is_untouched = ~sides.shown[face] & ~moments.any(1)
+        is_folded = known.surface.folded_lids[face] & ~sides.shown[face]
+        is_pinned = sides.triangles[face] | is_inner | is_untouched | is_folded
+        colors = sides.color[face]
+        hair = np.flatnonzero(sides.is_hair[face])
+        if len(hair):
+            shades = known.hair.shades(face[hair], splats.columns["parameters/xyz"][hair])
+            colors[hair] *= shades[:, None]
+        plausible = ((colors - 0.5) / SH_C0).astype(np.float32)
+        inner = np.searchsorted(known.inner.face, face[is_inner])
+        plausible[is_inner] = known.inner.sh[inner, 0]
+        rows = np.flatnonzero((share > MIN_PULL) & ~is_pinned)
+        color = splats.columns["parameters/color"][rows]
+        color += share[rows, None] * (plausible[rows] - color)
+        splats.assign(rows, {"parameters/color": color})
+        rows = np.flatnonzero(is_pinned)
+        zeros = dict.fromkeys((f"{kind}/sh" for kind in PINNED_KINDS), 0.0)
+        values = parameters_and_average({"color": plausible[rows]})
+        splats.assign(rows, {**zeros, **values})
+
+
+class OpaqueSurface:
+    """What turns away from the views is opaque and lies on the surface, or in the outer layer of
+    hair."""
+
+    def __init__(self, known: _Known) -> None:
+        self._known = known
+
+    def apply(self, splats: BoundSplats) -> None:
+        known = self._known
+        surface = known.surface
+        face = splats.face
+        moments = splats.columns["second/opacity"]
+        share = doubt(moments[:, None], splats.reference["second/opacity"][:, None])
+        turned_away = np.where(surface.sticks_out, 0, surface.turned_away)
+        share = (share * turned_away[face]) ** 2  # little of what outlines show
+        # no view has stepped these: beyond images' edges also lies what faces cameras
+        beyond = surface.outside & ~surface.sticks_out & ~known.sides.shown
+        share[beyond[face] & ~moments.astype(bool)] = 1
+        rows = np.flatnonzero(share > MIN_PULL)
+        share = share[rows]
+        opacity = splats.columns["parameters/opacity"][rows]
+        opacity += share * (HIDDEN_OPACITY - opacity)
+        xyz = splats.columns["parameters/xyz"][rows]
+        axis = known.normal_axis
+        height = known.hair.height(face[rows], xyz)
+        xyz[:, axis] += share * (height - xyz[:, axis])
+        splats.assign(rows, parameters_and_average({"opacity": opacity, "xyz": xyz}))
+
+
+class ShortSteps:
+    """Where gradients are below DOUBT times those of well observed splats, Adam moves and shapes
+    splats by steps that are as much shorter: a layer that hardly shows would get holes."""
+
+    def __init__(self, known: _Known) -> None:
+        pass
+
+    def apply(self, splats: BoundSplats) -> None:
+        reference = splats.reference
+        least = {name: DOUBT**2 * np.median(reference[name].mean(1)) for name in GEOMETRY_MOMENTS}
+        moments = {name: np.maximum(splats.columns[name], least[name]) for name in GEOMETRY_MOMENTS}
+        splats.assign(np.arange(len(splats.rows)), moments)
+
+
+class FlatSkin:
+    """Splats on skin and clothes stay thin, those of the hidden layer as wide as closes it."""
+
+    def __init__(self, known: _Known) -> None:
+        self._known = known
+
+    def apply(self, splats: BoundSplats) -> None:
+        frames = self._known.frames
+        axis = self._known.normal_axis
+        rows = np.flatnonzero(self._known.surface.is_flat[splats.face])
+        face = splats.face[rows]
+        rotation = splats.columns["parameters/rotation"][rows]
+        log_scale = splats.columns["parameters/log_scale"][rows]
+        limits = FLAT_VOXELS * frames.voxel / frames.unit_lengths[face]
+        least = self._least_width[face]
+        is_off = thickness(rotation, log_scale, axis) > FLAT_TOLERANCE * limits
+        layer = np.flatnonzero(least > 0)
+        widths = width(rotation[layer], log_scale[layer], axis)
+        is_off[layer] |= widths * FLAT_TOLERANCE < least[layer]
+        off = np.flatnonzero(is_off)
+        flat = flattened(rotation[off], log_scale[off], axis, limits[off], least[off])
+        values = parameters_and_average(dict(zip(("rotation", "log_scale"), flat, strict=True)))
+        moments = dict.fromkeys(("first/rotation", "first/log_scale"), 0.0)
+        splats.assign(rows[off], {**values, **moments})
+
+    @cached_property
+    def _least_width(self) -> np.ndarray:
+        """(F,) of the `width` of the layer on triangles that face away from all cameras, in local
+        units; smaller, it has gaps. 0 elsewhere."""
+        surface = self._known.surface
+        frames = self._known.frames
+        is_layer = surface.closed & (surface.facing < BEHIND_COSINE)
+        hair = self._known.hair.least_width
+        skin = LEAST_WIDTH_SHARE * SCALE * frames.units / hidden_order(frames)
+        return np.where(is_layer, np.where(hair > 0, hair, skin), 0.0)
+
+
+class FixedInnerLayer:
+    """Splats of the mouth's unseen inside, and those behind lids and sides, stay as `inner_layer`
+    has them: views would make them any size."""
+
+    def __init__(self, known: _Known) -> None:
+        self._inner = known.inner
+        self._is_inside = known.sides.triangles & ~known.surface.outside
+
+    def apply(self, splats: BoundSplats) -> None:
+        rows = np.flatnonzero(self._is_inside[splats.face] | splats.is_inner)
+        inner = self._inner.rows(np.searchsorted(self._inner.face, splats.face[rows]))
+        kept = {name: getattr(inner, name) for name in INNER_PARAMETERS}
+        splats.assign(rows, parameters_and_average(kept))
+
+
+class FixedEnd:
+    """Splats of the layer where the mesh ends, the first ones of their triangles, stay as its
+    lattice has them: masks would fray the end."""
+
+    def __init__(self, known: _Known) -> None:
+        surface = known.surface
+        is_end = surface.closed & surface.border & ~known.hair.has_strands
+        layer = layer_on(known.frames, is_end, hidden_order(known.frames), 0)
+        self._lattice = layer.rows(np.argsort(layer.face, kind="stable"))
+        self._size = np.bincount(layer.face, minlength=len(surface.border))
+
+    def apply(self, splats: BoundSplats) -> None:
+        size = self._size
+        is_inner = splats.is_inner
+        count = np.bincount(splats.face[~is_inner], minlength=len(size))
+        is_whole = (size > 0) & (count >= size)  # not where another lattice was chosen
+        rows = np.flatnonzero(is_whole[splats.face] & ~is_inner)
+        rows = rows[np.argsort(splats.face[rows], kind="stable")]
+        face = splats.face[rows]
+        number = np.arange(len(rows)) - np.searchsorted(face, face)
+        is_first = number < size[face]
+        place = (np.searchsorted(self._lattice.face, face) + number)[is_first]
+        kept = {name: getattr(self._lattice, name)[place] for name in INNER_PARAMETERS}
+        splats.assign(rows[is_first], parameters_and_average(kept))
+
+
+class SmallLining:
+    """Splats on the lips' inner side, which few cameras do not show well, stay small: they would
+    hang before the teeth when the lips part."""
+
+    def __init__(self, known: _Known) -> None:
+        capture = known.frames.capture
+        sides = known.sides
+        lining = lining_of(capture) & ~known.surface.outside & ~sides.shown & ~sides.triangles
+        lining &= known.surface.has_few_cameras
+        single = lattice_splats(
+            capture.neutral, capture.faces, 0, 0, convention=known.frames.convention
+        )
+        largest = single.log_scale.max(1) + np.log(LINING_SHARE)
+        self._limits = np.where(lining, largest, np.inf).astype(np.float32)
+
+    def apply(self, splats: BoundSplats) -> None:
+        limits = self._limits[splats.face, None]
+        rows = np.flatnonzero((splats.columns["parameters/log_scale"] > limits).any(1))
+        log_scale = np.minimum(splats.columns["parameters/log_scale"][rows], limits[rows])
+        values = parameters_and_average({"log_scale": log_scale})
+        splats.assign(rows, {**values, "first/log_scale": 0.0})
+
+
+class SunkenEyes:
+    """Splats on eyeballs lie below them: lids, whose splats are as deep, close over them."""
+
+    def __init__(self, known: _Known) -> None:
+        self._axis = known.normal_axis
+        self._eyeballs = eyeballs_of(known.frames.capture)
+        self._highest = -EYE_DEPTH_M / known.frames.unit_lengths
+
+    def apply(self, splats: BoundSplats) -> None:
+        highest = self._highest[splats.face]
+        rises = splats.columns["parameters/xyz"][:, self._axis] > highest
+        rows = np.flatnonzero(rises & self._eyeballs[splats.face])
+        xyz = splats.columns["parameters/xyz"][rows]
+        xyz[:, self._axis] = highest[rows]
+        splats.assign(rows, parameters_and_average({"xyz": xyz}))
+
+
+PRIORS = (
+    PlausibleColor,
+    OpaqueSurface,
+    ShortSteps,
+    FlatSkin,
+    FixedInnerLayer,
+    FixedEnd,
+    SmallLining,
+    SunkenEyes,
+)
+"""In the order in which they apply: a later one may change what an earlier one did."""
 
 
 def doubt(second: np.ndarray, reference: np.ndarray) -> np.ndarray:
@@ -383,111 +425,3 @@ def flattened(
     turned = from_matrices(axes)
     scale = 0.5 * np.log(np.maximum(variance, MIN_VARIANCE))
     return turned.astype(np.float32), scale.astype(np.float32)
-
-
-def above_unseen_hair(frames: FrameStore, splats: Splats) -> np.ndarray:
-    """(N,) bool: unbound splats that stand higher than hair which faces no camera. Masks from
-    in front do not end the hull behind a head: what stands there hangs in the air off-axis."""
-    surface = frames.surface
-    top = (surface.hair_height + frames.voxel) / frames.unit_lengths
-    height = splats.xyz[:, NORMAL_AXIS[frames.convention]]
-    is_hair = surface.hidden & (surface.hair_height > 0)
-    return np.asarray(splats.unbound & is_hair[splats.face] & (height > top[splats.face]))
-
-
-def hidden_splats(frames: FrameStore, settings: TrainingSettings) -> Splats:
-    """A dense opaque layer on the `closed` triangles, in which no view splits splats: on skin and
-    clothes, or where the outer layer of hair is, of strands where no outline shows it."""
-    surface = frames.surface
-    hair = UnseenHair(frames)
-    order = hidden_order(frames)
-    if settings.lattice is not None:
-        order[:] = settings.lattice
-    layer = layer_on(frames, surface.closed & ~hair.has_strands, order, settings.sh_degree)
-    return joined([layer, hair.splats(settings.sh_degree, HIDDEN_OPACITY)])
-
-
-def layer_on(
-    frames: FrameStore, triangles: np.ndarray, order: np.ndarray, sh_degree: int
-) -> Splats:
-    """The hidden layer on some triangles (F,) bool: lattices of these orders (F,)."""
-    capture = frames.capture
-    parts = []
-    for number in np.unique(order):
-        rows = np.flatnonzero(triangles & (order == number)).astype(np.int32)
-        lattice = lattice_splats(
-            capture.neutral,
-            capture.faces[rows],
-            int(number),
-            sh_degree,
-            HIDDEN_OPACITY,
-            convention=frames.convention,
-        )
-        parts.append(replace(lattice, face=rows[lattice.face]))
-    layer = joined(parts)
-    face = layer.face
-    axis = NORMAL_AXIS[frames.convention]
-    inset = border_inset(frames.surface, order)[face]
-    xyz = layer.xyz * inset[:, None]
-    xyz[:, axis] += frames.layer_height[face]
-    log_scale = layer.log_scale + np.log(inset * frames.hair_widening[face])[:, None]
-    log_scale[:, axis] += np.log(HIDDEN_FLATNESS)
-    return replace(layer, xyz=xyz.astype(np.float32), log_scale=log_scale.astype(np.float32))
-
-
-def hidden_order(frames: FrameStore) -> np.ndarray:
-    """(F,) order of the hidden layer's lattice, the higher the larger the triangles: colors and
-    ends of the mesh would be as coarse as these."""
-    spacing = HIDDEN_SPACING_VOXELS * frames.voxel
-    order = np.ceil(frames.units * frames.unit_lengths / spacing)
-    return np.clip(order, 1, MAX_HIDDEN_ORDER).astype(int)
-
-
-def border_inset(surface: Surface, order: np.ndarray) -> np.ndarray:
-    """(F,) share of the size that the hidden layer, lattices of these orders (F,), has on each
-    triangle."""
-    inset = 1 - (1 - BORDER_INSET) / np.maximum(order, 1) ** 2
-    return np.where(surface.border, inset, 1.0)
-
-
-def splats_behind(frames: FrameStore, sh_degree: int) -> Splats:
-    """The opaque layer under lids, whose own splats, trained on open eyes, would leave gaps when
-    they close, and the `occlusion_layer`."""
-    surface = frames.surface
-    inner = inner_layer(frames, sh_degree)
-    has_inner = (surface.lids & ~surface.closed) | frames.occlusion_layer.triangles
-    return inner.rows(has_inner[inner.face])
-
-
-def inner_layer(frames: FrameStore, sh_degree: int = 0) -> Splats:
-    """One splat in its plausible color, sorted by triangle, for each triangle of lids, under its
-    middle and so large that closed lids have no gaps, of the mouth's unseen inside, and of the
-    `occlusion_layer`."""
-    capture = frames.capture
-    axis = NORMAL_AXIS[frames.convention]
-    lids = frames.surface.lids
-    occlusion = frames.occlusion_layer
-    layer = lattice_splats(
-        capture.neutral, capture.faces, 0, sh_degree, HIDDEN_OPACITY, frames.convention
-    )
-    around = np.ones(len(capture.neutral), bool)
-    around[capture.faces[~lids]] = False
-    share = np.where(around[capture.faces].all(1), 1.0, BESIDE_LID_SHARE)
-    layer.xyz[:, axis] = frames.layer_height
-    layer.log_scale[:] += np.log(share)[:, None]
-    layer.log_scale[:, axis] += np.log(HIDDEN_FLATNESS)
-    behind = lattice_splats(
-        occlusion.places, capture.faces, 0, sh_degree, OCCLUSION_OPACITY, frames.convention
-    ).rows(occlusion.triangles)
-    behind.log_scale[:, axis] += np.log(HIDDEN_FLATNESS)
-    there = face_frames(occlusion.places, capture.faces, occlusion.places, frames.convention)
-    world = to_world(behind, there)
-    least = np.where(np.arange(3) == axis, 0, CELL_WIDTH * CELL_VOXELS * frames.voxel)
-    world = replace(world, log_scale=np.log(np.maximum(np.exp(world.log_scale), least)))
-    behind = to_local(world, frames.neutral, behind.face)
-    within = lids | (frames.sides.triangles & ~frames.surface.outside)
-    layer = joined([layer.rows((within & ~occlusion.triangles)[layer.face]), behind])
-    layer = layer.rows(np.argsort(layer.face))
-    color = np.where(occlusion.triangles[:, None], occlusion.color, frames.sides.color)
-    layer.sh[:, 0] = (color[layer.face] - 0.5) / SH_C0
-    return layer

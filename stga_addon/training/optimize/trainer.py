@@ -17,13 +17,14 @@ from .backend import Batch, RenderOptions
 from .density import DensityControl
 from .floaters import FloaterPruning
 from .frames import FrameStore
+from .hidden_layers import above_unseen_hair, hidden_splats, splats_behind
 from .initial_splats import initial_splats, unseen_share
 from .make_backend import make_backend
 from .outliers import OutlierReset
 from .outlines import OutlinePruning
 from .state import TrainState, new_state, with_offsets
 from .step_hook import Schedule, StepHook, is_due
-from .surface_prior import SurfacePrior, above_unseen_hair, hidden_splats, splats_behind
+from .surface_prior import SurfacePrior
 from .unseen_sides import plausible_off_axis
 
 
