@@ -17,6 +17,7 @@ from ..errors import StgaError
 from ..files import damage_of
 from .camera import MAX_IMAGE_PIXELS, is_image_size
 from .color import in_bands, is_srgb, to_srgb, with_gamma
+from .green_screen import without_spill
 from .model import View
 
 WHITE = (255, 255, 255)
@@ -125,8 +126,8 @@ def read_view(
     view: View, scale: float = 1.0, background: tuple[int, int, int] = WHITE
 ) -> tuple[View, np.ndarray, np.ndarray | None]:
     """Image and mask at `scale` in (0, 1]: the view with its camera scaled alike, image and mask as
-    above. Every small pixel is the mean over the area it covers, to avoid aliasing. Raises
-    StgaError as `read_image` does."""
+    above, the image without the light of a green screen. Every small pixel is the mean over the
+    area it covers, to avoid aliasing. Raises StgaError as `read_image` does."""
     if not 0 < scale <= 1:
         raise ValueError(f"scale {scale} is not in (0, 1]")
     pixels = _undistorted(view, _decode(view.image, view, "image"))
@@ -134,7 +135,10 @@ def read_view(
     small = view if scale == 1 else replace(view, camera=view.camera.scaled(scale))
     size = small.camera.height, small.camera.width
     image = area_mean(_over(pixels, background), *size)
-    return small, image, None if mask is None else area_mean(mask, *size)
+    if mask is None:
+        return small, image, None
+    mask = area_mean(mask, *size)
+    return small, without_spill(image, mask), mask
 
 
 def _undistorted(view: View, pixels: np.ndarray) -> np.ndarray:

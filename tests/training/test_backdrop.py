@@ -4,12 +4,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from numpy.testing import assert_array_equal
+from numpy.testing import assert_allclose, assert_array_equal
 from PIL import Image
 from scipy.ndimage import binary_dilation, binary_erosion
 
+from stga_addon.capture.camera import camera_from_gl
 from stga_addon.capture.images import read_image, read_mask, read_view
 from stga_addon.capture.mesh_geometry import rasterize
+from stga_addon.capture.model import View
 from stga_addon.raster.cpu.image_loss import change_background
 from stga_addon.raster.cpu.rasterize import frames_in_camera
 from stga_addon.training.evaluate.metrics import read_evaluation_view
@@ -53,6 +55,39 @@ def test_soft_edge_keeps_no_wall():
     blended = np.abs(alpha * image + (1 - alpha) * 255 * np.array(GREEN) - expected)
     assert error.max() < 6
     assert blended.max() > 25
+
+
+@pytest.mark.parametrize("screen", [[70, 160, 105], [30, 60, 170]])
+def test_the_light_of_a_screen_is_taken_away(screen, tmp_path):
+    """Catches a green rim on hair and ears of a person before a green screen. Before a meadow, of
+    the same light, and far from the outline, colors stay."""
+    key = int(np.argmax(screen))
+    hair, cover = person()
+    hair[:] = 60
+    alpha = cover[..., None]
+    y, x = np.mgrid[:SIZE, :SIZE]
+    middle = np.hypot(x - 38, y - 42) < 6
+    spilt = hair + 0.2 * (np.array(screen) - np.delete(screen, key).max()) * (np.arange(3) == key)
+    badge = np.where(np.arange(3) == key, 200.0, 60.0)
+    colors = np.where(middle[..., None], badge, spilt)
+    mask = (255 * cover).round().astype(np.uint8)
+    wild = np.random.default_rng(0).uniform(-120, 120, (SIZE, SIZE, 1))
+    camera = camera_from_gl(np.eye(4), (SIZE, SIZE), (100, 100), (SIZE / 2, SIZE / 2))
+    Image.fromarray(mask).save(tmp_path / "mask.png")
+    for noise in (0, wild):
+        backdrop = np.clip(np.array(screen) + noise, 0, 255)
+        image = (alpha * colors + (1 - alpha) * backdrop).round().astype(np.uint8)
+        Image.fromarray(image).save(tmp_path / "image.png")
+        view = View(0, 0, camera, "image", tmp_path / "image.png", tmp_path / "mask.png")
+        _, found, _ = read_view(view)
+        rim = (cover == 1) & ~binary_erosion(cover == 1, iterations=3)
+        expected = hair if not np.any(noise) else spilt
+        assert_allclose(found[rim], expected[rim], atol=1)
+        assert_array_equal(found[middle], image[middle])
+        over = over_color(found, mask, (0, 0, 0))
+        edge = (cover > 0.3) & (cover < 0.9)
+        excess = (over[..., key].astype(int) - np.delete(over, key, 2).max(2))[edge]
+        assert (excess.max() <= 1) == (not np.any(noise))
 
 
 @pytest.mark.parametrize("level", [0, 255])

@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterable, Sequence
 
 import numpy as np
 
+from ...capture.green_screen import limited_channel, screen_channel
 from ...capture.loader import Preparation
 from ...capture.mesh_geometry import silhouette
 from ...capture.model import Capture, View, ViewExposure
@@ -73,8 +74,9 @@ def over_color(image: np.ndarray, mask: np.ndarray, color: Sequence[float]) -> n
     """The masked part of an image (H, W, 3) uint8 over a color (0…1); mask (H, W) uint8 coverage.
 
     image = coverage · foreground + (1 − coverage) · backdrop, where the backdrop of a pixel is the
-    mean of those pixels around it that show nothing else; only this second term is exchanged. A
-    mask's soft edge thus keeps no rim of the backdrop's color.
+    mean of those pixels around it that show nothing else; only this second term is exchanged, and
+    the light of a green screen is taken from the first. A mask's soft edge thus keeps no rim of the
+    backdrop's color.
     """
     import cv2
 
@@ -92,6 +94,8 @@ def over_color(image: np.ndarray, mask: np.ndarray, color: Sequence[float]) -> n
             clear = (mask == 0).astype(np.uint8)
             behind = mean_around(image, clear, deviations, np.stack(places, axis=1))
             shown = np.clip(image[places] - (1 - cover) * behind, 0, 255 * cover)
+            if (key := screen_channel(image, mask)) is not None:
+                shown = limited_channel(shown, key)
         rest = (1 - cover) * 255 * np.asarray(color, np.float32)
         over[places] = _levels(shown + rest)
     return np.asarray(over)
