@@ -26,6 +26,7 @@ from ..stga_addon.errors import StgaError
 from ..stga_addon.export import formats
 from ..stga_addon.export.formats import FORMATS, SPLAT_FORMATS, Content, Meshes, WorldContent
 from ..stga_addon.export.playback import Playback
+from ..stga_addon.export.usd import find_usd
 from ..stga_addon.files import confirming
 from ..stga_addon.flame.sequence import FlameSequence
 from ..stga_addon.format import format_bytes
@@ -49,6 +50,7 @@ from ..stga_addon.scene.rig.head import find_rig, has_shape_keys, shape_key_mode
 from ..stga_addon.scene.rig.motion import sample_motion
 from ..stga_addon.scene.vertex_groups import training_selection
 from ..stga_addon.tracking.head_model import shape_arrays, write_linear_model
+from ..stga_addon.worker.training_python import own_python
 from . import common, options
 from .common import (
     Action,
@@ -63,6 +65,7 @@ from .common import (
     scene_frames,
 )
 from .options import ONCE
+from .training_python import training_python
 
 Read = Callable[[], Any]
 """What is exported of the open scene at its frame."""
@@ -239,8 +242,10 @@ class ExportAvatar(SplatExport, bpy.types.Operator):
             motion = sample_motion(head, own_motion(head), frames, self.warn)
 
         def write(meshes: Meshes) -> None:
-            formats.export_avatar(path, avatar, self.format, meshes, motion, playback)
+            content = Content(avatar, meshes, motion, playback, python)
+            formats.write_content(path, self.format, content)
 
+        python = _usd_python(context, self.format)
         owner = Identity(head)
         return self.write_frames(
             context, path, lambda: evaluated_vertices(owner.get()), write, [head]
@@ -301,10 +306,23 @@ class ExportSplats(SplatExport, bpy.types.Operator):
                 content = SimpleNamespace(splats=read(), moving_color=False)
             formats.check_free_space(path, format.size(content, count))
 
+        python = _usd_python(context, self.format)
+
         def write(frames: Iterable[tuple[int, Splats]]) -> None:
-            formats.write_content(path, self.format, WorldContent(frames, playback))
+            formats.write_content(path, self.format, WorldContent(frames, playback, python))
 
         return self.write_frames(context, path, read, write, things)
+
+
+def _usd_python(context: Any, format: str) -> str:
+    """The interpreter that writes USD files where Blender's lacks USD; "" where none is needed, or
+    none is chosen."""
+    if format != "usd" or find_usd() is not None:
+        return ""
+    with suppress(StgaError):
+        python = training_python(context)
+        return "" if python == own_python() else python
+    return ""
 
 
 class _Writer:

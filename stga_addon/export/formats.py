@@ -30,12 +30,16 @@ Meshes = Iterable[tuple[int, np.ndarray]]
 
 @dataclass(frozen=True)
 class Content:
-    """An avatar to be exported; `meshes` and `sequence` as `export_avatar` takes them."""
+    """An avatar to be exported; `meshes` and `sequence` as `export_avatar` takes them.
+
+    python  the interpreter that writes what this one lacks packages for (`write_usd`); "": none
+    """
 
     avatar: Avatar
     meshes: Meshes = ()
     sequence: FlameSequence | None = None
     playback: Playback = field(default_factory=Playback)
+    python: str = ""
 
     def frames(self, path: Path) -> Iterator[tuple[int, Splats]]:
         """The splats in world space on each mesh, with its number. Raises StgaError naming `path`
@@ -82,10 +86,12 @@ class Content:
 @dataclass(frozen=True)
 class WorldContent:
     """Any splats to be exported, in world space: numbered frames of them, whose number, order and
-    values may differ, and how they play. Harmonics are of the degree of the first frame."""
+    values may differ, and how they play. Harmonics are of the degree of the first frame. python: as
+    of `Content`."""
 
     numbered: Iterable[tuple[int, Splats]]
     playback: Playback
+    python: str = ""
     antialiased: bool = False
     moving_color: bool = False
 
@@ -159,7 +165,11 @@ FORMATS: dict[str, Format] = {
         (".usdc", ".usdz"),
         "range",
         lambda path, item: write_usd(
-            path, item.for_linear_light.frames(path), item.playback.fps, item.moving_color
+            path,
+            item.for_linear_light.frames(path),
+            item.playback.fps,
+            item.moving_color,
+            item.python,
         ),
         lambda item, frames: usd_bytes(item.splats, frames, item.moving_color),
         has_rate=True,

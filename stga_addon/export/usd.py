@@ -1,17 +1,24 @@
-"""Writing of an avatar as an animated OpenUSD particle field of Gaussian splats."""
+"""Writing of an avatar as an animated OpenUSD particle field of Gaussian splats, in this
+interpreter or, where it lacks USD, by another."""
 
 import errno
 import os
+import sys
 import zipfile
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO, cast
 
 import numpy as np
 
 from ..avatar.splats import Splats
 from ..errors import StgaError
 from ..files import replacing
+from ..worker.helpers import claim_stdout
+from ..worker.launch import start_piped
+from ..worker.messages import receive, send
+from ..worker.training_python import own_python
 
 PRIM_TYPE = "ParticleField3DGaussianSplat"
 COEFFICIENTS = "radiance:sphericalHarmonicsCoefficients"
@@ -19,9 +26,20 @@ COEFFICIENTS = "radiance:sphericalHarmonicsCoefficients"
 EXTENT_DEVIATIONS = 3.0
 """Standard deviations that count as a splat's extent, as for USD's Gaussian kernel."""
 
+HAS_USD = "has usd"
+"""Of the writing process's first message: whether its interpreter has USD."""
+NUMBER = "number"
+"""Of a frame's message: its time code."""
+ERROR = "error"
+"""Of the writing process's last message: why the file could not be written."""
+
 
 def write_usd(
-    path: Path, frames: Iterable[tuple[int, Splats]], fps: float, moving_color: bool = False
+    path: Path,
+    frames: Iterable[tuple[int, Splats]],
+    fps: float,
+    moving_color: bool = False,
+    python: str = "",
 ) -> None:
     """Write numbered world-space splats as the time samples of one prim, atomically.
 
@@ -30,40 +48,131 @@ def write_usd(
     fps           time codes per second
     moving_color  whether the spherical harmonics differ between frames: written for each of them,
                   in half precision
+    python        the interpreter that writes the file where this one lacks USD; "": none
     Meters, y up; rotations unit quaternions, standard deviations linear, opacity 0 to 1. What stays
     the same is written once; splats may come and go. A frame is in the file before the next is
     taken, so memory does not grow with their number. Raises StgaError where USD is not installed,
     or a file cannot be written.
     """
+    usd = find_usd()
+    if usd is None and not python:
+        raise _lacks_usd(path, f"{own_python()} lacks")
+    with replacing(path) as partial:
+        if usd is not None:
+            _write_file(usd, partial, path, frames, fps, moving_color)
+        else:
+            _write_elsewhere(python, partial, path, frames, fps, moving_color)
+
+
+def find_usd() -> Any:
+    """The package `pxr` with the modules used here; None where USD is not installed."""
     try:
-        import pxr as usd
+        import pxr
         import pxr.Sdf
         import pxr.Tf
         import pxr.Usd
         import pxr.UsdGeom
         import pxr.Vt
-    except ImportError as error:
-        raise StgaError(
-            f"{path}: USD files need the package usd-core, which this Python lacks"
-        ) from error
+    except ImportError:
+        return None
+    return pxr
+
+
+def _lacks_usd(path: Path, who: str) -> StgaError:
+    return StgaError(
+        f"{path}: USD files need the package usd-core, which {who}; install it in the Python that "
+        "trains (pip install usd-core)"
+    )
+
+
+def _write_file(
+    usd: Any,
+    file: Path,
+    path: Path,
+    frames: Iterable[tuple[int, Splats]],
+    fps: float,
+    moving_color: bool,
+) -> None:
+    """Write a file that is renamed to `path` afterwards. Raises OSError."""
     is_package = path.suffix.lower() == ".usdz"
-    with replacing(path) as partial:
-        layer = partial.with_name(f".layer{partial.name}") if is_package else partial
+    layer = file.with_name(f".layer{file.name}") if is_package else file
+    try:
+        _write_layer(usd, layer, frames, fps, moving_color)
+        if is_package:
+            # there before USD 26
+            writer = getattr(usd.Sdf, "ZipFileWriter", None) or usd.Usd.ZipFileWriter
+            with writer.CreateNew(str(file)) as archive:
+                archive.AddFile(str(layer), f"{path.stem}.usdc")
+            if not zipfile.is_zipfile(file):  # no error is reported on a full disk
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+    except usd.Tf.ErrorException as error:
+        # "Error occurred writing file: No space left on device"
+        raise OSError(error.args[0].commentary.rpartition(": ")[2]) from error
+    finally:
+        if is_package:
+            layer.unlink(missing_ok=True)
+
+
+def _write_elsewhere(
+    python: str,
+    file: Path,
+    path: Path,
+    frames: Iterable[tuple[int, Splats]],
+    fps: float,
+    moving_color: bool,
+) -> None:
+    """As `_write_file`, by another interpreter, which takes a frame at a time. Raises StgaError
+    where it lacks USD or ends early."""
+    arguments = [str(file), str(path), repr(fps), "moving" if moving_color else "constant"]
+    with start_piped(python, ["stga_addon.export.usd", *arguments]) as process:
+        stdin = cast(BinaryIO, process.stdin)
+        stdout = cast(BinaryIO, process.stdout)
         try:
-            _write_layer(usd, layer, frames, fps, moving_color)
-            if is_package:
-                # there before USD 26
-                writer = getattr(usd.Sdf, "ZipFileWriter", None) or usd.Usd.ZipFileWriter
-                with writer.CreateNew(str(partial)) as archive:
-                    archive.AddFile(str(layer), f"{path.stem}.usdc")
-                if not zipfile.is_zipfile(partial):  # no error is reported on a full disk
-                    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-        except usd.Tf.ErrorException as error:
-            # "Error occurred writing file: No space left on device"
-            raise OSError(error.args[0].commentary.rpartition(": ")[2]) from error
-        finally:
-            if is_package:
-                layer.unlink(missing_ok=True)
+            if not _answer(python, stdout)[HAS_USD]:
+                raise _lacks_usd(path, f"neither {own_python()} nor {python} has")
+            with suppress(BrokenPipeError):  # it has ended, and said why
+                for number, world in frames:
+                    send(stdin, {NUMBER: number, **vars(world)})
+                send(stdin, {})
+            _answer(python, stdout)
+        except BaseException:
+            process.kill()
+            file.with_name(f".layer{file.name}").unlink(missing_ok=True)
+            raise
+
+
+def _answer(python: str, stream: BinaryIO) -> dict[str, np.ndarray]:
+    """The next message of the writing process. Raises OSError with what it could not write."""
+    try:
+        answer = receive(stream)
+    except (EOFError, ValueError) as error:
+        raise StgaError(f"{python}: exited unexpectedly while it wrote a USD file") from error
+    if ERROR in answer:
+        raise OSError(str(answer[ERROR]))
+    return answer
+
+
+def serve(requests: BinaryIO, answers: BinaryIO, file: Path, path: Path, *settings: Any) -> None:
+    """Write the frames that are requested; answer whether USD is installed, and at the end.
+
+    settings: fps and moving_color, as `write_usd` takes them
+    """
+    usd = find_usd()
+    send(answers, {HAS_USD: usd is not None})
+    if usd is None:
+        return
+
+    def frames() -> Iterator[tuple[int, Splats]]:
+        while arrays := receive(requests):
+            number = int(arrays.pop(NUMBER))
+            yield number, Splats(**arrays)
+
+    try:
+        _write_file(usd, file, path, frames(), *settings)
+    except OSError as error:
+        send(answers, {ERROR: error.strerror or str(error)})
+    else:
+        send(answers, {})
 
 
 def usd_bytes(splats: Splats, frames: int, moving_color: bool) -> int:
@@ -163,3 +272,9 @@ def _define(usd: Any, stage: Any, first: Splats) -> Any:
 def _rows(array: np.ndarray) -> np.ndarray:
     """As (..., last axis) contiguous rows, as USD's arrays are."""
     return np.ascontiguousarray(array.reshape(-1, array.shape[-1]))
+
+
+if __name__ == "__main__":
+    answers = claim_stdout()
+    file, path, fps, color = sys.argv[1:]
+    serve(sys.stdin.buffer, answers, Path(file), Path(path), float(fps), color == "moving")

@@ -1,11 +1,9 @@
 """Render client: renders in this process, or through a render server in another interpreter where
 packages are missing; the server, `python -m stga_addon.render.client DEVICE`, and their messages.
 
-A message is a mark, a length, then named arrays as an npz without pickle. Importing this needs
-numpy only.
+Importing this needs numpy only.
 """
 
-import io
 import subprocess
 import sys
 import threading
@@ -24,11 +22,11 @@ from ..errors import StgaError
 from ..raster.posed_splats import ComposedImage, PosedSplats
 from ..worker.helpers import claim_stdout
 from ..worker.launch import start_python
+from ..worker.messages import receive, send
 from .device import Composer
 
 REQUIRED_PACKAGES = ("numba", "platformdirs")
 """What the kernels need beside numpy, by the names of the packages."""
-MARK = b"stga"
 SPLAT_FIELDS = [field.name for field in fields(Splats)]
 FRAME_FIELDS = [field.name for field in fields(FaceFrames)]
 
@@ -118,35 +116,6 @@ class RenderClient:
 def missing_packages() -> list[str]:
     """Those of REQUIRED_PACKAGES that this interpreter lacks."""
     return [name for name in REQUIRED_PACKAGES if find_spec(name) is None]
-
-
-def send(stream: BinaryIO, arrays: Mapping[str, Any]) -> None:
-    """Write one message."""
-    packed = io.BytesIO()
-    np.savez(packed, **arrays)
-    stream.write(MARK + packed.tell().to_bytes(8, "little"))
-    stream.write(packed.getbuffer())
-    stream.flush()
-
-
-def receive(stream: BinaryIO) -> dict[str, np.ndarray]:
-    """Read one message. Raises EOFError at the stream's end, ValueError for anything else."""
-
-    def read(size: int) -> bytes:
-        parts = []
-        while size:
-            parts.append(stream.read(size))
-            if not parts[-1]:
-                raise EOFError
-            size -= len(parts[-1])
-        return b"".join(parts)
-
-    mark = read(len(MARK))
-    size = int.from_bytes(read(8), "little")
-    if mark != MARK:
-        raise ValueError(f"a message begins with {MARK!r}, got {mark!r}")
-    with np.load(io.BytesIO(read(size)), allow_pickle=False) as arrays:
-        return dict(arrays)
 
 
 def pack_camera(camera: Camera) -> dict[str, Any]:

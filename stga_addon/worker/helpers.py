@@ -24,7 +24,7 @@ import numpy as np
 
 from ..errors import StgaError
 from ..files import read_npz, write_npz
-from .launch import end_with_this_process, start_python
+from .launch import start_piped
 from .machine import processors
 from .training_python import own_python
 
@@ -192,11 +192,7 @@ def _kept(
 
 
 def _start() -> "subprocess.Popen[bytes]":
-    quiet: dict[str, Any] = {"preexec_fn": end_with_this_process()}
-    if os.name == "nt":
-        quiet = {"creationflags": 0x08000000}  # no console window
-    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
-    return start_python(own_python(), ["stga_addon.worker.helpers"], SINGLE, **pipes, **quiet)
+    return start_piped(own_python(), ["stga_addon.worker.helpers"], SINGLE)
 
 
 class _Unpickler(pickle.Unpickler):

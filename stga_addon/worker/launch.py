@@ -121,6 +121,18 @@ def start_python(
         ) from error
 
 
+def start_piped(
+    python: str, arguments: Sequence[str], variables: Mapping[str, str] | None = None
+) -> "subprocess.Popen[bytes]":
+    """`start_python` with pipes, of a process that on Linux ends with the thread that starts it, on
+    Windows has no console window."""
+    options: dict[str, Any] = {"preexec_fn": end_with_this_process()}
+    if os.name == "nt":
+        options = {"creationflags": 0x08000000}
+    options |= {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
+    return start_python(python, arguments, variables, **options)
+
+
 def end_with_this_process() -> Callable[[], None] | None:
     """A `preexec_fn` by which Linux kills the started process with the thread that starts it; None
     on other systems, where it goes on to its end."""

@@ -1,6 +1,7 @@
 """The operators, called as a script calls them, from the checkout registered as an extension."""
 
 import re
+import sys
 import threading
 import time
 from dataclasses import replace
@@ -230,6 +231,24 @@ def test_exports(shown, tmp_path):
     assert_allclose(arrays["translation"][[0, 2]], centers, atol=1e-5)
     up = np.array(panel().head.matrix_world.to_3x3()) @ header["up"]
     assert_allclose(up, [0, 0, 1], atol=1e-5)
+
+
+@pytest.mark.parametrize("export", [ops.export_avatar, ops.export_splats])
+def test_usd_is_written_by_the_python_that_trains(shown, extension, tmp_path, monkeypatch, export):
+    """Catches USD files that a Blender without USD refuses although the Python that trains has
+    it."""
+    pytest.importorskip("pxr.Usd", reason="the package usd-core is not installed")
+    export(filepath=tmp_path / "here.usdc", format="usd")
+    for module in (extension.operators.export, extension.stga_addon.export.usd):
+        monkeypatch.setattr(module, "find_usd", lambda: None)
+    with failure("USD files need the package usd-core"):
+        export(filepath=tmp_path / "there.usdc", format="usd")
+    python = tmp_path / "python"
+    python.write_text(f'#!/bin/sh\nexec {sys.executable} "$@"\n')
+    python.chmod(0o755)
+    monkeypatch.setenv("STGA_PYTHON", str(python))
+    export(filepath=tmp_path / "there.usdc", format="usd")
+    assert (tmp_path / "there.usdc").read_bytes() == (tmp_path / "here.usdc").read_bytes()
 
 
 class RangeExport:

@@ -12,8 +12,10 @@ from pxr import Usd, UsdGeom, UsdValidation, UsdVol
 from refusal import refusal
 
 from stga_addon.avatar.embedding import to_world
-from stga_addon.export.formats import FORMATS, Content, export_avatar
+from stga_addon.export import usd
+from stga_addon.export.formats import FORMATS, Content, export_avatar, write_content
 from stga_addon.export.playback import Playback
+from stga_addon.progress import Cancelled
 
 PLAYBACK = Playback(fps=30.0)
 
@@ -106,10 +108,58 @@ def test_size_is_known_before(avatar, tmp_path):
         assert FORMATS["usd"].size(Content(item), 4) == pytest.approx(size, rel=0.02)
 
 
-def test_without_usd_the_package_is_named(avatar, tmp_path, monkeypatch):
-    """Catches a traceback without USD."""
+@pytest.fixture
+def without_usd(monkeypatch):
+    """This interpreter lacks USD."""
     for name in [name for name in sys.modules if name.partition(".")[0] == "pxr"]:
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, "pxr", None)
-    with refusal(r"USD files need the package usd-core"):
-        export_avatar(tmp_path / "a.usdc", avatar, "usd", moved(avatar))
+
+
+def interpreter(path, line):
+    path.write_text(f"#!/bin/sh\n{line}\n")
+    path.chmod(0o755)
+    return str(path)
+
+
+@pytest.mark.parametrize("suffix", [".usdc", ".usdz"])
+def test_another_interpreter_writes_the_same(avatar, tmp_path, monkeypatch, suffix):
+    """Catches frames, rates or colors that are lost on the way to the Python that has USD, and
+    files that are left beside it."""
+    content = Content(colored(avatar), list(moved(avatar)), playback=PLAYBACK)
+    here = tmp_path / f"here/a{suffix}"
+    there = tmp_path / f"there/a{suffix}"
+    write_content(here, "usd", content)
+    monkeypatch.setattr(usd, "find_usd", lambda: None)
+    write_content(there, "usd", replace(content, python=sys.executable))
+    written, expected = (Usd.Stage.Open(str(file)).ExportToString(False) for file in (there, here))
+    assert written == expected
+    assert [path.name for path in there.parent.iterdir()] == [there.name]
+
+
+def test_without_usd_the_package_is_named(avatar, tmp_path, without_usd):
+    """Catches tracebacks, endless waits and half files without USD, here and in the other
+    Python."""
+    path = tmp_path / "out/a.usdz"
+    (tmp_path / "none").mkdir()
+    (tmp_path / "none/pxr.py").write_text("raise ImportError")
+    run = f'exec {sys.executable} "$@"'
+    lacking = f"PYTHONPATH={tmp_path / 'none'}:$PYTHONPATH {run}"
+
+    def interrupted():
+        yield from moved(avatar)
+        raise Cancelled
+
+    content = Content(avatar, moved(avatar), playback=PLAYBACK)
+    for name, line, sentence in (
+        ("", "", r"a\.usdz: USD files need the package usd-core, which .* lacks"),
+        ("lacking", lacking, "usd-core, which neither .* nor .*lacking has; install it in"),
+        ("ends", "exit 3", "ends: exited unexpectedly while it wrote a USD file"),
+    ):
+        python = name and interpreter(tmp_path / name, line)
+        with refusal(sentence):
+            write_content(path, "usd", replace(content, python=python))
+    there = interpreter(tmp_path / "there", run)
+    with pytest.raises(Cancelled):
+        write_content(path, "usd", replace(content, meshes=interrupted(), python=there))
+    assert not path.parent.exists()

@@ -18,8 +18,9 @@ from stga_addon.errors import StgaError
 from stga_addon.raster.cpu.compose import compose
 from stga_addon.raster.posed_splats import PosedSplats
 from stga_addon.render import client as render_client
-from stga_addon.render.client import RenderClient, receive
+from stga_addon.render.client import RenderClient
 from stga_addon.render.render import render, render_layers
+from stga_addon.worker.messages import receive
 
 HERE = np.eye(4)
 AHEAD = np.array([0, 0, 1.2])
