@@ -8,6 +8,13 @@ from ...capture.transforms import WHOLE_FILE, transforms_files
 from ...errors import StgaError
 from ...files import decoded_text, is_file, is_folder, matching
 from .colmap import colmap_models, incomplete_models, read_colmap
+from .json_cameras import (
+    CAMERA_PARAMS,
+    is_camera_params,
+    is_gaussian_cameras,
+    read_camera_params,
+    read_gaussian_cameras,
+)
 from .metashape import is_metashape, read_metashape
 from .nerfstudio import is_transforms, read_nerfstudio
 from .realitycapture import (
@@ -20,9 +27,11 @@ from .shots import Calibrated, ImageSize, listed
 
 EXPECTED = (
     "transforms.json, a COLMAP model (sparse/0), Metashape's cameras.xml, "
-    "RealityCapture's CSV or XMP files"
+    "RealityCapture's CSV or XMP files, NeRSemble's camera_params.json"
 )
 """What messages say is read."""
+LEVELS_ABOVE = 4
+"""Folders around one of images, in which NeRSemble's calibration is looked for."""
 HEAD_BYTES = 4096
 """Bytes of a file in which UNREAD_MARKS are looked for."""
 UNREAD_NAMES = (
@@ -62,7 +71,11 @@ def _transforms(root: Path) -> list[Path]:
     return [files[0] if files[0].name == WHOLE_FILE else root] if files else []
 
 
-def _read_transforms(path: Path, _: ImageSize) -> Calibrated:
+def _read_transforms(path: Path, image_size: ImageSize) -> Calibrated:
+    if is_file(path) and is_camera_params(path):
+        return read_camera_params(path, image_size)
+    if is_file(path) and is_gaussian_cameras(path):
+        return read_gaussian_cameras(path), ()
     parts = [read_nerfstudio(own) for own in (transforms_files(path) or [path])]
     return [shot for shots, _ in parts for shot in shots], sum((told for _, told in parts), ())
 
@@ -101,6 +114,21 @@ def _read_xmp(path: Path, image_size: ImageSize) -> Calibrated:
     return read_realitycapture_xmp(_xmp_files(path), image_size, path)
 
 
+def _camera_params(root: Path) -> list[Path]:
+    """NeRSemble's file, in the folder or in one below it, where its data set has it."""
+    inside = [path for path in sorted(root.glob(f"*/{CAMERA_PARAMS}")) if is_file(path)]
+    return [*_exports(".json", is_camera_params)(root), *inside]
+
+
+def calibration_above(root: Path) -> Path | None:
+    """NeRSemble's file in one of the folders around that of a moment's images."""
+    for folder in root.parents[:LEVELS_ABOVE]:
+        for path in (folder / CAMERA_PARAMS, folder / "calibration" / CAMERA_PARAMS):
+            if is_file(path):
+                return path
+    return None
+
+
 PROGRAMS = (
     Program(_transforms, _read_transforms, (".json",)),
     Program(colmap_models, lambda path, _: read_colmap(path), (".bin", ".txt")),
@@ -110,6 +138,8 @@ PROGRAMS = (
         ),
         _read_transforms,
     ),
+    Program(_camera_params, _read_transforms),
+    Program(_exports(".json", is_gaussian_cameras), _read_transforms),
     Program(
         _exports(".xml", lambda path: is_metashape(_head(path))),
         lambda path, _: read_metashape(path),

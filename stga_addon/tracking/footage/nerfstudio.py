@@ -1,15 +1,26 @@
 """Cameras of transforms files: nerfstudio, instant-ngp, VHAP, Blender's exports."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
+
 from ...capture.distortion import lens_of
 from ...capture.model import FPS_LIMIT
-from ...capture.transforms import read_transforms, repairs, with_principal_point
+from ...capture.transforms import Frame, read_transforms, repairs, with_principal_point
 from .shots import Calibrated, Shot
+from .sources import natural_order
 
+FACE_KEYS = ("expression", "exp_path", "mesh_path", "flame_path")
+"""What each frame of NeRFace, IMavatar and INSTA has: a head that moves before one camera."""
 MARKS = b'"frames"', b'"transform_matrix"'
 HEAD_BYTES = 1 << 16
+HEAD_FIXED = (
+    "its frames hold a face's expressions: they are moments of one camera, and its poses are "
+    "relative to the head, which tracking finds itself"
+)
+"""Sentence about what NeRFace, INSTA and their like write."""
 
 
 def is_transforms(path: Path) -> bool:
@@ -46,4 +57,23 @@ def read_nerfstudio(path: Path) -> Calibrated:
             view.name, camera, lens_of(record), frame.where, view.image, timestep, mask, name
         )
         shots.append(replace(shot, fps=fps, keeps_world=keeps_world))
+    if not is_timed and is_head_fixed(frames):
+        return _of_one_camera(shots), (*repairs(frames), HEAD_FIXED)
     return shots, repairs(frames)
+
+
+def is_head_fixed(frames: Sequence[Frame]) -> bool:
+    """Whether poses are relative to a moving head, as those of single-camera head trackers."""
+    entries = [frame.record.values for frame in frames]
+    return len(frames) > 1 and any(all(key in each for each in entries) for key in FACE_KEYS)
+
+
+def _of_one_camera(shots: list[Shot]) -> list[Shot]:
+    """Shots of one camera that stands in the origin, a moment each, in natural order of images."""
+    order = sorted(range(len(shots)), key=lambda place: natural_order(shots[place].label))
+    timed = []
+    for timestep, place in enumerate(order):
+        shot = shots[place]
+        camera = replace(shot.camera, world_to_camera=np.eye(4))
+        timed.append(replace(shot, camera=camera, camera_name="camera", timestep=timestep))
+    return timed

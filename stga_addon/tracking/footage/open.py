@@ -17,10 +17,12 @@ from ...capture.model import View
 from ...capture.transforms import IMAGE_SUFFIXES
 from ...errors import StgaError
 from ...files import is_file, is_folder
-from .calibrations import EXPECTED, find_calibration, read_calibration
+from .calibrations import EXPECTED, calibration_above, find_calibration, read_calibration
 from .colmap import is_distorted, model_suffix
 from .focal_tags import photo_focal, video_focal
+from .json_cameras import camera_names
 from .model import Footage, FootageCamera, Frames, ImageFrames
+from .moments import central_pose, find_moments, images_by_camera
 from .sequences import FrameRange, Sequence, open_sequence, sequence_size, synchronized
 from .shots import Shot, listed
 from .sources import (
@@ -31,9 +33,12 @@ from .sources import (
     calibration_images,
     find_sources,
     frame_number,
+    images_of,
     is_video,
+    natural_order,
     sequence_files,
     sequence_names,
+    stem_of,
     still_image,
 )
 from .video import Video, VideoFrames, first_frames
@@ -74,6 +79,9 @@ def open_footage(
         sources = Sources(root.parent, videos={root.stem: [root]}, files=[root])
     else:
         raise StgaError(f"{path}: {_no_footage(path)}")
+    if cameras is None and is_folder(path):
+        cameras = _calibration_around(sources)
+        warnings = () if cameras is None else (f"{cameras}: is the calibration of {root}",)
     if cameras is None:
         footage = _single_camera(sources, frames, focal)
     elif focal is not None:
@@ -133,10 +141,21 @@ def _workspace(root: Path, calibration: Path) -> tuple[Path, tuple[str, ...]]:
     return next((own for own in inside if is_folder(own / CONTAINERS[0])), root), CONTAINERS
 
 
+def _calibration_around(sources: Sources) -> Path | None:
+    """A calibration in a folder around that of the images, which names cameras of theirs."""
+    found = calibration_above(sources.root)
+    if found is None:
+        return None
+    return found if images_by_camera(camera_names(found), sources.images) else None
+
+
 def _calibrated(
     sources: Sources, calibration: Path, shots: list[Shot], frames: FrameRange
 ) -> Footage:
     timed = any(shot.timestep is not None for shot in shots)
+    told: tuple[str, ...] = ()
+    if not timed:
+        shots, told = _one_a_camera(shots, calibration)
     names = [] if timed else sequence_names(sources, (shot.label for shot in shots))
     if any(names):  # a folder of images or a video for each camera
         found: dict[str, Shot] = {}
@@ -159,17 +178,22 @@ def _calibrated(
         ]
         used += [path for shot in shots for path in calibration_images(sources, shot.label)]
         footage = _rig(sources, found, sequences, frames)
-        return replace(footage, warnings=(*footage.warnings, *_unused(sources, calibration, used)))
+        unused = _unused(sources, calibration, used)
+        return replace(footage, warnings=(*told, *footage.warnings, *unused))
     if frames.offsets or frames.sync != "none":
         raise StgaError(
             f"{calibration}: lists images, which offsets do not apply to; expected none"
         )
     fps = next((shot.fps for shot in shots if timed and shot.fps is not None), None)
-    shots = shots if timed else _with_stills(shots, sources)
+    if not timed:
+        shots, sentences = _with_images(shots, sources)
+        told += sentences
     unused = _unused(sources, calibration, [shot.image for shot in shots if shot.image is not None])
     timesteps = frames.chosen(sorted({shot.timestep or 0 for shot in shots}))
     chosen = [shot for shot in shots if (shot.timestep or 0) in timesteps]
-    return Footage(sources.root, _listed_cameras(chosen, calibration), fps, warnings=unused)
+    return Footage(
+        sources.root, _listed_cameras(chosen, calibration), fps, warnings=(*told, *unused)
+    )
 
 
 def _unused(sources: Sources, calibration: Path, used: Iterable[Path]) -> tuple[str, ...]:
@@ -312,6 +336,54 @@ def usual_focal(width: int, height: int) -> float:
 # Images that the calibration lists
 
 
+def _one_a_camera(shots: list[Shot], calibration: Path) -> tuple[list[Shot], tuple[str, ...]]:
+    """A shot for each camera of a rig that stands still, of which several moments were calibrated,
+    labelled with its name; and a sentence about it. Shots of one moment stay."""
+    moments = find_moments(
+        [stem_of(shot.label) for shot in shots], [shot.camera.world_to_camera for shot in shots]
+    )
+    if not moments.is_rig:
+        return shots, ()
+    groups: dict[str, list[Shot]] = {}
+    for camera, shot in zip(moments.cameras, shots, strict=True):
+        groups.setdefault(camera, []).append(shot)
+    chosen = []
+    for camera, group in groups.items():
+        middle = group[central_pose([shot.camera.world_to_camera for shot in group])]
+        chosen.append(replace(middle, label=camera, image=None, mask=None, camera_name=None))
+    count = len(set(moments.timesteps))
+    sentence = (
+        f"{calibration}: {len(shots)} images are of {len(groups)} cameras that stand still, at "
+        f"{count} moments"
+    )
+    return chosen, (sentence,)
+
+
+def _with_images(shots: list[Shot], sources: Sources) -> tuple[list[Shot], tuple[str, ...]]:
+    """Shots with their images: of one moment where each has one, else of the moments that the
+    images' names tell, and a sentence about these."""
+    if not all(_has_one_image(shot, sources) for shot in shots):
+        labels = [stem_of(shot.label).rpartition("/")[2] for shot in shots]
+        images = {} if len(set(labels)) < len(labels) else images_by_camera(labels, sources.images)
+        moments = sorted({moment for own in (images or {}).values() for moment in own})
+        order = {moment: n for n, moment in enumerate(sorted(moments, key=natural_order))}
+        found = []
+        for shot, label in zip(shots, labels, strict=True):
+            for moment, name in (images or {}).get(label, {}).items():
+                image = sources.images[name][0]
+                own = replace(shot, image=image, mask=sources.mask_of(image), camera_name=label)
+                found.append(replace(own, timestep=order[moment]))
+        if found:
+            told = f"images are of {len(shots)} cameras at {len(order)} moments, by their names"
+            return found, (f"{sources.root}: {told}",) if len(order) > 1 else ()
+    return _with_stills(shots, sources), ()
+
+
+def _has_one_image(shot: Shot, sources: Sources) -> bool:
+    is_listed = shot.image is not None and is_file(shot.image)
+    return is_listed or len(images_of(sources, shot.label)) == 1
+
+
 def _with_stills(shots: Iterable[Shot], sources: Sources) -> list[Shot]:
     """Shots with their image, after which they are named, and which shows the only timestep; no two
     of the same pose: the images of a camera that stands still are a sequence."""
@@ -337,6 +409,10 @@ def _image_size(sources: Sources, label: str) -> tuple[int, int]:
     """Size of the images of a label; for calibrations that do not hold it."""
     name = sequence_names(sources, [label])[0]
     if name is None:
+        moments = images_by_camera([label], sources.images) or {label: {}}
+        name = next(iter(moments[label].values()), None)
+        if name is not None and len(images_of(sources, label)) != 1:
+            return image_size(sources.images[name][0])
         return image_size(still_image(sources, label, f"camera {label}"))
     files = sequence_files(sources, name)
     return first_frames(files).size if isinstance(files, Path) else image_size(files[0])

@@ -123,7 +123,22 @@ def find_sources(root: Path, containers: Sequence[str] = CONTAINERS) -> Sources:
         for path in _without_copies(parts, containers):
             sources.images.setdefault(sources.name_of(path), []).append(path)
             sources.folders.setdefault(name, []).append(path)
+    _name_by_folder(sources)
     return sources
+
+
+def _name_by_folder(sources: Sources) -> None:
+    """Name videos after their folders, where several cameras have a folder each with one video, and
+    with one image at most, from which the camera was calibrated."""
+    folders = {name: name.rpartition("/")[0] for name in sources.videos}
+    if len(folders) < 2 or "" in folders.values() or len(set(folders.values())) < len(folders):
+        return
+    images = [sources.folders.get(folder, []) for folder in folders.values()]
+    if any(len(own) > 1 for own in images) or not set(folders.values()).isdisjoint(sources.videos):
+        return
+    for folder in folders.values():
+        sources.folders.pop(folder, None)
+    sources.videos = {folders[name]: files for name, files in sources.videos.items()}
 
 
 def _without_copies(parts: Mapping[str, list[Path]], containers: Sequence[str]) -> list[Path]:
@@ -144,7 +159,7 @@ def sequence_names(sources: Sources, labels: Iterable[str]) -> list[str | None]:
     is the label, with or without suffix and leading folders; or the folder of the image that the
     camera was calibrated with, where no other camera's lies there."""
     labels = list(labels)
-    parents = [_stem(label).rpartition("/")[0] for label in labels]
+    parents = [stem_of(label).rpartition("/")[0] for label in labels]
     found = []
     for label, parent in zip(labels, parents, strict=True):
         names = _tails(label)
@@ -160,13 +175,17 @@ def calibration_images(sources: Sources, label: str) -> list[Path]:
     return next((sources.images[name] for name in _tails(label) if name in sources.images), [])
 
 
+def images_of(sources: Sources, label: str) -> list[Path]:
+    """The images of that name: in that folder, else in any."""
+    tails = _tails(label)
+    found = calibration_images(sources, label)
+    return found or (sources.images_by_name.get(tails[-1], []) if tails else [])
+
+
 def still_image(sources: Sources, label: str, where: str) -> Path:
     """The image of that name, in that folder or, where only one has it, in another. Raises
     StgaError where there is none, or more than one."""
-    tails = _tails(label)
-    found = calibration_images(sources, label)
-    if not found and tails:
-        found = sources.images_by_name.get(tails[-1], [])
+    found = images_of(sources, label)
     if not found:
         raise StgaError(
             f"{where}: {sources.root} has no image, folder or video of the name {shorten(label)}"
@@ -209,7 +228,7 @@ def _without_container(path: str) -> str:
     return rest if separator and first in CONTAINERS else path
 
 
-def _stem(label: str) -> str:
+def stem_of(label: str) -> str:
     """The label without the suffix of an image or video, with forward slashes."""
     path = PurePosixPath(label.replace("\\", "/"))
     known = path.suffix.lower() in (*IMAGE_SUFFIXES, *VIDEO_SUFFIXES)
@@ -219,5 +238,5 @@ def _stem(label: str) -> str:
 def _tails(label: str) -> list[str]:
     """The label without suffix, then without its first folder, its second, …; none deeper than
     footage is searched."""
-    parts = [part for part in _stem(label).split("/") if part not in ("", ".")][-MAX_DEPTH - 1 :]
+    parts = [part for part in stem_of(label).split("/") if part not in ("", ".")][-MAX_DEPTH - 1 :]
     return ["/".join(parts[start:]) for start in range(len(parts))]
