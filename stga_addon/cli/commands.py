@@ -256,6 +256,11 @@ def _refuse_changes(options: Namespace, run: Run) -> None:
 
 @dataclass(frozen=True)
 class AvatarOptions:
+    footage: tuple[Path, ...] = option(
+        "a video, or a folder of images or videos; several, or a folder that holds several, are "
+        "takes of one person",
+        flag="FOOTAGE",
+    )
     out: Path = option("folder of capture, run and file", flag="--out", metavar="DIR")
     quick: bool = option(
         f"a first look: at most {QUICK['most']} frames at half size, half a minute of training",
@@ -265,6 +270,8 @@ class AvatarOptions:
 
 
 def _avatar(options: Namespace, head: OpenHead | None) -> None:
+    first, *takes = _takes(options)
+    options.footage = first
     tracked = {"model": None, **(QUICK if options.quick else {}), **given_options(options, Track)}
     if options.quick and not {options.seconds, options.iterations, options.preset} - {None}:
         options.seconds = QUICK_S
@@ -275,7 +282,7 @@ def _avatar(options: Namespace, head: OpenHead | None) -> None:
         _refuse_changes(options, read_run(run))
     track = Track(**{**tracked, "out": out / CAPTURE_FOLDER})
     device = {} if options.device is None else {"device": options.device}
-    carry_out(MakeAvatar(track, Train(run, track.out, settings, **device)))
+    carry_out(MakeAvatar(track, Train(run, track.out, settings, **device), tuple(takes)))
     if options.no_blend:
         return
     if find_spec("bpy") is None:
@@ -287,6 +294,16 @@ def _avatar(options: Namespace, head: OpenHead | None) -> None:
     from ..training.run.folder import with_refined_tracking
 
     print(f"blender: {write_blend(out, lambda capture: with_refined_tracking(capture, run))}")
+
+
+def _takes(options: Namespace) -> list[Path]:
+    """The takes that are given, or that lie in the only folder which is."""
+    given: list[Path] = options.footage
+    if len(given) > 1 or options.cameras is not None:
+        return given
+    from ..tracking.footage.takes import takes_in
+
+    return takes_in(given[0])
 
 
 def write_blend(
@@ -435,7 +452,7 @@ def _perform(options: Namespace, head: OpenHead | None) -> None:
         perform_in_folder(options.folder, bar.say, report, bool(options.resume))
 
 
-TRACKED_AS = [s.name for s in option_fields(Track) if s.name not in ("out", "avatar")]
+TRACKED_AS = [s.name for s in option_fields(Track) if s.name not in ("footage", "out", "avatar")]
 """What `stga avatar` takes of `stga track`."""
 COMMANDS = {
     "avatar": Command(
@@ -443,8 +460,8 @@ COMMANDS = {
         "again with the same arguments, it continues where it was interrupted.",
         _avatar,
         (
-            (Track, *TRACKED_AS),
             AvatarOptions,
+            (Track, *TRACKED_AS),
             TrainingSettings,
             (SelectionOptions, "threshold"),
             (Train, "device"),
