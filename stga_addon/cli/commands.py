@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from ..avatar.file import read_avatar
 from ..avatar.filmed import filmed_sides
+from ..capture.filmed import describe_filmed
 from ..capture.model import Capture, summarize_capture
 from ..capture.open import open_capture
 from ..errors import StgaError, printable
@@ -51,7 +52,7 @@ from ..options import (
 from ..progress import Clock, Progress, ignore
 from ..selection import SelectionOptions
 from ..tracking.folder import describe_focal_length
-from ..training.run.folder import AVATAR, Run, claimed_folder, has_run, read_run
+from ..training.run.folder import AVATAR, Run, claimed_folder, has_run, open_run, read_run
 from ..training.settings import TrainingSettings, make_settings
 from .batch import BatchOptions, EngineOptions, run_batch_command
 
@@ -383,6 +384,7 @@ def _info(options: Namespace, head: OpenHead | None) -> None:
         rows = [("splats", f"{len(avatar.splats)}, {len(avatar.faces)} triangles")]
         sides = filmed_sides(avatar)
         rows += [("sides", sides)] if sides else []
+        rows += _filmed_by_take(path, options.flame)
         rows += [(name, text.strip()) for name, _, text in (line.partition(":") for line in light)]
         print(*format_table(rows), sep="\n")
         return
@@ -390,6 +392,7 @@ def _info(options: Namespace, head: OpenHead | None) -> None:
     capture = open_capture(path, request.flame, request.principal_point)
     found: Any = carry_out(request, with_bar=False)
     rows = summarize_capture(capture)
+    rows.append(("filmed", describe_filmed(capture)))
     lens = describe_focal_length(capture.root)
     rows += [("focal length", lens)] if lens else []
     print(*format_table(rows), sep="\n")
@@ -397,6 +400,21 @@ def _info(options: Namespace, head: OpenHead | None) -> None:
         from ..training.effects.plan import describe_effects
 
         print("", *format_table(describe_effects(found.plan)), sep="\n")
+
+
+def _filmed_by_take(run: Path, flame: Path | None) -> list[tuple[str, str]]:
+    """What each take of a run filmed; nothing of an avatar file, or where a capture has gone."""
+    if not has_run(run):
+        return []
+    try:
+        takes = open_run(run, flame=flame).takes
+    except StgaError as error:
+        return [("takes", f"unknown ({error})")]
+    names = [f"take {number + 1}" if len(takes) > 1 else "filmed" for number in range(len(takes))]
+    return [
+        (name, f"{take.root.name}: {describe_filmed(take)}")
+        for name, take in zip(names, takes, strict=True)
+    ]
 
 
 @dataclass(frozen=True)
