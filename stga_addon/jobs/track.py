@@ -31,7 +31,7 @@ from ..tracking.stages import Draw, Stage, stage_spans
 from ..training.run.folder import AVATAR, has_run
 from ..worker.helpers import Helpers
 from ..worker.lock import hold_folder
-from .train import AFTER_S, Train, resumed, train_and_finish
+from .train import AFTER_S, Extend, Train, resumed, train_and_finish
 
 if TYPE_CHECKING:
     from ..tracking.footage.model import Footage
@@ -607,3 +607,48 @@ def _inputs(track: Track, takes: Sequence[Path] = ()) -> dict[str, Any]:
     del values["out"]
     values = {n: os.path.abspath(v) if isinstance(v, Path) else v for n, v in values.items()}
     return {**values, "takes": [os.path.abspath(take) for take in takes]}
+
+
+# Further takes of an avatar
+
+
+def extend(request: Extend, report: Report, say: Say) -> Written:
+    """Extend a run. Takes that are footage are tracked by its avatar first, into captures beside
+    the new run; those that are there already are used. Raises StgaError."""
+    captures = list[Path]()
+    for path in request.captures:
+        captures.append(path)
+        if is_footage(path, request.flame):
+            out = captures[-1] = request.run.with_name(f"{request.run.name}_{path.stem}")
+            say(f"take: {path.name} is tracked by the avatar of {request.parent} into {out}")
+            if not is_written(out):
+                asked = Track(footage=path, model=None, out=out, avatar=request.parent)
+                for line in track(asked, partial(_tell_half, report, 0.0), say).lines:
+                    say(line)
+    if captures == list(request.captures):
+        return train_and_finish(request, report, say)
+    tell = partial(_tell_half, report, TRACKING_SHARE)
+    return train_and_finish(replace(request, captures=tuple(captures)), tell, say)
+
+
+def _tell_half(report: Report, begin: float, progress: Progress) -> bool:
+    """Report a half of the progress."""
+    return report(replace(progress, share=begin + TRACKING_SHARE * progress.share))
+
+
+def is_footage(path: Path, flame: Path | None) -> bool:
+    """Whether a path is that of a video or of one camera's images, and not of a capture."""
+    from ..capture.open import open_capture
+    from ..tracking.footage.calibrations import find_calibration
+    from ..tracking.footage.sources import find_sources, is_video
+
+    if path.is_file():
+        return is_video(path)
+    if not path.is_dir() or find_calibration(path)[0] is not None:
+        return False
+    try:
+        open_capture(path, flame)
+    except StgaError:
+        sources = find_sources(path)
+        return bool(sources.videos or sources.folders)
+    return False

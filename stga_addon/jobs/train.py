@@ -165,7 +165,8 @@ class Extend(_Continue):
     """Extend a finished avatar by further takes of the same head, in a run of its own."""
 
     captures: tuple[Path, ...] = option(
-        "captures of the same head; required without --resume", flag="CAPTURE"
+        "captures of the same head, or footage, which the avatar tracks; required without --resume",
+        flag="CAPTURE",
     )
     _: KW_ONLY
     seconds: float | None = like(_Continue, "seconds", help="training time (default 1m)")
