@@ -3,6 +3,7 @@ what it found, and solving it again around frames that were posed by hand; an av
 video, tracked and trained at once."""
 
 import json
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
@@ -37,6 +38,10 @@ XRAY_ALPHA = 0.4
 """Opacity of the head over the footage."""
 TRACK_FIELDS = ("footage", "start", "step", "cameras", "model", "avatar", "landmarks", "stop")
 """Fields of the request, beside its focal length, that are properties of the operator as well."""
+UNSEEN = {*ONCE, "HIDDEN"}
+"""Options of properties that nobody sets by hand."""
+TAKE_LABELS = {"auto": "Found Out", "around": "Around a Still Head", "talk": "Talk"}
+"""Names of the choices of what was filmed."""
 MAX_FOLDERS = 1000
 """Numbers that are tried for the name of a new folder."""
 DIGITS = 3
@@ -185,14 +190,17 @@ def tracking_keys(head: Any) -> dict[int, np.ndarray]:
 
 
 class AvatarFromVideo(Action, bpy.types.Operator, FileImport):
-    """Make an avatar from a video of a face: track the head, train, and show the avatar on it. What
-    was begun with the same video is continued"""
+    """Make an avatar from a video of a face, or from several of one person: track the head, train,
+    and show the avatar on it. What was begun with the same videos is continued"""
 
     bl_label = "Avatar from Video"
     needs = (idle(*TRAINS),)
 
     filepath: options.path("Video", "Video of a face", options=ONCE)
-    folder: options.path(  # not `directory`, which Blender's file browser sets to that of the file
+    # Blender's file browser sets both
+    directory: options.path("Directory", "That of the videos", "DIR_PATH", options=UNSEEN)
+    files: bpy.props.CollectionProperty(type=bpy.types.OperatorFileListElement, options=UNSEEN)
+    folder: options.path(
         "Folder",
         "Folder for capture and avatar; empty: one beside the .blend file, else beside the video",
         "DIR_PATH",
@@ -206,49 +214,62 @@ class AvatarFromVideo(Action, bpy.types.Operator, FileImport):
         options=ONCE,
     )
     focal: options.field(Track, "focal", "Focal Length", options=ONCE)
+    take: options.field(Track, "take", labels=TAKE_LABELS, options=ONCE)
     python: options.python("tracks and trains", options={*ONCE, "HIDDEN"})
     filter_glob: options.file_filter(*VIDEO_SUFFIXES)
 
     def invoke(self, context: Any, event: Any) -> set[str]:
-        if not self.filepath:
+        if not (self.filepath or self.files):
             return self.execute(context) if self.folder else super().invoke(context, event)
-        video = file_path(self.filepath, "video").resolve()  # dropped
-        self.folder = str(proposed_folder(self._tracking(video, Path())).parent)
+        video, *takes = self._videos()  # dropped
+        self.folder = str(proposed_folder(self._tracking(video, Path()), takes).parent)
         return context.window_manager.invoke_props_dialog(
             self, width=480, title=self.bl_label, confirm_text="Make"
         )
 
     def draw(self, context: Any) -> None:
         self.layout.use_property_split = True
-        for name in ("quick", "folder", "minutes", "focal"):
+        for name in ("quick", "folder", "minutes", "focal", "take"):
             column = self.layout.column()
             column.active = not (self.quick and name == "minutes")
             column.prop(self, name)
 
     def run(self, context: Any) -> None:
         settings = None
-        if self.folder and not self.filepath:  # continues
+        takes = list[Path]()
+        if self.folder and not (self.filepath or self.files):  # continues
             began_with = jobs.read_inputs(file_path(self.folder, "folder"))
             self.filepath = str(began_with.get("footage", ""))
+            takes = [Path(take) for take in began_with.get("takes", ())]
+            self.take = began_with.get("take", "auto")
             self.focal = began_with.get("focal") or 0.0
             self.quick = began_with.get("size") == jobs.QUICK["size"]
             settings = self._settings_before()
-        video = file_path(self.filepath, "video").resolve()
+        video, *others = self._videos()
+        takes = others or takes
         if not video.is_file():
             raise StgaError(f"{video}: is not a file; expected a video")
         python = training_python(context, self.python)
         if self.folder:
             capture = file_path(self.folder, "folder").resolve() / CAPTURE_FOLDER
         else:
-            capture = proposed_folder(self._tracking(video, Path()))
+            capture = proposed_folder(self._tracking(video, Path()), takes)
         if settings is None:
             seconds = jobs.QUICK_S if self.quick else round(60 * self.minutes, DIGITS)
             settings = make_settings("global", seconds=seconds, effects={})
         train = Train(capture.parent / jobs.RUN_FOLDER, capture, settings)
-        request = jobs.MakeAvatar(self._tracking(video, capture), train)
+        request = jobs.MakeAvatar(self._tracking(video, capture), train, tuple(takes))
         show_panel()  # where it can be watched and cancelled, also after a drop
         if start(context.scene, request, python):
             self.inform(f"Made {request.out}")
+
+    def _videos(self) -> list[Path]:
+        """The files that are chosen or dropped, that of `filepath` first."""
+        chosen = [Path(self.directory, file.name).resolve() for file in self.files if file.name]
+        if self.filepath or not chosen:
+            first = file_path(self.filepath, "video").resolve()
+            chosen = [first, *(path for path in chosen if path != first)]
+        return chosen
 
     def _settings_before(self) -> TrainingSettings | None:
         """Those that the request in the folder began with, such as its time; None where minutes are
@@ -261,18 +282,19 @@ class AvatarFromVideo(Action, bpy.types.Operator, FileImport):
 
     def _tracking(self, video: Path, capture: Path) -> Track:
         quick = jobs.QUICK if self.quick else {}
-        return Track(video, None, capture, focal=round(self.focal, DIGITS) or None, **quick)
+        focal = round(self.focal, DIGITS) or None
+        return Track(video, None, capture, focal=focal, take=self.take, **quick)
 
 
-def proposed_folder(track: Track) -> Path:
+def proposed_folder(track: Track, takes: Sequence[Path] = ()) -> Path:
     """The folder of the capture in the first folder beside the .blend file, else beside the video,
-    that is free or in which this video's avatar was begun."""
+    that is free or in which the avatar of these takes was begun."""
     beside = Path(bpy.data.filepath).parent if bpy.data.filepath else track.footage.parent
     name = f"{track.footage.stem} avatar"
     for each in (name, *(f"{name} {number}" for number in range(2, MAX_FOLDERS))):
         capture = beside / each / CAPTURE_FOLDER
         with suppress(StgaError):
-            jobs.check_inputs(replace(track, out=capture))
+            jobs.check_inputs(replace(track, out=capture), takes)
             return capture
     problem = f"holds {MAX_FOLDERS} avatars of {track.footage.name}; choose a folder"
     raise StgaError(f"{beside}: {problem}")

@@ -108,7 +108,9 @@ class RefineOptions:
 class ExtendOptions:
     """What a run is extended by, and for how long."""
 
-    take: options.path("Take", "Folder of a further capture of the same head", "DIR_PATH")
+    take: options.path(
+        "Take", "Further capture of the same head, or video or folder of photos", "DIR_PATH"
+    )
     seconds: options.field(
         jobs.Extend, "seconds", description="Training time", default=60.0, min=0.1
     )
@@ -270,6 +272,7 @@ class Extend(ContinueOperator, ExtendOptions, DeviceOptions, bpy.types.Operator)
 
     def run(self, context: Any) -> None:
         take = file_path(self.take, "take").resolve()
-        if not take.is_dir():
-            raise StgaError(f"{take}: is not a folder; expected a further capture of the same head")
+        if not take.exists():
+            expected = "expected a further capture of the same head, or footage"
+            raise StgaError(f"{take}: does not exist; {expected}")
         self.go_on(context, jobs.Extend, (take,))

@@ -28,8 +28,8 @@ from .sidebar import SidebarPanel, draw_end, draw_running, draw_text
 from .train_panel import draw_missing_python, draw_preferences, draw_train_button
 
 FILM_MORE = (
-    "Blue was not filmed, but is plausible. To have it as it is: film the person turning the head "
-    "by 90° to both sides, and train again"
+    "Blue was not filmed, but is plausible. To have it as it is: film once around the person, who "
+    "keeps still, and make the avatar from both videos"
 )
 GO_ON = "Go on working, save, or quit Blender"
 

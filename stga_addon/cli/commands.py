@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from ..avatar.file import read_avatar
 from ..avatar.filmed import filmed_sides
+from ..capture.filmed import describe_filmed
 from ..capture.model import Capture, summarize_capture
 from ..capture.open import open_capture
 from ..errors import StgaError, printable
@@ -51,7 +52,7 @@ from ..options import (
 from ..progress import Clock, Progress, ignore
 from ..selection import SelectionOptions
 from ..tracking.folder import describe_focal_length
-from ..training.run.folder import AVATAR, Run, claimed_folder, has_run, read_run
+from ..training.run.folder import AVATAR, Run, claimed_folder, has_run, open_run, read_run
 from ..training.settings import TrainingSettings, make_settings
 from .batch import BatchOptions, EngineOptions, run_batch_command
 
@@ -256,6 +257,11 @@ def _refuse_changes(options: Namespace, run: Run) -> None:
 
 @dataclass(frozen=True)
 class AvatarOptions:
+    footage: tuple[Path, ...] = option(
+        "a video, or a folder of images or videos; several, or a folder that holds several, are "
+        "takes of one person",
+        flag="FOOTAGE",
+    )
     out: Path = option("folder of capture, run and file", flag="--out", metavar="DIR")
     quick: bool = option(
         f"a first look: at most {QUICK['most']} frames at half size, half a minute of training",
@@ -265,6 +271,8 @@ class AvatarOptions:
 
 
 def _avatar(options: Namespace, head: OpenHead | None) -> None:
+    first, *takes = _takes(options)
+    options.footage = first
     tracked = {"model": None, **(QUICK if options.quick else {}), **given_options(options, Track)}
     if options.quick and not {options.seconds, options.iterations, options.preset} - {None}:
         options.seconds = QUICK_S
@@ -275,7 +283,7 @@ def _avatar(options: Namespace, head: OpenHead | None) -> None:
         _refuse_changes(options, read_run(run))
     track = Track(**{**tracked, "out": out / CAPTURE_FOLDER})
     device = {} if options.device is None else {"device": options.device}
-    carry_out(MakeAvatar(track, Train(run, track.out, settings, **device)))
+    carry_out(MakeAvatar(track, Train(run, track.out, settings, **device), tuple(takes)))
     if options.no_blend:
         return
     if find_spec("bpy") is None:
@@ -287,6 +295,16 @@ def _avatar(options: Namespace, head: OpenHead | None) -> None:
     from ..training.run.folder import with_refined_tracking
 
     print(f"blender: {write_blend(out, lambda capture: with_refined_tracking(capture, run))}")
+
+
+def _takes(options: Namespace) -> list[Path]:
+    """The takes that are given, or that lie in the only folder which is."""
+    given: list[Path] = options.footage
+    if len(given) > 1 or options.cameras is not None:
+        return given
+    from ..tracking.footage.takes import takes_in
+
+    return takes_in(given[0])
 
 
 def write_blend(
@@ -366,6 +384,7 @@ def _info(options: Namespace, head: OpenHead | None) -> None:
         rows = [("splats", f"{len(avatar.splats)}, {len(avatar.faces)} triangles")]
         sides = filmed_sides(avatar)
         rows += [("sides", sides)] if sides else []
+        rows += _filmed_by_take(path, options.flame)
         rows += [(name, text.strip()) for name, _, text in (line.partition(":") for line in light)]
         print(*format_table(rows), sep="\n")
         return
@@ -373,6 +392,7 @@ def _info(options: Namespace, head: OpenHead | None) -> None:
     capture = open_capture(path, request.flame, request.principal_point)
     found: Any = carry_out(request, with_bar=False)
     rows = summarize_capture(capture)
+    rows.append(("filmed", describe_filmed(capture)))
     lens = describe_focal_length(capture.root)
     rows += [("focal length", lens)] if lens else []
     print(*format_table(rows), sep="\n")
@@ -380,6 +400,21 @@ def _info(options: Namespace, head: OpenHead | None) -> None:
         from ..training.effects.plan import describe_effects
 
         print("", *format_table(describe_effects(found.plan)), sep="\n")
+
+
+def _filmed_by_take(run: Path, flame: Path | None) -> list[tuple[str, str]]:
+    """What each take of a run filmed; nothing of an avatar file, or where a capture has gone."""
+    if not has_run(run):
+        return []
+    try:
+        takes = open_run(run, flame=flame).takes
+    except StgaError as error:
+        return [("takes", f"unknown ({error})")]
+    names = [f"take {number + 1}" if len(takes) > 1 else "filmed" for number in range(len(takes))]
+    return [
+        (name, f"{take.root.name}: {describe_filmed(take)}")
+        for name, take in zip(names, takes, strict=True)
+    ]
 
 
 @dataclass(frozen=True)
@@ -435,7 +470,7 @@ def _perform(options: Namespace, head: OpenHead | None) -> None:
         perform_in_folder(options.folder, bar.say, report, bool(options.resume))
 
 
-TRACKED_AS = [s.name for s in option_fields(Track) if s.name not in ("out", "avatar")]
+TRACKED_AS = [s.name for s in option_fields(Track) if s.name not in ("footage", "out", "avatar")]
 """What `stga avatar` takes of `stga track`."""
 COMMANDS = {
     "avatar": Command(
@@ -443,8 +478,8 @@ COMMANDS = {
         "again with the same arguments, it continues where it was interrupted.",
         _avatar,
         (
-            (Track, *TRACKED_AS),
             AvatarOptions,
+            (Track, *TRACKED_AS),
             TrainingSettings,
             (SelectionOptions, "threshold"),
             (Train, "device"),

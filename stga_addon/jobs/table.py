@@ -1,7 +1,7 @@
 """The one table of jobs: each request, its work, and what Blender's sidebar shows of it."""
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 from pathlib import Path
 from typing import Any, Union
@@ -25,6 +25,7 @@ from .track import (
     SolveAgain,
     Track,
     check_avatar,
+    extend,
     make_avatar,
     refuse_tracked,
     require_tracked,
@@ -123,7 +124,7 @@ _NEW_RUN = Job(
 JOBS: dict[type[Any], Job] = {
     Train: _NEW_RUN,
     Refine: _NEW_RUN,
-    Extend: _NEW_RUN,
+    Extend: replace(_NEW_RUN, work=extend),
     Resume: Job(train_and_finish, Kind.TRAINING, "run", check=require_run),
     Track: Job(track, Kind.TRACKING, "out", check=refuse_tracked, left=untracked, output="out"),
     SolveAgain: Job(solve_again, Kind.TRACKING, "capture", check=require_tracked),

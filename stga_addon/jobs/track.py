@@ -28,13 +28,14 @@ from ..tracking.folder import (
     is_written,
 )
 from ..tracking.stages import Draw, Stage, stage_spans
-from ..training.run.folder import AVATAR
+from ..training.run.folder import AVATAR, has_run
 from ..worker.helpers import Helpers
 from ..worker.lock import hold_folder
-from .train import AFTER_S, Train, resumed, train_and_finish
+from .train import AFTER_S, Extend, Train, resumed, train_and_finish
 
 if TYPE_CHECKING:
     from ..tracking.footage.model import Footage
+    from ..tracking.known_person import KnownPerson
     from ..tracking.opened import TrackingOptions
     from ..tracking.track import TrackingReport
 
@@ -65,6 +66,8 @@ RUN_FOLDER = "run"
 INPUTS = "inputs.json"
 """File in the folder of `MakeAvatar`: capture, run, and what was asked for when they began, which
 alone continues."""
+KINDS = "kinds"
+"""In it what each of several takes is, once that was found out."""
 
 
 def _parsed_mattes(text: str) -> str:
@@ -101,7 +104,8 @@ class Track:
     )
     avatar: Path | None = option(
         "run of the same person's avatar: its head is tracked, in place of --model's, and posed "
-        "such that the avatar looks like the images",
+        "such that the avatar looks like the images; or a capture of that person, whose head is "
+        "tracked",
         None,
         metavar="RUN",
     )
@@ -161,7 +165,7 @@ class Track:
 
     def check(self) -> None:
         """Raise StgaError where two options contradict each other."""
-        if self.avatar is not None and (self.model is not None or self.meshes):
+        if self.avatar is not None and has_run(self.avatar) and (self.model or self.meshes):
             name = "--meshes" if self.model is None else "--model"
             raise StgaError(f"{name}: does not go with --avatar, whose head is tracked")
         for name in ("cameras", "landmarks"):
@@ -190,10 +194,14 @@ class MakeAvatar:
 
     track, train    write to CAPTURE_FOLDER and RUN_FOLDER of one folder, `out`; the FLAME model is
                     that of `track`
+    takes           footage of further takes of the same person, tracked into captures of their own
+                    and trained together. One around a still head, where there is one, is tracked
+                    first: the others are with its head
     """
 
     track: Track
     train: Train
+    takes: tuple[Path, ...] = ()
 
     @property
     def out(self) -> Path:
@@ -208,8 +216,19 @@ class MakeAvatar:
             raise StgaError(
                 f"{self.out}: expected a capture in {CAPTURE_FOLDER}, and its run in {RUN_FOLDER}"
             )
+        for name in OF_ONE_TAKE if self.takes else ():
+            if getattr(self.track, name) != Track.__dataclass_fields__[name].default:
+                raise StgaError(f"--{name}: is of one take, but {1 + len(self.takes)} are given")
+        if self.takes and self.track.mattes not in MATTES:
+            raise StgaError("--mattes: a folder is of one take; expected auto or none")
+        named = [os.path.abspath(path) for path in (self.track.footage, *self.takes)]
+        for number, path in enumerate(named):
+            if path in named[:number]:
+                raise StgaError(f"{path}: is given twice; expected each take once")
 
 
+OF_ONE_TAKE = ("cameras", "landmarks", "focal", "start", "stop", "offset", "sync")
+"""Fields of `Track` that are of one take, and have no meaning for several."""
 QUICK: Mapping[str, Any] = {"most": 24, "size": 0.5}
 """Fields of `Track` for a first look at an avatar, as soon of a long video as of a short one."""
 QUICK_S = 30.0
@@ -243,19 +262,36 @@ def track(request: Track, report: Report, say: Say) -> Written:
     """Track the head into a capture; cancelled, the same request continues. Raises StgaError, also
     while another process writes the capture."""
     with hold_folder(request.out, LOCK_FILE, WRITER):
-        if request.avatar is None:
-            return _track_head(request, report)
-        return _track_by_avatar(request, request.avatar, report)
+        if request.avatar is not None and has_run(request.avatar):
+            return _track_by_avatar(request, request.avatar, report)
+        return _track_head(request, report)
 
 
 def _track_head(request: Track, report: Report) -> Written:
+    """The head of a stranger, or that of the capture which the request names."""
     from ..tracking.track import track as track_footage
 
     steps = _Steps(report)
-    footage, messages = _open(request, steps)
+    model = request.model
     options = _options(request)
-    found = track_footage(footage, request.model, request.out, options, steps.report, steps.show)
+    if request.avatar is not None:
+        person, model = _captured_person(request.avatar, model)
+        options = replace(options, person=person)
+    footage, messages = _open(request, steps)
+    found = track_footage(footage, model, request.out, options, steps.report, steps.show)
     return _written(request.out, found, report, messages)
+
+
+def _captured_person(path: Path, model: Path | None) -> tuple["KnownPerson", Path | None]:
+    """Whose head a capture shows, and the model's file, None of the bundled head. Raises
+    StgaError."""
+    from ..capture.open import open_capture
+    from ..tracking.known_person import captured_person
+
+    if not path.is_dir():
+        raise StgaError(f"{path}: is not a folder; expected that of a run or a capture")
+    capture = open_capture(path, model)
+    return captured_person(capture), model
 
 
 def _track_by_avatar(request: Track, run: Path, report: Report) -> Written:
@@ -415,30 +451,20 @@ def make_avatar(request: MakeAvatar, report: Report, say: Say) -> Written:
         return report(replace(progress, share=share))
 
     begin = perf_counter()
-    check_inputs(request.track)
-    if not is_written(capture):
-        _track(request.track, report_tracking, say)
+    check_inputs(request.track, request.takes)
+    captures = _track_takes(request, report_tracking, say)
     tracked = perf_counter()
-    new = replace(request.train, flame=request.track.model if is_flame(capture) else None)
+    flame = request.track.model if is_flame(capture) else None
+    new = replace(request.train, flame=flame, takes=tuple(captures[1:]))
     trained = train_and_finish(resumed(new), report_training, say)
     tracking = tracked - begin
     training = perf_counter() - tracked
-    values = read_json(capture / REPORT_FILE)
-    try:
-        errors = values["reprojection_px"]
-        timesteps = {timestep for by_timestep in errors.values() for timestep in by_timestep}
-        timesteps |= set(map(str, values["interpolated"]))
-        lines = ["", *(f"warning: {warning}" for warning in values["warnings"])]
-        lines.append(f"footage: cameras {len(errors)}, timesteps {len(timesteps)}")
-        median = f"{values['median_reprojection_px']:.2f} px (median)"
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise StgaError(
-            f"{capture / REPORT_FILE}: is not the report of a tracking ({error!s:.100})"
-        ) from error
-    files = [capture / SHEET_FILE, capture / REPORT_FILE, run / CURVE]
+    lines = [""]
+    for own in captures:
+        lines += _tracking_lines(own)
+    files = [own / name for own in captures for name in (SHEET_FILE, REPORT_FILE)]
     lines += [
-        f"tracking: reprojection error {median}",
-        f"report: {', '.join(str(path) for path in files if path.exists())}",
+        f"report: {', '.join(str(path) for path in (*files, run / CURVE) if path.exists())}",
         *trained.lines,
         f"time: tracking {format_duration(tracking)}, training {format_duration(training)}, "
         f"in all {format_duration(tracking + training)}",
@@ -446,35 +472,120 @@ def make_avatar(request: MakeAvatar, report: Report, say: Say) -> Written:
     return Written(run / AVATAR, tuple(lines))
 
 
-def _track(request: Track, report: Report, say: Say) -> None:
-    out = request.out.parent
-    new = not out.exists()
-    write_json(out / INPUTS, _inputs(request))
+def _tracking_lines(capture: Path) -> list[str]:
+    """What the report of a tracking says. Raises StgaError where it is malformed."""
+    values = read_json(capture / REPORT_FILE)
     try:
-        with hold_folder(request.out, LOCK_FILE, WRITER):
-            for line in _track_head(request, report).lines:
-                say(line)
+        errors = values["reprojection_px"]
+        timesteps = {timestep for by_timestep in errors.values() for timestep in by_timestep}
+        timesteps |= set(map(str, values["interpolated"]))
+        lines = [f"warning: {warning}" for warning in values["warnings"]]
+        lines.append(f"footage: cameras {len(errors)}, timesteps {len(timesteps)}")
+        median = f"{values['median_reprojection_px']:.2f} px (median)"
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise StgaError(
+            f"{capture / REPORT_FILE}: is not the report of a tracking ({error!s:.100})"
+        ) from error
+    return [*lines, f"tracking: reprojection error {median}"]
+
+
+def _track_takes(request: MakeAvatar, report: Report, say: Say) -> list[Path]:
+    """The captures of all takes, that of CAPTURE_FOLDER first; those that are not there are
+    tracked."""
+    out = request.out
+    is_new = not out.exists()
+    if not (out / INPUTS).exists():
+        write_json(out / INPUTS, _inputs(request.track, request.takes))
+    try:
+        tracks = _planned(request, report, say)
+        for number, own in enumerate(tracks):
+
+            def report_take(progress: Progress, before: int = number) -> bool:
+                share = (before + progress.share) / len(tracks)
+                return report(replace(progress, share=share))
+
+            if not is_written(own.out):
+                with hold_folder(own.out, LOCK_FILE, WRITER):
+                    for line in _track_head(own, report_take).lines:
+                        say(line)
     except (StgaError, OSError):
-        if not request.out.exists():  # nothing was tracked yet, so that the inputs may be mended
+        # nothing was tracked yet, so that the inputs may be mended
+        if not any(path.name != INPUTS for path in out.iterdir()):
             (out / INPUTS).unlink()
-            if new:
+            if is_new:
                 out.rmdir()
         raise
+    return sorted((own.out for own in tracks), key=lambda path: path != request.track.out)
+
+
+def _planned(request: MakeAvatar, report: Report, say: Say) -> list[Track]:
+    """The takes in the order in which they are tracked: one around a still head first, the others
+    with its head. The first talk is in CAPTURE_FOLDER: it is what the avatar plays."""
+    track = request.track
+    if not request.takes:
+        return [track]
+    footage = [track.footage, *request.takes]
+    kinds = _kinds(request, report, say)
+    shown = kinds.index("talk") if "talk" in kinds else 0
+    person = kinds.index("around") if "around" in kinds else 0
+    folders = [f"{CAPTURE_FOLDER}_{number + 1}" for number in range(1, len(footage))]
+    folders.insert(shown, CAPTURE_FOLDER)
+    outs = [request.out / name for name in folders]
+    order = [person, *(number for number in range(len(footage)) if number != person)]
+    return [
+        replace(
+            track,
+            footage=footage[number],
+            out=outs[number],
+            avatar=None if number == person else outs[person],
+            take="talk" if kinds[number] == "talk" else track.take,
+        )
+        for number in order
+    ]
+
+
+def _kinds(request: MakeAvatar, report: Report, say: Say) -> list[str]:
+    """What each take is, "around" or "talk": found out once and kept, or as given for the first, of
+    which the others are none."""
+    from ..tracking.around import take_of
+    from ..tracking.footage.open import open_footage
+    from ..tracking.stages import Crew
+
+    track = request.track
+    stored = read_inputs(request.out)
+    footage = [track.footage, *request.takes]
+    known = stored.get(KINDS)
+    if isinstance(known, list) and len(known) == len(footage) and {*known} <= {*TAKES}:
+        return known
+    opened = [open_footage(path) for path in footage]
+    if track.take != "auto":
+        kinds = [track.take, *("talk" for _ in request.takes)]
+    else:
+        kinds = []
+        steps = _Steps(report)
+        with Helpers() as helpers:
+            for own, path in zip(opened, footage, strict=True):
+                kind, why = take_of(own, Crew(helpers, steps.report, steps.show))
+                kinds.append(kind)
+                told = "around a still head" if kind == "around" else "a head that moves"
+                say(f"take: {path.name}: {told} ({why})")
+    write_json(request.out / INPUTS, {**stored, KINDS: kinds})
+    return kinds
 
 
 def check_avatar(request: MakeAvatar) -> None:
     """Raise StgaError as `check_inputs`."""
-    check_inputs(request.track)
+    check_inputs(request.track, request.takes)
 
 
-def check_inputs(track: Track) -> None:
+def check_inputs(track: Track, takes: Sequence[Path] = ()) -> None:
     """Raise StgaError where the folder began with other inputs, or holds something else."""
     out = track.out.parent
-    inputs = _inputs(track)
+    inputs = _inputs(track, takes)
     if (out / INPUTS).exists():
-        stored = read_inputs(out)
+        stored = {"take": "auto", "takes": [], **read_inputs(out)}
         for name, value in inputs.items():
-            before = stored.get(name, "auto" if name == "take" else None)
+            before = stored.get(name)
             if before != value:
                 raise StgaError(f"{name}: {out} began with {shorten(before)}; give another --out")
     elif is_written(track.out) or (out / RUN_FOLDER).exists():
@@ -489,8 +600,55 @@ def read_inputs(out: Path) -> dict[str, Any]:
     return values
 
 
-def _inputs(track: Track) -> dict[str, Any]:
-    """What decides how it is tracked, as JSON: `Track` without its folder, absolute paths."""
+def _inputs(track: Track, takes: Sequence[Path] = ()) -> dict[str, Any]:
+    """What decides how it is tracked, as JSON: `Track` without its folder, and the footage of
+    further takes; absolute paths."""
     values = {**vars(track), "offset": dict(sorted((track.offset or {}).items()))}
     del values["out"]
-    return {n: os.path.abspath(v) if isinstance(v, Path) else v for n, v in values.items()}
+    values = {n: os.path.abspath(v) if isinstance(v, Path) else v for n, v in values.items()}
+    return {**values, "takes": [os.path.abspath(take) for take in takes]}
+
+
+# Further takes of an avatar
+
+
+def extend(request: Extend, report: Report, say: Say) -> Written:
+    """Extend a run. Takes that are footage are tracked by its avatar first, into captures beside
+    the new run; those that are there already are used. Raises StgaError."""
+    captures = list[Path]()
+    for path in request.captures:
+        captures.append(path)
+        if is_footage(path, request.flame):
+            out = captures[-1] = request.run.with_name(f"{request.run.name}_{path.stem}")
+            say(f"take: {path.name} is tracked by the avatar of {request.parent} into {out}")
+            if not is_written(out):
+                asked = Track(footage=path, model=None, out=out, avatar=request.parent)
+                for line in track(asked, partial(_tell_half, report, 0.0), say).lines:
+                    say(line)
+    if captures == list(request.captures):
+        return train_and_finish(request, report, say)
+    tell = partial(_tell_half, report, TRACKING_SHARE)
+    return train_and_finish(replace(request, captures=tuple(captures)), tell, say)
+
+
+def _tell_half(report: Report, begin: float, progress: Progress) -> bool:
+    """Report a half of the progress."""
+    return report(replace(progress, share=begin + TRACKING_SHARE * progress.share))
+
+
+def is_footage(path: Path, flame: Path | None) -> bool:
+    """Whether a path is that of a video or of one camera's images, and not of a capture."""
+    from ..capture.open import open_capture
+    from ..tracking.footage.calibrations import find_calibration
+    from ..tracking.footage.sources import find_sources, is_video
+
+    if path.is_file():
+        return is_video(path)
+    if not path.is_dir() or find_calibration(path)[0] is not None:
+        return False
+    try:
+        open_capture(path, flame)
+    except StgaError:
+        sources = find_sources(path)
+        return bool(sources.videos or sources.folders)
+    return False

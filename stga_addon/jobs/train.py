@@ -1,7 +1,7 @@
 """Training: a new run, one that is resumed, and one that refines or extends a finished run."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -45,7 +45,8 @@ Selection = Mapping[int, np.ndarray]  # timestep -> (F,) bool: triangles to trai
 class Train:
     """Train an avatar from a capture, or continue a run.
 
-    selection: trained instead of what the rule selects.
+    selection: trained instead of what the rule selects. takes: further captures of the same head,
+    with which the capture takes turns.
     """
 
     run: Path = option("folder of the run", flag="--out", metavar="RUN")
@@ -65,6 +66,7 @@ class Train:
         metavar="{auto,cpu,gpu,gpu:NAME}",
     )
     selection: Selection | None = None
+    takes: tuple[Path, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -163,7 +165,8 @@ class Extend(_Continue):
     """Extend a finished avatar by further takes of the same head, in a run of its own."""
 
     captures: tuple[Path, ...] = option(
-        "captures of the same head; required without --resume", flag="CAPTURE"
+        "captures of the same head, or footage, which the avatar tracks; required without --resume",
+        flag="CAPTURE",
     )
     _: KW_ONLY
     seconds: float | None = like(_Continue, "seconds", help="training time (default 1m)")
@@ -343,7 +346,10 @@ def _new_run(request: Train, report: Report, say: Say) -> Prepared:
         raise StgaError(f"{request.capture}: is not a folder; expected that of a capture")
     begin_compiling()
     device, why = choose_device(request.device)
-    capture = open_capture(request.capture, request.flame, request.principal_point)
+    opened = open_capture(request.capture, request.flame, request.principal_point)
+    new = _further_takes(request.takes, [opened], request.flame, request.principal_point)
+    every = [opened, *new]
+    capture = capture_model.join_takes(every)
     expected_s = (request.settings.seconds or math.nan) + AFTER_S
     report(Progress(stage="Analyzing the capture", figures=lambda: {"left_s": expected_s}))
     settings, plan = plan_effects(capture, request.settings, device)
@@ -353,7 +359,39 @@ def _new_run(request: Train, report: Report, say: Say) -> Prepared:
     say(why)
     flame = None if request.flame is None else request.flame.resolve()
     run = Run(capture.root, flame, request.principal_point, settings, plan, device)
+    run = replace(run, takes=_named_takes(every, 1, run))
     return Prepared(request, run, capture, request.selection)
+
+
+def _further_takes(
+    paths: Sequence[Path], before: Sequence[Capture], flame: Path | None, principal_point: str
+) -> list[Capture]:
+    """Captures that join those before them. Raises StgaError where one is of another head or scale,
+    has no training views or is there already."""
+    new = list[Capture]()
+    for path in paths:
+        take = open_capture(path, flame, principal_point)
+        capture_model.require_same_head(before[0], take)
+        if not take.views.get("train"):
+            raise StgaError(
+                f"{take.root}: has no training views, so there is nothing to extend the avatar with"
+            )
+        capture_model.require_same_scale(before[0], take)
+        if any(take.root == old.root for old in before):
+            raise StgaError(f"{take.root}: is a take of this run already")
+        if any(take.root == other.root for other in new):
+            raise StgaError(f"{take.root}: is given twice; expected each take once")
+        new.append(take)
+    return new
+
+
+def _named_takes(every: Sequence[Capture], first: int, run: Run) -> tuple[run_folder.Take, ...]:
+    """As a run keeps them, those of all of its captures from the `first` on."""
+    starts = capture_model.first_timesteps(every)
+    return tuple(
+        run_folder.Take(take.root, start, identity_of(take, run.principal_point, run.settings))
+        for take, start in list(zip(every, starts, strict=True))[first:]
+    )
 
 
 def _refinement(request: Refine, report: Report, say: Say) -> Prepared:
@@ -420,30 +458,15 @@ def _joined_takes(request: Extend) -> tuple[Capture, Run]:
     """
     opened = run_folder.open_run(request.parent, flame=request.flame)
     run = opened.run
-    new = list[Capture]()
-    for path in request.captures:
-        take = open_capture(path, run.flame, run.principal_point)
-        capture_model.require_same_head(opened.capture, take)
-        if not take.views.get("train"):
-            raise StgaError(
-                f"{take.root}: has no training views, so there is nothing to extend the avatar with"
-            )
-        capture_model.require_same_scale(opened.takes[0], take)
-        if any(take.root == old.root for old in opened.takes):
-            raise StgaError(f"{take.root}: is a take of this run already")
-        if any(take.root == other.root for other in new):
-            raise StgaError(f"{take.root}: is given twice; expected each take once")
-        new.append(take)
+    new = _further_takes(request.captures, opened.takes, run.flame, run.principal_point)
     everything = [*opened.takes, *new]
     joined = capture_model.join_takes(everything)
     capture = run_folder.with_refined_tracking(joined, request.parent, fitted=False)
-    starts = capture_model.first_timesteps(everything)[len(opened.takes) :]
-    added = [
-        run_folder.Take(take.root, start, identity_of(take, run.principal_point, run.settings))
-        for take, start in zip(new, starts, strict=True)
-    ]
+    added = _named_takes(everything, len(opened.takes), run)
     parent = request.parent
     last = max(capture.timesteps)
-    continuation = Continuation(parent.resolve(), file_digest(parent / AVATAR), starts[0], last)
+    continuation = Continuation(
+        parent.resolve(), file_digest(parent / AVATAR), added[0].start, last
+    )
     run = replace(run, identity=None, takes=(*run.takes, *added), continuation=continuation)
     return capture, run

@@ -136,12 +136,8 @@ def with_found_cameras(
             )
         found, line = _with_cameras(footage, out, crew)
         return found, (f"take: around a still head, as given; {line}",)
-    if count < MIN_IMAGES:
-        return footage, ()
-    seen = _recognized(footage, camera, crew)
-    photos = isinstance(camera.frames, ImageFrames) and len(camera.timesteps) <= MAX_PHOTOS
-    plain_photos = photos and seen.turns and bool(np.isnan(seen.parallax))
-    if not (seen.is_around or plain_photos):
+    kind, why = take_of(footage, crew)
+    if kind == "talk":
         return footage, ()
     try:
         found, line = _with_cameras(footage, out, crew)
@@ -151,9 +147,27 @@ def with_found_cameras(
             "head that turns before a camera"
         )
         return replace(footage, warnings=(*footage.warnings, warning)), ()
-    why = f"the camera sees it from directions {seen.turn_deg:.0f}° apart"
-    why += "" if plain_photos else ", and the room moves with it"
     return found, (f"take: around a still head ({why}; else give --take talk); {line}",)
+
+
+def take_of(footage: Footage, crew: Crew) -> tuple[str, str]:
+    """What was filmed, "around" a still head or else "talk"; and why, in a clause."""
+    if footage.focal == "calibration":
+        several = len(footage.cameras) >= MIN_IMAGES
+        return "around" if several else "talk", f"{len(footage.cameras)} calibrated cameras"
+    (camera,) = footage.cameras
+    count = len(camera.timesteps)
+    if count < MIN_IMAGES:
+        return "talk", f"{count} images"
+    seen = _recognized(footage, camera, crew)
+    photos = isinstance(camera.frames, ImageFrames) and count <= MAX_PHOTOS
+    plain_photos = photos and seen.turns and bool(np.isnan(seen.parallax))
+    why = f"the camera sees it from directions {seen.turn_deg:.0f}° apart"
+    if plain_photos:
+        return "around", why
+    if seen.is_around:
+        return "around", f"{why}, and the room moves with it"
+    return "talk", why + (", but the room does not move with it" if seen.turns else "")
 
 
 def _with_cameras(footage: Footage, out: Path, crew: Crew) -> tuple[Footage, str]:

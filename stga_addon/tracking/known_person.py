@@ -1,4 +1,4 @@
-"""A person who is known from another take, and whose avatar there is."""
+"""A person who is known from another take."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -6,10 +6,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ..capture.camera import Camera
-from ..capture.model import evenly_spread
+from ..capture.mesh_geometry import Similarity
+from ..capture.model import Capture, cameras_at_once, evenly_spread
+from ..errors import StgaError
+from ..flame.sequence import with_identity
 from . import landmark_bias
 from .face_networks import FaceNetworks
 from .fit import ROUNDS, HeadFit, RecordedTake, fit_head, posed_mesh
+from .head_model import HeadModel
 from .posed_points import PosedPoints, face_size, split
 from .stages import Crew, Stage
 
@@ -22,16 +26,41 @@ BIAS_TIMESTEPS = 12
 
 @dataclass(frozen=True)
 class KnownPerson:
-    """Whom an avatar shows.
+    """Whom a tracked capture shows.
 
     fit     the head, without a take's parameters
-    draw    the avatar on a mesh (V, 3), as a camera sees it: (H, W, 3) uint8
     camera  that recorded the person; None of several
+    draw    the person's avatar on a mesh (V, 3), as a camera sees it: (H, W, 3) uint8; None where
+            there is none
     """
 
     fit: HeadFit
-    draw: Callable[[np.ndarray, Camera], np.ndarray]
     camera: Camera | None
+    draw: Callable[[np.ndarray, Camera], np.ndarray] | None = None
+
+
+def captured_person(capture: Capture, name: str = "") -> KnownPerson:
+    """Whose head a capture was tracked with. Raises StgaError, beginning with `name` or the
+    folder's, where it was tracked with neither FLAME nor the bundled head."""
+    sequence = capture.flame
+    if sequence is None:
+        where = name or capture.root
+        raise StgaError(f"{where}: its head is neither FLAME nor the bundled one; expected either")
+    head = HeadModel(with_identity(sequence).model, "flame")
+    unmoved = Similarity(1.0, np.eye(3), np.zeros(3))
+    fit = HeadFit(head, sequence.shape, {}, unmoved, sequence.static_offset)
+    cameras = list(cameras_of(capture).values())
+    return KnownPerson(fit, cameras[0] if len(cameras) == 1 else None)
+
+
+def cameras_of(capture: Capture) -> dict[int, Camera]:
+    """By their index; where never two show one timestep, as a phone's in several takes, the first
+    take's stands for all."""
+    views = sorted(capture.all_views, key=lambda view: view.timestep)
+    found = {view.camera_index: view.camera for view in views}
+    if cameras_at_once(views) > 1:
+        return found
+    return {view.camera_index: found[view.camera_index] for view in views[:1]}
 
 
 def without_own_bias(take: RecordedTake, person: KnownPerson, crew: Crew) -> RecordedTake:
@@ -41,6 +70,7 @@ def without_own_bias(take: RecordedTake, person: KnownPerson, crew: Crew) -> Rec
     From an unusual direction they are off by the same in pictures of the person, whatever the
     light.
     """
+    assert person.draw is not None
     networks = FaceNetworks()
     model = person.fit.head.model
     neutral = take.places.on(model.v_template, model.faces)

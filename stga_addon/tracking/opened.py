@@ -27,7 +27,8 @@ class TrackingOptions:
                as the calibration says, else "head"
     mattes     whether they are made for frames without a mask (`with_mattes`)
     person     known from another take, with the head file's shapes: then only scale, expressions
-               and poses are sought, without the networks' bias, and `end_tracking` is the caller's
+               and poses are sought; of an avatar without the networks' bias, and `end_tracking` is
+               the caller's
     """
 
     landmarks: Path | None = None

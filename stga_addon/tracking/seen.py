@@ -223,7 +223,7 @@ def _warnings(fitted: FittedHead) -> tuple[str, ...]:
         f"no face at {share}, interpolated: {listed}": bool(missing),
         f"no face in any frame of: {', '.join(blind)}": bool(blind),
         "one camera: size and distance of the head, and its depth, are those of the average "
-        "head": single,
+        "head": single and recorded.opened.options.person is None,
         "the images do not show the skin's surface sharply enough: the head is fitted to "
         "landmarks alone": not single and fit.static_offset is None,
         "the cameras' world is kept but for its scale: in meters, the head would be more than "

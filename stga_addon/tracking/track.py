@@ -63,7 +63,7 @@ def track(
         crew = Crew(helpers, report, show)
         head = _stranger(opened, crew) if person is None else _known(opened, person, crew)
     written = _write(head, crew)
-    if person is None:
+    if person is None or person.draw is None:
         end_tracking(out)
     return written
 
@@ -78,11 +78,11 @@ def _stranger(opened: OpenedFootage, crew: Crew) -> SeenHead:
 
 
 def _known(opened: OpenedFootage, person: KnownPerson, crew: Crew) -> SeenHead:
-    """The stages of a person of whom there is an avatar. The only camera has the focal length of
-    the person's, where its file does not tell it and the landmarks allow it."""
+    """The stages of a person who is known. The only camera has the focal length of the person's,
+    where its file does not tell it and the landmarks allow it."""
     recorded = record(opened, crew)
     recorded = in_world(with_focal(recorded, crew, person.camera))
-    if opened.options.landmarks is None:
+    if opened.options.landmarks is None and person.draw is not None:
         recorded = replace(recorded, take=without_own_bias(recorded.take, person, crew))
     fitted = fit_landmarks(recorded, crew)
     fitted = fit_expressions(fitted, person.fit, crew)

@@ -36,6 +36,20 @@ def view_order(views: Sequence[View], per_visit: int, seed: int, start: int = 0)
         skip = 0
 
 
+def take_order(
+    takes: Sequence[Sequence[View]], per_visit: int, seed: int, start: int = 0
+) -> Iterator[View]:
+    """Endless order of the views of several takes, which take turns however many views they have;
+    each in a `view_order` of its own."""
+    turns = len(takes)
+    orders = [
+        view_order(views, per_visit, seed + turn, (start + turns - 1 - turn) // turns)
+        for turn, views in enumerate(takes)
+    ]
+    for position in count(start):
+        yield next(orders[position % turns])
+
+
 def sh_degree(settings: TrainingSettings, progress: float) -> int:
     """Degree of spherical harmonics in use at a share of the budget."""
     return min(settings.sh_degree, sum(progress >= step for step in settings.sh_steps))

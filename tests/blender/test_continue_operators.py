@@ -86,7 +86,7 @@ def test_mistakes_are_sentences(head, asked, run, tmp_path):
         (ops.refine, {"group": "chin"}, "has no vertex group 'chin'"),
         (ops.refine, {"group": "faint"}, few),
         (ops.refine, {"directory": none, "group": "cheek"}, "holds no trained avatar"),
-        (ops.extend, {"take": none}, "is not a folder"),
+        (ops.extend, {"take": none}, "does not exist; expected a further capture"),
         (ops.extend, {"take": ""}, "take: no path given"),
     ):
         with failure(f"^Error: .*{sentence}"):

@@ -59,6 +59,11 @@ REQUESTS = (
         Track(Path("v.mp4"), None, Path("o/capture"), focal=900.0),
         Train(Path("o/run"), Path("o/capture"), make_settings(iterations=3), device="cpu"),
     ),
+    MakeAvatar(
+        Track(Path("v.mp4"), None, Path("o/capture"), take="around"),
+        Train(Path("o/run"), Path("o/capture"), make_settings(iterations=3)),
+        (Path("talk.mp4"), Path("photos")),
+    ),
     SolveAgain(HEAD, Path("flame.npz"), {12: np.linspace(0, 1, 5), 3: np.zeros(5)}),
     RenderRecording(Path("a/b.bin"), Path("v.mp4"), 3, 25.0, (1.0, 0.5, 0.0)),
     Render(

@@ -17,7 +17,7 @@ from stga_addon.avatar.strain import TRAINED_RANGE
 from stga_addon.capture.meshes import read_mesh
 from stga_addon.capture.model import require_same_scale
 from stga_addon.capture.open import open_capture
-from stga_addon.jobs.train import Extend, prepare
+from stga_addon.jobs.train import Extend, Train, prepare
 from stga_addon.progress import ignore
 from stga_addon.training.run import continuation
 from stga_addon.training.run.checkpoint import read_checkpoint
@@ -27,7 +27,7 @@ from stga_addon.training.run.metrics_log import read_metrics
 from stga_addon.training.run.session import train_run
 from stga_addon.training.schedule import learning_rates
 
-from .toys import assert_same_run, run_of, stop_at
+from .toys import assert_same_run, quick_settings, run_of, stop_at
 
 ITERATIONS = 15
 CAP_PX = 8
@@ -93,6 +93,24 @@ def test_the_run_remembers_its_takes(takes, parent, tmp_path):
     factory.edit(moved / "transforms_train.json", lambda document: document["frames"].pop(0))
     with refusal(r"was extended with .*new .* but it now has other images"):
         open_run(out)
+
+
+def test_a_new_run_of_several_takes(takes, tmp_path):
+    """Catches a take that a new run does not train, measures with another or forgets, and one that
+    is resumed to other bits."""
+    settings = quick_settings("global", iterations=16, lattice=1, effects=None)
+    request = Train(tmp_path / "run", takes[0], settings, device="cpu", takes=(takes[1],))
+    prepared = prepare(request, ignore, lambda line: None)
+    for name, stop in (("whole", None), ("stopped", 7)):
+        train_run(prepared.capture, tmp_path / name, prepared.run, report=stop_at(stop))
+    opened = open_run(tmp_path / "stopped")
+    assert (opened.run.continuation, opened.capture.timesteps) == (None, (0, 1, 3, 4, 5, 7))
+    train_run(opened.capture, tmp_path / "stopped", opened.run, resume=True)
+    assert_same_run(tmp_path / "stopped", tmp_path / "whole")
+    last = read_metrics(tmp_path / "whole")[-1]
+    assert last["psnr_take_1"] != last["psnr_take_2"]
+    with refusal("is a take of this run already"):
+        prepare(replace(request, takes=(takes[0],)), ignore, lambda line: None)
 
 
 def painted(root, cameras, color):

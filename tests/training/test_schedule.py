@@ -9,7 +9,7 @@ import pytest
 
 from stga_addon.capture.camera import Camera
 from stga_addon.capture.model import View
-from stga_addon.training.schedule import learning_rates, sh_degree, view_order
+from stga_addon.training.schedule import learning_rates, sh_degree, take_order, view_order
 from stga_addon.training.settings import Rates, TrainingSettings
 
 CAMERA = Camera(4, 4, 4.0, 4.0, 2.0, 2.0, np.eye(4))
@@ -32,6 +32,18 @@ def test_every_view_once_an_epoch_and_another_order_each(per_visit):
     assert names(EPOCH, per_visit, seed=1) != epochs[0]
     for start in (0, 1, 5, EPOCH - 1, EPOCH, EPOCH + 1, 2 * EPOCH + 7):
         assert names(EPOCH, per_visit, start=start) == order[start : start + EPOCH]
+
+
+def test_takes_take_turns():
+    """Catches a short take that starves beside a long one, and an order that a resumed run does not
+    find again."""
+    takes = [VIEWS[:2], VIEWS[2:], VIEWS[1:2]]
+    order = [view.name for view in islice(take_order(takes, 1, 5), 60)]
+    for turn, views in enumerate(takes):
+        own = [view.name for view in islice(view_order(views, 1, 5 + turn), 20)]
+        assert order[turn::3] == own
+    for start in (1, 2, 3, 17):
+        assert [v.name for v in islice(take_order(takes, 1, 5, start), 30)] == order[start:][:30]
 
 
 def visits(per_visit):

@@ -7,7 +7,7 @@ parameters. L-BFGS follows it in coordinates in which the Gauss-Newton matrix of
 surface is the identity, so that few renderings are enough.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Container, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from time import perf_counter
@@ -119,6 +119,12 @@ class AvatarTracking:
     shift: np.ndarray
     scale: np.ndarray
     information: np.ndarray
+
+    def at(self, timesteps: Container[int]) -> "AvatarTracking":
+        """Some of the timesteps."""
+        kept = [row for row, timestep in enumerate(self.timesteps) if timestep in timesteps]
+        arrays = {name: own[kept] for name, own in vars(self).items() if name != "timesteps"}
+        return AvatarTracking(tuple(self.timesteps[row] for row in kept), **arrays)
 
     def smoothed(self, model: FlameModel) -> "AvatarTracking":
         """Over time, where images do not say; model: the person's. Not where scale was sought."""

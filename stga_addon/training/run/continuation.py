@@ -15,7 +15,7 @@ from ...schema import validate
 from ..evaluate import metrics
 from ..evaluate.metrics import EvaluationView
 from ..optimize.state import TrainState, state_of_avatar, with_offsets
-from ..schedule import learning_rates, view_order
+from ..schedule import learning_rates, take_order, view_order
 from ..settings import TrainingSettings
 from .checkpoint import read_checkpoint
 from .folder import AVATAR, CHECKPOINT, Continuation, Run
@@ -116,20 +116,22 @@ def continued_settings(
     return continued
 
 
-def continued_evaluation_views(
+def grouped_evaluation_views(
     run: Run, capture: Capture, region: np.ndarray | None
 ) -> list[EvaluationView]:
-    """Evaluation views of a run that continues another, in groups: by take, or frames that are
-    refined and others.
+    """Evaluation views of a run of several takes or one that continues another, in groups: by take,
+    or frames that are refined and others.
 
-    region (F,) bool: its visible pixels become the views' region "region"; None for an extension.
+    region (F,) bool: its visible pixels become the views' region "region"; None but for a
+    refinement.
     """
-    assert run.continuation is not None
     groups: dict[str, list[View]] = {}
     for view in capture.views.get("val", ()):
-        group = "frames" if run.continuation.includes(view.timestep) else "other_frames"
-        if run.settings.strategy == "extend":
-            group = f"take_{1 + sum(take.start <= view.timestep for take in run.takes)}"
+        continuation = run.continuation
+        if continuation is None or run.settings.strategy == "extend":
+            group = f"take_{1 + run.take_at(view.timestep)}"
+        else:
+            group = "frames" if continuation.includes(view.timestep) else "other_frames"
         groups.setdefault(group, []).append(view)
     limit = max(MIN_GROUP_VIEWS, metrics.MAX_EVALUATION_VIEWS // max(1, len(groups)))
     chosen = []
@@ -150,8 +152,6 @@ def continued_evaluation_views(
 
 REPLAY_SHARE = 1 / 3
 """Fraction of a refinement's iterations that train views outside its frames, if any."""
-EXTEND_REPLAY_SHARE = 1 / 2
-"""Fraction of an extension's iterations that train views of the old takes."""
 REPLAY_TIMESTEPS = 12
 """Timesteps that are replayed: those that differ most from each other."""
 REPLAY_VIEWS = 120
@@ -178,11 +178,12 @@ def continued_order(
     views = capture.views["train"]
     asked = [view for view in views if continuation.includes(view.timestep)]
     rest = [view for view in views if not continuation.includes(view.timestep)]
-    others = rest
-    if region is not None:
-        parts = (asked, replayed_views(capture, rest))
-        asked, others = (views_of_region(capture, members, region) for members in parts)
-    share = (EXTEND_REPLAY_SHARE if region is None else REPLAY_SHARE) if others else 0.0
+    if region is None:
+        yield from take_order([asked, rest] if rest else [asked], 1, seed, start)
+        return
+    parts = (asked, replayed_views(capture, rest))
+    asked, others = (views_of_region(capture, members, region) for members in parts)
+    share = REPLAY_SHARE if others else 0.0
     replayed = [int(position * share) for position in (start, start + 1)]
     new = view_order(asked, 1, seed, start - replayed[0])
     old = view_order(others, 1, seed + 1, replayed[0]) if others else new

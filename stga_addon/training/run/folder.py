@@ -2,7 +2,7 @@
 the capture that it was trained on."""
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
@@ -105,6 +105,17 @@ class Run:
         """Of the identity of a run that has begun."""
         assert self.identity is not None
         return self.identity.digest
+
+    def take_at(self, timestep: int) -> int:
+        """Which take a timestep is of; 0 is `capture`."""
+        return sum(take.start <= timestep for take in self.takes)
+
+    def by_take(self, timesteps: Iterable[int]) -> list[list[int]]:
+        """Timesteps of each take that has some."""
+        found: dict[int, list[int]] = {}
+        for timestep in timesteps:
+            found.setdefault(self.take_at(timestep), []).append(timestep)
+        return [found[take] for take in sorted(found)]
 
 
 def write_run(folder: Path, run: Run) -> None:

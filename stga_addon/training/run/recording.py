@@ -15,17 +15,14 @@ from ...capture.mesh_geometry import Similarity, rasterize
 from ...capture.model import Capture, View, cameras_at_once, evenly_spread, views_by_camera
 from ...capture.open import PARAMETERS, open_capture
 from ...capture.usable_views import with_usable_views
-from ...errors import StgaError
 from ...files import read_json, read_npz, write_json, write_npz
 from ...flame.forward import joint_positions, moved_pose, shaped_vertices
 from ...flame.sequence import FlameSequence, torso_offset, torso_shapes, with_identity
 from ...light.harmonics import basis, uniform
 from ...render.render import render_avatar, to_uint8
 from ...tracking import folder as tracking_folder
-from ...tracking.fit import HeadFit
 from ...tracking.folder import REPORT_FILE, SPLIT_FILES
-from ...tracking.head_model import HeadModel
-from ...tracking.known_person import KnownPerson
+from ...tracking.known_person import KnownPerson, cameras_of, captured_person
 from ...tracking.write_capture import moving_arrays
 from ...worker.helpers import Helpers, Step
 from ..optimize.avatar_tracking import (
@@ -73,30 +70,14 @@ def avatar_person(run: Path) -> tuple[KnownPerson, Path | None]:
     """The person of a run's avatar, and the file of its FLAME model, None of the bundled head.
     Raises StgaError where its capture was not tracked with either."""
     capture = open_refined(run)
-    sequence = capture.flame
-    if sequence is None:
-        raise StgaError(f"{run}: its head is neither FLAME nor the bundled one; expected either")
-    head = HeadModel(with_identity(sequence).model, "flame")
-    fit = HeadFit(head, sequence.shape, {}, IDENTITY, sequence.static_offset)
-    cameras = list(cameras_of(capture).values())
+    person = captured_person(capture, str(run))
     stored = read_run(run)
     avatar = read_avatar(run / AVATAR)
 
     def draw(mesh: np.ndarray, camera: Camera) -> np.ndarray:
         return to_uint8(render_avatar(avatar, mesh, camera, stored.settings.background))
 
-    camera = cameras[0] if len(cameras) == 1 else None
-    return KnownPerson(fit, draw, camera), stored.flame
-
-
-def cameras_of(capture: Capture) -> dict[int, Camera]:
-    """By their index; where never two show one timestep, as a phone's in several takes, the first
-    take's stands for all."""
-    views = sorted(capture.all_views, key=lambda view: view.timestep)
-    found = {view.camera_index: view.camera for view in views}
-    if cameras_at_once(views) > 1:
-        return found
-    return {view.camera_index: found[view.camera_index] for view in views[:1]}
+    return replace(person, draw=draw), stored.flame
 
 
 def track_recording(

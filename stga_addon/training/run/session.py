@@ -46,13 +46,13 @@ from ..optimize.image_preparation import image_preparation
 from ..optimize.precompile import precompile_kernels
 from ..optimize.state import TrainState
 from ..optimize.trainer import Start, Trainer
-from ..schedule import image_scales, view_order
+from ..schedule import image_scales, take_order
 from . import checkpoint as checkpoints
 from . import folder as folders
 from .continuation import (
     START_SHARE,
-    continued_evaluation_views,
     continued_order,
+    grouped_evaluation_views,
     starting_state,
 )
 from .folder import AVATAR, CHECKPOINT, TRACKING, Run
@@ -381,8 +381,12 @@ class _Session:
         capture = self.capture
         first = self.trainer.iteration
         if self.run.continuation is None:
-            views = capture.views["train"]
-            order = view_order(views, settings.views_per_visit, settings.seed, first)
+            takes = [list[View]() for _ in range(1 + len(self.run.takes))]
+            for view in capture.views["train"]:
+                takes[self.run.take_at(view.timestep)].append(view)
+            order = take_order(
+                list(filter(None, takes)), settings.views_per_visit, settings.seed, first
+            )
         else:
             region = self.trainer.strategy.region
             order = continued_order(self.run.continuation, capture, region, settings.seed, first)
@@ -505,7 +509,11 @@ class _Session:
             found = track_by_avatar(trained, capture, chosen, seconds, stops)
         except Cancelled:
             return None
-        if too_far := tracking.take(found, changed):
+        too_far = []
+        for take in self.run.by_take(changed):  # no motion leads from one take to the next
+            part = found.at(take)
+            too_far += tracking.take(part, take) if part.timesteps else []
+        if too_far:
             _log.warning("Tracking by the avatar: %s", not_moved(too_far))
         return found
 
@@ -752,8 +760,8 @@ def _session(
         report(Progress(stage="Measuring strain"))
     strain_range = checkpoints.strain_range_of(folder, capture, run)
     trainer = Trainer(capture, settings, selection, Start(state, strain_range), run.device)
-    if run.continuation is not None:
-        views = continued_evaluation_views(run, capture, trainer.strategy.region)
+    if run.continuation is not None or run.takes:
+        views = grouped_evaluation_views(run, capture, trainer.strategy.region)
     else:
         background = settings.background
         backdrop = settings.backdrop
