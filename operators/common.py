@@ -14,6 +14,7 @@ from bpy_extras.io_utils import ExportHelper, ImportHelper
 from ..stga_addon.capture.open import open_capture
 from ..stga_addon.capture.transforms import DEFAULT_PRINCIPAL_POINT
 from ..stga_addon.errors import StgaError, telling_refusals
+from ..stga_addon.files import check_encodable
 from ..stga_addon.flame.sequence import FlameSequence
 from ..stga_addon.progress import Cancelled
 from ..stga_addon.scene import tags
@@ -391,12 +392,15 @@ def flame_model_path(context: Any, given: str = "") -> Path | None:
 
 
 def file_path(value: str, what: str) -> Path:
-    """Absolute path of a property. Raises StgaError where it is empty, or relative to no file."""
+    """Absolute path of a property. Raises StgaError where it is empty, relative to no file, or no
+    path that files and other programs can hold (`check_encodable`)."""
     if not value:
         raise StgaError(f"{what}: no path given")
     if value.startswith("//") and not bpy.data.filepath:
         raise StgaError(f"{what}: {value} is relative to the .blend file, which {UNSAVED}")
-    return Path(bpy.path.abspath(value))
+    path = Path(bpy.path.abspath(value))
+    check_encodable(path)
+    return path
 
 
 def given_values(operator: Any, kind: Any, *names: str) -> dict[str, Any]:

@@ -1,6 +1,7 @@
 """Rules of CONTRIBUTING.md, "How we write", that ruff has no rule for."""
 
 import ast
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -52,27 +53,38 @@ def described_in_groups(tree):
                 yield text.lineno
 
 
+RULES = (described_in_groups, packed_values, long_functions)
+
+
+@cache
+def broken_rules(path):
+    """What each of RULES finds in a file, by its function; a file is read once for all of them."""
+    tree = ast.parse(path.read_text())
+    return {rule: list(rule(tree)) for rule in RULES}
+
+
+def breaking(rule, folder):
+    """(file, what the rule finds) of a folder, where it finds something."""
+    files = [path for path in FILES if path.is_relative_to(ROOT / folder)]
+    assert files
+    found = ((path.relative_to(ROOT).as_posix(), broken_rules(path)[rule]) for path in files)
+    return [(path, places) for path, places in found if places]
+
+
 @pytest.mark.parametrize("folder", FOLDERS[:3])
 def test_a_docstring_describes_one_constant(folder):
     """Catches a paragraph for several constants, whose parts nobody can map to their names."""
-    for path in (path for path in FILES if path.is_relative_to(ROOT / folder)):
-        groups = list(described_in_groups(ast.parse(path.read_text())))
-        assert not groups or any(part in path.as_posix() for part in GROUPED), path.relative_to(
-            ROOT
-        )
+    found = breaking(described_in_groups, folder)
+    assert not [each for each in found if not any(part in each[0] for part in GROUPED)]
 
 
 @pytest.mark.parametrize("folder", FOLDERS)
 def test_one_assignment_a_line(folder):
     """Catches values packed into one line to save lines, which then read slower."""
-    files = [path for path in FILES if path.is_relative_to(ROOT / folder)]
-    assert files
-    for path in files:
-        assert not list(packed_values(ast.parse(path.read_text()))), path.relative_to(ROOT)
+    assert not breaking(packed_values, folder)
 
 
 @pytest.mark.parametrize("folder", FOLDERS)
 def test_functions_fit_on_a_screen(folder):
     """Catches a function that has become several."""
-    for path in (path for path in FILES if path.is_relative_to(ROOT / folder)):
-        assert not list(long_functions(ast.parse(path.read_text()))), path.relative_to(ROOT)
+    assert not breaking(long_functions, folder)

@@ -14,7 +14,7 @@ import numpy as np
 
 from ..avatar.splats import Splats
 from ..errors import StgaError
-from ..files import replacing
+from ..files import check_encodable, replacing
 from ..worker.helpers import claim_stdout
 from ..worker.launch import start_piped
 from ..worker.messages import receive, send
@@ -52,8 +52,9 @@ def write_usd(
     Meters, y up; rotations unit quaternions, standard deviations linear, opacity 0 to 1. What stays
     the same is written once; splats may come and go. A frame is in the file before the next is
     taken, so memory does not grow with their number. Raises StgaError where USD is not installed,
-    or a file cannot be written.
+    or a file cannot be written, also one whose path is not UTF-8.
     """
+    check_encodable(path)
     usd = find_usd()
     if usd is None and not python:
         raise _lacks_usd(path, f"{own_python()} lacks")

@@ -1,5 +1,6 @@
 """Export of all that shows splats in a scene, read back by Blender 5.3 and by others."""
 
+import os
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -268,6 +269,7 @@ UNWRITABLE = {
     "below a file": ("file/a.ply", "ply", "file/a.ply: cannot be written"),
     "frames below a file": ("file/frames", "ply-sequence", "file/frames: cannot be written"),
     "no folder of the system": ("/proc/a.ply", "ply", "/proc/a.ply: cannot be written"),
+    "no UTF-8": (os.fsdecode(b"caf\xe9/a.ply"), "ply", "not UTF-8; rename it"),
     "frames where files are": ("file", "ply-sequence", "file: cannot be written"),
 }
 

@@ -1,5 +1,6 @@
 """USD: read back by USD, checked by its validators and more, rendered equal."""
 
+import os
 import sys
 from dataclasses import replace
 
@@ -138,8 +139,8 @@ def test_another_interpreter_writes_the_same(avatar, tmp_path, monkeypatch, suff
 
 
 def test_without_usd_the_package_is_named(avatar, tmp_path, without_usd):
-    """Catches tracebacks, endless waits and half files without USD, here and in the other
-    Python."""
+    """Catches tracebacks, endless waits and half files without USD, here and in the other Python,
+    and for a path that USD cannot hold."""
     path = tmp_path / "out/a.usdz"
     (tmp_path / "none").mkdir()
     (tmp_path / "none/pxr.py").write_text("raise ImportError")
@@ -159,6 +160,8 @@ def test_without_usd_the_package_is_named(avatar, tmp_path, without_usd):
         python = name and interpreter(tmp_path / name, line)
         with refusal(sentence):
             write_content(path, "usd", replace(content, python=python))
+    with refusal(r"usable path .*not UTF-8; rename it"):
+        write_content(tmp_path / os.fsdecode(b"out/caf\xe9.usdz"), "usd", content)
     there = interpreter(tmp_path / "there", run)
     with pytest.raises(Cancelled):
         write_content(path, "usd", replace(content, meshes=interrupted(), python=there))
