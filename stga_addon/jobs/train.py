@@ -12,7 +12,7 @@ from ..avatar.file import Avatar, read_avatar
 from ..capture import model as capture_model
 from ..capture.meshes import SELECTED_WEIGHT, find_region, is_region_file
 from ..capture.model import Capture
-from ..capture.open import open_capture
+from ..capture.open import open_capture, repair_capture
 from ..capture.transforms import DEFAULT_PRINCIPAL_POINT, PRINCIPAL_POINTS
 from ..errors import StgaError
 from ..export.ply import write_ply
@@ -65,6 +65,9 @@ class Train:
         metavar="{auto,cpu,gpu,gpu:NAME}",
     )
     selection: Selection | None = None
+    repair: bool = option(
+        "if the mesh misses the images, read the capture in the way that fits, from now on", False
+    )
 
 
 @dataclass(frozen=True)
@@ -340,10 +343,13 @@ def _new_run(request: Train, report: Report, say: Say) -> Prepared:
     from ..training.effects.plan import plan_effects
 
     if not request.capture.is_dir():
-        raise StgaError(f"{request.capture}: is not a folder; expected that of a capture")
+        open_capture(request.capture)  # says what it is
     begin_compiling()
     device, why = choose_device(request.device)
-    capture = open_capture(request.capture, request.flame, request.principal_point)
+    source = request.capture, request.flame, request.principal_point
+    if request.repair and (told := repair_capture(*source)):
+        say(told)
+    capture = open_capture(*source)
     expected_s = (request.settings.seconds or math.nan) + AFTER_S
     report(Progress(stage="Analyzing the capture", figures=lambda: {"left_s": expected_s}))
     settings, plan = plan_effects(capture, request.settings, device)
