@@ -93,6 +93,17 @@ class Camera:
         return Camera(width, height, *intrinsics, self.world_to_camera)
 
 
+def scaled_to(camera: Camera, size: tuple[int, int]) -> Camera | None:
+    """The camera with images of another size (width, height), which has its shape but for the
+    rounding of a pixel of the smaller; None for another shape."""
+    x = size[0] / camera.width
+    y = size[1] / camera.height
+    if abs(x - y) * min(camera.width, camera.height) > max(x, y, 1.0):
+        return None
+    intrinsics = camera.fl_x * x, camera.fl_y * y, camera.cx * x, camera.cy * y
+    return Camera(*size, *intrinsics, camera.world_to_camera)
+
+
 def turn_about(axis: Sequence[float], center: np.ndarray, angle: float) -> np.ndarray:
     """(4, 4) that turns points by `angle` radians, counterclockwise seen against the `axis` (3,),
     about it through `center` (3,)."""

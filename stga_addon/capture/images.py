@@ -42,10 +42,11 @@ PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 warnings.filterwarnings("ignore", module=r"PIL\.")
 
 
-def image_size(path: Path) -> tuple[int, int]:
-    """(width, height) as displayed. Raises StgaError where it is no image, or too large a one."""
+def image_size(path: Path, is_as_stored: bool = False) -> tuple[int, int]:
+    """(width, height) as displayed, or as stored, without EXIF's orientation. Raises StgaError
+    where it is no image, or too large a one."""
     with _opened(path) as image:
-        width, height = _displayed_size(image)
+        width, height = image.size if is_as_stored else _displayed_size(image)
     if not is_image_size(width, height):
         raise StgaError(
             f"{path}: claims {width} x {height} pixels; at most {MAX_IMAGE_PIXELS} are read"
@@ -70,6 +71,12 @@ def _opened(path: Path) -> Iterator[Image.Image]:
     except Exception as error:  # Pillow's decoders raise any kind of error for a bad file
         problem = damage_of(path) or f"is not a readable image ({error})"
         raise StgaError(f"{path}: {problem}") from error
+
+
+def is_turned(path: Path) -> bool:
+    """Whether EXIF's orientation turns or mirrors the image. Raises StgaError."""
+    with _opened(path) as image:
+        return _orientation(image) != 1
 
 
 def is_plain(path: Path) -> bool:
@@ -101,7 +108,7 @@ def read_mask(view: View) -> np.ndarray | None:
         return _transparency(_undistorted(view, _decode(view.image, view, "image")))
     mask = stored_mask(view)
     mask = np.where(mask > 0, np.uint8(255), np.uint8(0)) if is_labeled(mask) else mask
-    return _undistorted(view, mask)
+    return _undistorted(view, 255 - mask if view.is_mask_inverted else mask)
 
 
 def stored_mask(view: View) -> np.ndarray:
@@ -164,7 +171,7 @@ def _decode(path: Path, view: View, kind: str) -> np.ndarray:
         # before any pixel is unpacked
         if expected in (stored, size) and is_image_size(*expected):
             convert = _conversion(image) if kind == "image" else None
-            turn = size == expected and _orientation(image) != 1
+            turn = size == expected and _orientation(image) != 1 and not view.is_as_stored
             turned = ImageOps.exif_transpose(image) if turn else image
             if kind == "mask" and turned.mode.startswith("I"):
                 numbers = np.asarray(turned)

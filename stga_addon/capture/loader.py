@@ -176,7 +176,14 @@ class ViewLoader:
         return self._closed or not self._ready or within
 
     def _begin(self, view: View, scale: float, pool: Executor) -> tuple[_Key, Future[LoadedView]]:
-        key = (view.image, view.mask, view.timestep, view.camera_index, scale)
+        key = (
+            view.image,
+            view.mask,
+            view.is_mask_inverted,
+            view.timestep,
+            view.camera_index,
+            scale,
+        )
         known = self._cache.get(key)
         if known is None:
             return key, pool.submit(self._decode, view, scale)

@@ -31,7 +31,9 @@ COMPARED = 8  # Views, and timesteps, of a take whose scale is looked at
 @dataclass(frozen=True)
 class View:
     """One image: a camera at a timestep. `name` is its `file_path` with forward slashes;
-    `undistortion` leads from the recorded image to that of `camera`, None where that is the same.
+    `undistortion` leads from the recorded image to that of `camera`, None where that is the same;
+    is_mask_inverted: its file holds 255 outside. is_as_stored: EXIF's orientation is ignored, as
+    the program did that calibrated the camera.
     """
 
     timestep: int
@@ -41,6 +43,8 @@ class View:
     image: Path
     mask: Path | None = None
     undistortion: Undistortion | None = None
+    is_mask_inverted: bool = False
+    is_as_stored: bool = False
 
 
 Views = Mapping[str, tuple[View, ...]]

@@ -19,6 +19,7 @@ from ..files import (
     matching,
     naming,
     open_npz,
+    read_bytes,
     read_json,
     read_npy,
     read_npz,
@@ -40,6 +41,16 @@ from . import meshes
 from .distortion import distortion, undistorted
 from .mesh_geometry import pixels_of, without_head_motion
 from .model import Capture, Views, evenly_spread
+from .other_input import is_gaussian_output, other_input
+from .repairs import (
+    REPAIRS,
+    REPAIRS_FILE,
+    find_repair,
+    in_meters,
+    read_repairs,
+    repaired,
+    write_repairs,
+)
 from .transforms import (
     DEFAULT_PRINCIPAL_POINT,
     IMAGE_SUFFIXES,
@@ -61,6 +72,8 @@ TYPICAL_HEAD_EXTENT_M = 0.3
 """Extent of an average head, which messages name."""
 MAX_HEAD_EXTENT_M = 3.0
 """Largest extent of a neutral mesh in meters."""
+NO_FOLDER = "is not a folder; expected that of a capture"
+"""What messages say of a path that is neither a capture nor anything else."""
 NEUTRAL = ("neutral", "canonical")
 """Names of a mesh without expression."""
 MAX_COMPARED_VIEWS = 4
@@ -106,7 +119,9 @@ def open_capture(
         model_file = BUNDLED_HEAD if bundled else _model_file(path, flame)
         return sequence_capture(path, read_motion(path, flame_model(model_file)), model_file, {})
     if not is_folder(folder):
-        raise StgaError(f"{folder}: is not a folder; expected that of a capture")
+        found = other_input(folder)
+        problem = f"is no capture: it {found.advice}" if found else NO_FOLDER
+        raise StgaError(f"{folder}: {problem}")
     root = folder.resolve()
     transforms = Transforms({}, None, None)
     if transforms_files(root):
@@ -123,16 +138,55 @@ def open_capture(
     warnings += transforms_warnings(transforms.frames, principal_point)
     warnings += _mask_warnings(transforms.frames)
     warnings += _unnamed_images(transforms.frames)
-    if found := _principal_point_warning(transforms.frames, capture.mesh, principal_point):
-        warnings.append(found)
+    point = _principal_point_warning(transforms.frames, capture.mesh, principal_point)
+    warnings += [point] if point else []
     # Limits, thresholds and the near plane are in meters: a head in millimeters cannot be trained.
+    capture, rescaled = in_meters(capture)
+    warnings += [rescaled] if rescaled else []
+    names = read_repairs(root)
+    capture = repaired(capture, names)
+    if names:
+        about = "; ".join(REPAIRS[name].about for name in names)
+        warnings.append(f"{root / REPAIRS_FILE}: the capture is read as repaired: {about}")
     size = float(np.ptp(capture.neutral, axis=0).max()) if len(capture.neutral) else 0.0
     if not MIN_HEAD_EXTENT_M <= size <= MAX_HEAD_EXTENT_M:
         warnings.append(
             f"{root}: the neutral mesh measures {size:.3g} m; expected a head of "
             f"{TYPICAL_HEAD_EXTENT_M} m"
         )
+    misses = None if names or point else find_repair(capture)[1]
+    warnings += [misses] if misses else []
     return replace(capture, fps=transforms.fps, warnings=tuple(warnings))
+
+
+def is_capture(path: Path) -> bool:
+    """Whether a path looks like a capture, or a motion, that `open_capture` reads."""
+    if not is_folder(path):
+        return False
+    files = transforms_files(path)
+    tracked = any(
+        key in read_bytes(own) for own in files for key in (b'"mesh_path"', b'"flame_param_path"')
+    )
+    is_listed = is_folder(path / PARAMETERS) or bool(matching(path / "meshes", "mesh_*.json"))
+    if tracked or is_listed or is_file(path / CANONICAL_NAME):
+        return True
+    bare = any(own.suffix.lower() in meshes.MESH_SUFFIXES for own in matching(path, "[!.]*"))
+    return bare and not files and not is_gaussian_output(path)
+
+
+def repair_capture(
+    folder: Path, flame: Path | None = None, principal_point: str = DEFAULT_PRINCIPAL_POINT
+) -> str | None:
+    """Keep in the capture's folder how it is to be read, if its mesh misses its images but fits
+    them in another way (`find_repair`); returns a sentence about that. Raises StgaError."""
+    capture = open_capture(folder, flame, principal_point)
+    if not capture.views or read_repairs(capture.root):
+        return None
+    name, _ = find_repair(capture)
+    if name is None:
+        return None
+    write_repairs(capture.root, [name])
+    return f"{capture.root / REPAIRS_FILE}: written: {REPAIRS[name].about}"
 
 
 def _require_files(frames: Sequence[Frame]) -> None:
@@ -161,14 +215,16 @@ def _open_layout(root: Path, transforms: Transforms, flame: Path | None) -> Capt
         return _mesh_capture(root, "mesh", tracked_files(frames, "mesh"), transforms)
     if matching(root / "meshes", "mesh_*.json"):
         return _open_release(root, transforms)
-    if bare:
+    if bare and not is_gaussian_output(root):
         return _open_mesh_folder(root, bare)
     if not given and (root / PARAMETERS).is_dir():
         return _open_flame_capture(root, transforms, flame)
     expected = f"transforms_{'|'.join(SPLITS)}.json, transforms.json or meshes"
     if given:
         expected = "a frame with flame_param_path or mesh_path in the transforms"
-    raise StgaError(f"{root}: is not a capture; expected {expected}")
+    found = other_input(root)
+    advice = f"; it {found.advice}" if found else ""
+    raise StgaError(f"{root}: is not a capture; expected {expected}{advice}")
 
 
 def _principal_point_warning(

@@ -37,6 +37,12 @@ MATRIX = "a 4x4 matrix of finite numbers"
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp")
 """Suffixes of images, in the order in which a path without one is looked for."""
+VIDEO_SUFFIXES = (
+    *(".mp4", ".mov", ".mkv", ".avi", ".m4v", ".webm", ".mts", ".m2ts", ".ts", ".mxf", ".mpg"),
+    *(".mpeg", ".m2v", ".vob", ".wmv", ".asf", ".flv", ".f4v", ".3gp", ".3g2", ".ogv", ".dv"),
+    ".gif",
+)
+"""Suffixes of videos that are read."""
 TIMESTEP_KEYS = ("timestep_index", "keyframe")
 """VHAP writes timestep_index, the STGA authors' release keyframe."""
 READ_PATHS = ("file_path", "fg_mask_path", "mask_path", "mesh_path", "flame_param_path")

@@ -128,17 +128,24 @@ def _small_files(views: Sequence[View]) -> set[Path]:
 def _content(view: View) -> _Content:
     files = [path for path in (view.image, view.mask) if path is not None]
     stamps = tuple((path.stat().st_mtime_ns if path.is_file() else 0) for path in files)
-    return _content_of(view.image, view.mask, view.camera.width, view.camera.height, stamps)
+    of_mask = view.mask, view.is_mask_inverted
+    return _content_of(view.image, of_mask, (view.camera.width, view.camera.height), stamps)
 
 
 @lru_cache(1 << 16)
 def _content_of(
-    image: Path, mask: Path | None, width: int, height: int, stamps: tuple[int, ...]
+    image: Path,
+    of_mask: tuple[Path | None, bool],
+    size: tuple[int, int],
+    stamps: tuple[int, ...],
 ) -> _Content:
-    """stamps: times of the files' last changes, so that others are read anew."""
-    camera = Camera(width, height, 1.0, 1.0, 0.0, 0.0, np.eye(4))
-    scale = min(1.0, COMPARED_HEIGHT_PX / height)
-    _, pixels, covered = read_view(View(0, 0, camera, image.name, image, mask), scale)
+    """of_mask: its file, and whether that is inverted. stamps: times of the files' last changes, so
+    that others are read anew."""
+    mask, is_inverted = of_mask
+    camera = Camera(*size, 1.0, 1.0, 0.0, 0.0, np.eye(4))
+    scale = min(1.0, COMPARED_HEIGHT_PX / camera.height)
+    view = View(0, 0, camera, image.name, image, mask, is_mask_inverted=is_inverted)
+    _, pixels, covered = read_view(view, scale)
     coverage = None if covered is None else float(covered.mean()) / 255
     masked = pixels[covered > 127] if covered is not None else pixels.reshape(-1, 3)
     is_plain = np.ptp(pixels.reshape(-1, 3), axis=0).max() <= MAX_ONE_COLOR_LEVELS

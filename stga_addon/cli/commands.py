@@ -16,11 +16,12 @@ from ..avatar.file import read_avatar
 from ..avatar.filmed import filmed_sides
 from ..capture.filmed import describe_filmed
 from ..capture.model import Capture, summarize_capture
-from ..capture.open import open_capture
+from ..capture.open import is_capture, open_capture
+from ..capture.other_input import other_input
 from ..errors import StgaError, printable
 from ..export.formats import FORMATS
 from ..export.splat_files import is_splats
-from ..files import write_npz
+from ..files import is_file, open_npz, write_npz
 from ..format import describe_figures, describe_left, format_table
 from ..jobs.analyze import Analyze, Select, TimePresets, holds_avatar
 from ..jobs.avatar_source import OpenHead, avatar_path
@@ -372,9 +373,17 @@ def _write_selection(request: Select, path: Path | None) -> None:
         write_npz(path, faces, compressed=True)
 
 
+def _is_motion(path: Path) -> bool:
+    """Whether an .npz is no avatar. Raises StgaError for a damaged one."""
+    if path.suffix != ".npz" or not is_file(path):
+        return False
+    with open_npz(path) as file:
+        return "header" not in file.entries
+
+
 def _info(options: Namespace, head: OpenHead | None) -> None:
     path = options.capture
-    if holds_avatar(path):
+    if holds_avatar(path) and not _is_motion(path):
         from ..jobs.finished_run import describe_light
 
         avatar = read_avatar(avatar_path(path))
@@ -388,9 +397,15 @@ def _info(options: Namespace, head: OpenHead | None) -> None:
         rows += [(name, text.strip()) for name, _, text in (line.partition(":") for line in light)]
         print(*format_table(rows), sep="\n")
         return
+    other = None if is_capture(path) else other_input(path)
+    if other is not None:
+        rows = [("path", str(path)), ("what", other.what), ("next", f"it {other.plan}")]
+        rows += [("command" if n == 0 else "or", own) for n, own in enumerate(other.commands[:2])]
+        print(*format_table(rows), sep="\n")
+        return
     request = Analyze(**given_options(options, Analyze))
-    capture = open_capture(path, request.flame, request.principal_point)
     found: Any = carry_out(request, with_bar=False)
+    capture = open_capture(path, request.flame, request.principal_point)
     rows = summarize_capture(capture)
     rows.append(("filmed", describe_filmed(capture)))
     lens = describe_focal_length(capture.root)

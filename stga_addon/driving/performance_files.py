@@ -12,6 +12,13 @@ import numpy as np
 from ..errors import StgaError, shorten
 from ..files import read_json, read_table, read_text
 from .clocks import DEFAULT_FPS, MAX_FPS, MIN_FPS, evened, find_times, numbers
+from .frame_forms import (
+    face_cap_frames,
+    is_face_cap,
+    plain_frames,
+    read_lines,
+    rows_of_shapes,
+)
 from .head_rotations import find_head, in_radians
 from .performance import COLUMN, COUNT, MAX_WEIGHT, FacePacket, Performance, arkit_name, columns_of
 
@@ -60,10 +67,10 @@ MAX_OTHERS = 256
 MAX_DEPTH = 4
 """Levels of dictionaries in a JSON frame that are looked at."""
 MAX_PERCENT = 110.0  # Of weights, of which some are a little above the whole
-FRAME_KEYS = ("frames", "weightMat", "weights")
+FRAME_KEYS = ("frames", "weightMat", "weights", "blendShapeWeights", "data")
 RATE_KEYS = ("exportFps", "fps", "FPS", "frameRate", "frame_rate", "framerate", "FrameRate")
-NAME_KEYS = ("facsNames", "names", "blendShapeNames", "blendshapes")
-WEIGHT_KEYS = ("weights", "blendshapes", "blendShapes", "face_blendshapes")
+NAME_KEYS = ("facsNames", "names", "blendShapeNames", "blendshapes", "blendShapes")
+WEIGHT_KEYS = ("weights", "blendshapes", "blendShapes", "face_blendshapes", "values")
 NAMED = ("categoryName", "category_name", "name")
 SCORED = ("score", "value", "weight")
 
@@ -74,6 +81,9 @@ def csv_performance(path: Path) -> Performance:
     if not rows:
         raise StgaError(f"{path}: is empty, expected a row of column names")
     header = [cell.strip() for cell in rows[0]]
+    frames = rows_of_shapes(header, rows[1:])
+    if frames is not None:
+        return frames_performance(path, frames)
     columns, guesses = columns_of(str(path), header)
     plain = {_plain(name): index for index, name in reversed([*enumerate(header)])}
     count = plain.get(COUNT_COLUMN)  # 0 in rows without a face, or they end after it
@@ -119,7 +129,26 @@ def packet_performance(path: Path) -> Performance:
 
 def json_performance(path: Path) -> Performance:
     """Of frames of weights. Raises StgaError."""
-    document = read_json(path)
+    return frames_performance(path, read_json(path))
+
+
+def lines_performance(path: Path) -> Performance:
+    """Of a frame of JSON a line. Raises StgaError."""
+    return frames_performance(path, read_lines(path, read_text(path, MAX_TEXT_BYTES)))
+
+
+def text_performance(path: Path) -> Performance:
+    """Of text: iFacialMocap's packets, Face Cap's recording, or a frame of JSON a line. Raises
+    StgaError."""
+    text = read_text(path, MAX_TEXT_BYTES)
+    if is_face_cap(text):
+        return frames_performance(path, face_cap_frames(path, text))
+    return lines_performance(path) if text.startswith("{") else packet_performance(path)
+
+
+def frames_performance(path: Path, document: Any) -> Performance:
+    """Of a JSON document with frames of weights. Raises StgaError."""
+    document = plain_frames(document)
     outer = document if isinstance(document, dict) else {}
     frames = next((outer[key] for key in FRAME_KEYS if isinstance(outer.get(key), list)), document)
     if not isinstance(frames, list) or not frames:

@@ -9,7 +9,12 @@ from ..files import is_file, is_folder, matching
 from ..progress import Report, ignore
 from ..tracking.footage.sources import VIDEO_SUFFIXES
 from .performance import Performance
-from .performance_files import csv_performance, json_performance, packet_performance
+from .performance_files import (
+    csv_performance,
+    json_performance,
+    lines_performance,
+    text_performance,
+)
 
 TAKE_EXTRAS = ("_neutral", "_raw", "_cal")
 """Endings of files that Live Link Face writes beside a take's own."""
@@ -44,7 +49,9 @@ PERFORMERS: Mapping[str, Performer] = {
     ".csv": _at_once("a table", csv_performance),
     ".tsv": _at_once("a table", csv_performance),
     ".json": _at_once("named weights", json_performance),
-    ".txt": _at_once("lines of iFacialMocap", packet_performance),
+    ".jsonl": _at_once("lines of named weights", lines_performance),
+    ".ndjson": _at_once("lines of named weights", lines_performance),
+    ".txt": _at_once("lines of iFacialMocap or Face Cap", text_performance),
     **dict.fromkeys(VIDEO_SUFFIXES, Performer("a video", _watched, False)),
 }
 """By the suffixes of their files."""

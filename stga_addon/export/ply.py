@@ -26,6 +26,8 @@ from ..progress import Say, warn
 
 MAX_SPLAT_BYTES = 16 << 30
 READ_FILES = "the folder of a run, an avatar (.npz), or splats (.ply, .spz, .splat)"
+CLOUDCOMPARE_PREFIX = "scalar_"
+"""What CloudCompare writes before the names of other properties."""
 COLOR_NAMES = (("red", "green", "blue"), ("r", "g", "b"))
 
 FRAME_NAME = re.compile(r"(\d{5,}|-\d{4,})\.ply")
@@ -79,7 +81,7 @@ def read_ply(path: Path, say: Say = warn) -> Splats:
     Values may be not finite. Raises StgaError naming the file and the property that is missing, and
     for splats that are packed, or bound to triangles.
     """
-    vertices = read_vertices(path)
+    vertices = _without_prefix(read_vertices(path))
     names = vertices.dtype.names or ()
     binding = next((name for name in names if name.startswith("binding")), None)
     if binding is not None:
@@ -88,6 +90,16 @@ def read_ply(path: Path, say: Say = warn) -> Splats:
             "triangles, not in the world; render the run, or export it as --format ply"
         )
     return splats_of(path, vertices, say)
+
+
+def _without_prefix(vertices: np.ndarray) -> np.ndarray:
+    """The vertices without CloudCompare's prefix of all properties but positions and colors."""
+    names = vertices.dtype.names or ()
+    plain = [name.removeprefix(CLOUDCOMPARE_PREFIX) for name in names]
+    if len(set(plain)) == len(plain):
+        vertices = vertices.view()
+        vertices.dtype.names = tuple(plain)
+    return vertices
 
 
 def splats_of(path: Path, vertices: np.ndarray, say: Say) -> Splats:

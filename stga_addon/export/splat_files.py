@@ -13,6 +13,8 @@ from ..progress import Say, warn
 from .ply import MAX_SPLAT_BYTES, READ_FILES, read_ply
 from .spz import read_spz
 
+GAUSSIAN_OUTPUT = "point_cloud/iteration_*/*.ply"
+"""Where 3D Gaussian Splatting writes the splats of an iteration."""
 CONVERTED = "are not read; save them as .ply, for example with SuperSplat"
 
 UNREAD_SUFFIXES = {
@@ -42,8 +44,20 @@ SPLAT_ROW = np.dtype(
 
 
 def is_splats(path: Path) -> bool:
-    """Whether a path is named as a file of splats that are bound to no head."""
-    return path.suffix.lower() in (*READERS, *UNREAD_SUFFIXES)
+    """Whether a path is named as a file of splats that are bound to no head, or is the output of 3D
+    Gaussian Splatting."""
+    return path.suffix.lower() in (*READERS, *UNREAD_SUFFIXES) or latest_iteration(path) is not None
+
+
+def latest_iteration(folder: Path) -> Path | None:
+    """The splats of the last iteration in a folder of 3D Gaussian Splatting's output, or of tools
+    that write as it does; None for others."""
+    found = {}
+    for path in folder.glob(GAUSSIAN_OUTPUT):
+        number = path.parent.name.rpartition("_")[2]
+        if number.isascii() and number.isdigit():
+            found[int(number)] = path
+    return found[max(found)] if found else None
 
 
 def read_splats(path: Path, say: Say = warn) -> Splats:
@@ -52,6 +66,10 @@ def read_splats(path: Path, say: Say = warn) -> Splats:
     Rows that hold a value that is not finite are left out. `say` gets a sentence about what was
     left out or repaired. Raises StgaError naming the file, also for other kinds of files.
     """
+    latest = latest_iteration(path)
+    if latest is not None:
+        say(f"{path}: {latest.relative_to(path).as_posix()} is used")
+        path = latest
     suffix = path.suffix.lower()
     if suffix not in READERS:
         kind = UNREAD_SUFFIXES.get(suffix, f"files named {suffix}")

@@ -4,6 +4,7 @@ import gzip
 import math
 import struct
 import zlib
+from collections.abc import Sequence
 from dataclasses import fields
 from pathlib import Path
 
@@ -20,14 +21,22 @@ MAGIC = b"NGSP"
 
 VERSION = 3
 """The last packed by gzip: version 4 needs Zstandard, which Blender's Python lacks."""
-READ_VERSIONS = 1, 2, 3
+READ_VERSIONS = 1, 2, 3, 4
+STREAM_VERSION = 4
+"""First version of streams that Zstandard packs, behind a table of their sizes."""
 HEADER_BYTES = 16
+STREAM_HEADER = struct.Struct("<4sIIBBBBI12x")
+"""Header of version 4: as before, with the number of streams, and where their table begins."""
+STREAMS = 6
+"""Streams of version 4: positions, opacities, colors, scales, rotations, harmonics."""
 GZIP_MAGIC = b"\x1f\x8b"
 # The format's own limits
 MAX_SPZ_BYTES = 2 << 30
 MAX_SPZ_SPLATS = 10_000_000
 MAX_SPZ_DEGREE = 4
 ANTIALIASED = 1
+HAS_EXTENSIONS = 2
+"""Flag of files with more behind the splats, such as a safe orbit for a viewer's camera."""
 
 MAX_FRACTION_BITS = 16
 """Resolution of positions: 2⁻¹⁶ m = 15 µm, within ±128 m; coarser where splats are farther away."""
@@ -85,7 +94,7 @@ def write_spz(path: Path, world: Splats, antialiased: bool = False) -> None:
 
 
 def read_spz(path: Path, say: Say = warn) -> Splats:
-    """World-space splats of an .spz of version 1 to 3, in the axes of the file; of harmonics above
+    """World-space splats of an .spz of version 1 to 4, in the axes of the file; of harmonics above
     degree 3 and of antialiasing, `say` gets a sentence. Raises StgaError naming the file."""
     data = read_bytes(path, MAX_SPZ_BYTES)
     try:
@@ -106,16 +115,23 @@ def _unpacked(path: Path, data: bytes, say: Say) -> Splats:
     magic, version, count, degree, bits, flags, _ = struct.unpack("<4sIIBBBB", header)
     if magic != MAGIC:
         raise ValueError("it does not begin as one")
-    if version not in READ_VERSIONS or data[:2] != GZIP_MAGIC:
-        raise ValueError(f"version {version}; read are 1 to 3; save it as .ply")
+    is_packed = data[:2] == GZIP_MAGIC
+    if version not in READ_VERSIONS or is_packed != (version < STREAM_VERSION):
+        raise ValueError(f"version {version}; read are 1 to 4; save it as .ply")
     others = (degree + 1) ** 2 - 1
-    parts = (6 if version == 1 else 9, 1, 3, 3, 4 if version == 3 else 3, 3 * others)
+    parts = (6 if version == 1 else 9, 1, 3, 3, 4 if version >= 3 else 3, 3 * others)
     needed = count * sum(parts)
     if count > MAX_SPZ_SPLATS or degree > MAX_SPZ_DEGREE:
         raise ValueError(f"{count} splats of degree {degree}")
     if needed > allowed_bytes(len(data)):
         raise ValueError(f"{count} splats in {len(data)} bytes")
-    body = stream.decompress(stream.unconsumed_tail, needed + 1)
+    if version >= STREAM_VERSION:
+        body = _streams(path, data, [count * size for size in parts])
+    else:
+        body = stream.decompress(stream.unconsumed_tail, needed + 1)
+    if flags & HAS_EXTENSIONS:
+        say(f"{path}: has extensions, which are not read")
+        body = body[:needed]
     if len(body) != needed:
         raise ValueError(f"{len(body)} bytes of {count} splats, expected {needed}")
     edges = np.cumsum([0, *(count * size for size in parts)])
@@ -130,11 +146,45 @@ def _unpacked(path: Path, data: bytes, say: Say) -> Splats:
     harmonics = (rest.reshape(count, others, 3).astype(np.float32) - 128) / 128
     base = (color.astype(np.float32) / 255 - 0.5) / COLOR_SCALE
     sh = np.concatenate([base[:, None], harmonics[:, : (MAX_SH_DEGREE + 1) ** 2 - 1]], axis=1)
-    rotation = _smallest_three(turn) if version == 3 else _three(turn)
+    rotation = _smallest_three(turn) if version >= 3 else _three(turn)
     xyz = places.view("<f2") if version == 1 else _fixed(places) / 2.0**bits
     return in_world(
         xyz, rotation, scale.astype(np.float32) / 16 - 10, logits(alpha[:, 0] / 255), sh
     )
+
+
+def _streams(path: Path, data: bytes, sizes: Sequence[int]) -> bytes:
+    """The streams of version 4, one after the other. Raises StgaError without a decoder, ValueError
+    or struct.error for others than those sizes."""
+    *_, count, begin = STREAM_HEADER.unpack_from(data)
+    if count < sum(size > 0 for size in sizes) or count > STREAMS:
+        raise ValueError(f"{count} streams, expected {STREAMS}")
+    table = np.array(struct.unpack_from(f"<{2 * count}Q", data, begin), object).reshape(-1, 2)
+    at = begin + 16 * count
+    parts = []
+    for (packed, size), expected in zip(table, sizes, strict=False):
+        if size != expected or at + packed > len(data):
+            raise ValueError(f"a stream of {size} bytes, expected {expected}")
+        parts.append(_unzstd(path, data[at : at + packed], expected))
+        at += packed
+    return b"".join(parts)
+
+
+def _unzstd(path: Path, data: bytes, size: int) -> bytes:
+    """What Zstandard packed into `data`, of `size` bytes. Raises StgaError, ValueError."""
+    if not size:
+        return b""
+    try:
+        import zstandard
+    except ImportError:
+        raise StgaError(
+            f"{path}: is SPZ of version 4, which needs the package zstandard; install it, or save "
+            "the splats as .ply or as version 3"
+        ) from None
+    try:
+        return zstandard.ZstdDecompressor().stream_reader(data).read(size + 1)
+    except zstandard.ZstdError as error:
+        raise ValueError(str(error)) from error
 
 
 def _fixed(places: np.ndarray) -> np.ndarray:

@@ -49,6 +49,10 @@ FIELD_ALIASES = {
     "expression_params": "expr",
     "jaw_params": "jaw_pose",
     "shape_params": "shape",
+    "expressions": "expr",
+    "expcode": "expr",
+    "posecode": "pose",
+    "shapecode": "shape",
 }
 """Field as other programs name it -> as it is read."""
 JOINT_COUNTS = {"rotation": 1, "neck_pose": 1, "jaw_pose": 1, "eyes_pose": 2}
@@ -60,6 +64,10 @@ MATRIX_TOLERANCE = 1e-3  # Of exports with a few decimals
 UNREAD_PARTS = ("eyelids", "eyelid_params")  # Of models that FLAME was extended by
 # Columns of a `pose` that holds several joints -> the fields they are, three columns a joint.
 POSE_LAYOUTS = {6: ("rotation", "jaw_pose"), 15: ("rotation", "neck_pose", "jaw_pose", "eyes_pose")}
+BODY_POSE_SIZE = 165
+"""Numbers of SMPL-X's pose, as BEAT2 has it in `poses`."""
+BODY_POSE_PARTS = {"neck_pose": (45, 48), "jaw_pose": (66, 69), "eyes_pose": (69, 75)}
+"""Field -> its columns there; the neck is moved as SMPL-X's head."""
 MIN_JOINT_ANGLE_DEG = 0.5  # of a joint that moves
 TORSO_SHIFT = "torso_shift"
 SHIFT_SIZE = 3
@@ -201,6 +209,12 @@ def motion_of(path: Path, arrays: Arrays, model: FlameModel) -> FlameSequence:
     spelled = {FIELD_ALIASES[name]: own for name, own in arrays.items() if name in FIELD_ALIASES}
     warnings = _guesses(path, arrays)
     arrays = spelled | dict(arrays)
+    body = arrays.get("poses")
+    if body is not None and body.ndim == 2 and body.shape[1] == BODY_POSE_SIZE:
+        parts = {name: body[:, start:end] for name, (start, end) in BODY_POSE_PARTS.items()}
+        arrays = parts | arrays
+        told = "poses are those of a body (SMPL-X): its head, jaw and eyes move this head"
+        warnings = (*warnings, f"{path}: {told}")
     pose = arrays.pop("pose", None)
     if pose is not None:
         if pose.ndim < 2 or not len(pose) or pose[0].size not in POSE_LAYOUTS:

@@ -6,7 +6,7 @@ from functools import partial
 from pathlib import Path
 from time import monotonic
 
-from ..capture.open import open_capture
+from ..capture.open import open_capture, repair_capture
 from ..format import format_duration
 from ..options import When, like
 from ..progress import Progress, Report, Say
@@ -51,6 +51,7 @@ class Analyze(_OfCapture):
     effects: Mapping[str, str] | None = like(TrainingSettings, "effects", needs=(CAPTURED,))
     device: str = like(Train, "device", needs=(CAPTURED,))
     timed: bool = False
+    repair: bool = like(Train, "repair", needs=(CAPTURED,))
 
 
 @dataclass(frozen=True)
@@ -88,7 +89,10 @@ def analyze(request: Analyze, report: Report, say: Say) -> Analyzed:
 
     begin = monotonic()
     report(Progress(stage="Analyzing the capture"))
-    capture = open_capture(request.capture, request.flame, request.principal_point)
+    source = request.capture, request.flame, request.principal_point
+    if request.repair and (told := repair_capture(*source)):
+        say(told)
+    capture = open_capture(*source)
     if not capture.views.get("train"):
         return Analyzed((), {})
     device, _ = choose_device(request.device)

@@ -12,13 +12,13 @@ from ..avatar.file import Avatar, read_avatar
 from ..capture.camera import TURNTABLE_S, central_camera, covered_angles, to_and_fro, turntable
 from ..capture.distortion import distortion
 from ..capture.model import View
-from ..capture.transforms import DEFAULT_PRINCIPAL_POINT, read_transforms
+from ..capture.transforms import read_transforms
 from ..driving.open_motion import MotionOptions
 from ..driving.performers import is_performance
 from ..errors import StgaError
 from ..export.playback import DEFAULT_FPS, playback_fps
 from ..export.splat_files import is_splats, read_splats
-from ..files import replacing
+from ..files import is_file, replacing
 from ..flame.sequence import sequence_mesh
 from ..light.environment import read_lighting, turned
 from ..light.relight import Relighter
@@ -28,6 +28,8 @@ from ..raster.posed_splats import PosedSplats
 from ..render.device import Composer
 from ..render.video import sequence_writer, video_writer
 from ..schema import setting
+from ..tracking.footage.json_cameras import is_gaussian_cameras, read_gaussian_cameras
+from ..tracking.footage.nerfstudio import written_convention
 from ..training.run.folder import WORLD_FILE
 from . import avatar_source
 from .train import Train
@@ -128,7 +130,8 @@ class Render:
         "principal_point",
         default=None,
         needs=("cameras",),
-        help="what cy means in the file of --cameras (default: as in training; of a PLY vhap)",
+        help="what cy means in the file of --cameras (default: as in training; with splats, as "
+        "the program of the file writes it)",
     )
     device: str = like(Train, "device")
     motion_options: MotionOptions = avatar_source.motion_options_field("motion")
@@ -172,13 +175,7 @@ def render(request: Render, report: Report, say: Say) -> Written:
         _turntable_images(request, request.fps or DEFAULT_FPS)  # before anything is read
     views: Sequence[View] = ()
     if request.cameras is not None:
-        principal_point = request.principal_point or DEFAULT_PRINCIPAL_POINT  # splats have none
-        if request.principal_point is None and not is_splats(request.source):
-            principal_point = read_avatar(avatar_source.avatar_path(request.source)).principal_point
-        frames = read_transforms(request.cameras, principal_point)
-        views = [frame.view for frame in frames]
-        if distorted := distortion(frames):
-            say(f"{distorted}; pictures are drawn as of a pinhole")
+        views = _camera_views(request, request.cameras, say)
     composer = Composer(request.device)
     composer.choose()
     subject = _subject(request, composer, say)
@@ -195,6 +192,23 @@ def render(request: Render, report: Report, say: Say) -> Written:
     timesteps = set(_timesteps(request, tuple({view.timestep for view in views})))
     _pictures(request, subject, [view for view in views if view.timestep in timesteps], report)
     return Written(request.output)
+
+
+def _camera_views(request: Render, path: Path, say: Say) -> list[View]:
+    """The views of a file of cameras: transforms, or 3D Gaussian Splatting's. Raises StgaError."""
+    if is_file(path) and is_gaussian_cameras(path):
+        shots = read_gaussian_cameras(path)
+        return [View(0, n, own.camera, own.label, Path(own.label)) for n, own in enumerate(shots)]
+    principal_point = request.principal_point
+    if principal_point is None:
+        if is_splats(request.source):
+            principal_point = written_convention(read_transforms(path))
+        else:
+            principal_point = read_avatar(avatar_source.avatar_path(request.source)).principal_point
+    frames = read_transforms(path, principal_point)
+    if distorted := distortion(frames):
+        say(f"{distorted}; pictures are drawn as of a pinhole")
+    return [frame.view for frame in frames]
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ from ..avatar.file import Avatar, read_avatar
 from ..capture import model as capture_model
 from ..capture.meshes import SELECTED_WEIGHT, find_region, is_region_file
 from ..capture.model import Capture
-from ..capture.open import open_capture
+from ..capture.open import open_capture, repair_capture
 from ..capture.transforms import DEFAULT_PRINCIPAL_POINT, PRINCIPAL_POINTS
 from ..errors import StgaError
 from ..export.ply import write_ply
@@ -67,6 +67,9 @@ class Train:
     )
     selection: Selection | None = None
     takes: tuple[Path, ...] = ()
+    repair: bool = option(
+        "if the mesh misses the images, read the capture in the way that fits, from now on", False
+    )
 
 
 @dataclass(frozen=True)
@@ -343,10 +346,13 @@ def _new_run(request: Train, report: Report, say: Say) -> Prepared:
     from ..training.effects.plan import plan_effects
 
     if not request.capture.is_dir():
-        raise StgaError(f"{request.capture}: is not a folder; expected that of a capture")
+        open_capture(request.capture)  # says what it is
     begin_compiling()
     device, why = choose_device(request.device)
-    opened = open_capture(request.capture, request.flame, request.principal_point)
+    source = request.capture, request.flame, request.principal_point
+    if request.repair and (repaired := repair_capture(*source)):
+        say(repaired)
+    opened = open_capture(*source)
     new = _further_takes(request.takes, [opened], request.flame, request.principal_point)
     every = [opened, *new]
     capture = capture_model.join_takes(every)

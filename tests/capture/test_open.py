@@ -350,7 +350,9 @@ def test_principal_point_is_checked_against_the_masks(tmp_path, shared_data):
     assert "with 'center'" in warning
 
 
-@pytest.mark.parametrize(("factor", "says"), [(1000.0, "200 m"), (1e-3, "0.0002 m"), (1.0, None)])
+@pytest.mark.parametrize(
+    ("factor", "says"), [(1000.0, "200: meshes are read as milli"), (1e-3, "0.0002 m"), (1.0, None)]
+)
 def test_a_head_that_is_not_in_meters(tmp_path, factor, says):
     """Catches a capture in millimeters that trains to nonsense, or renders nothing, silently."""
     root = factory.write_mesh_capture(tmp_path / "capture")
@@ -522,7 +524,7 @@ def test_what_is_no_capture(tmp_path):
         open_capture(root)
     with refusal("'left' is not one of vhap, opencv, center"):
         open_capture(root, model_file, "left")
-    with refusal("is not a folder"):
+    with refusal("is no capture: it is a file of a capture, .* named by its folder"):
         open_capture(root / "transforms_train.json")
     with refusal(r"model\.npz: has none of expr"):
         open_capture(model_file, model_file)

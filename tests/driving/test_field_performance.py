@@ -281,3 +281,66 @@ def test_what_is_no_motion(tmp_path, capsys, out):
             open_motion(tmp_path / name, None, head)
     with refusal("stga drive makes a motion of a video"):
         open_motion(tmp_path / "face.mp4", None, head)
+
+
+def named(row):
+    return dict(zip(ARKIT_SHAPES, row.tolist(), strict=True))
+
+
+def long_rows():
+    return [
+        {"timestamp": number / 30, "blendShapeLocation": name, "value": value}
+        for number, row in enumerate(WEIGHTS)
+        for name, value in named(row).items()
+    ]
+
+
+def face_cap():
+    lines = ["info,Face Cap", "bs," + ",".join(ARKIT_SHAPES)]
+    for number, row in enumerate(WEIGHTS):
+        before = [round(1000 * number / 30), 0, 0, 0, 5, 10, 0, 0, 0, 0, 0]
+        lines.append(",".join(map(str, ["k", *before, *row.tolist()])))
+    return "\n".join(lines) + "\n"
+
+
+def long_table():
+    rows = [",".join(map(str, row.values())) for row in long_rows()]
+    return "\n".join(["timestamp,blendShape,value", *rows]) + "\n"
+
+
+def live_link(row):
+    facial = {"Names": [name.capitalize() for name in ARKIT_SHAPES], "Weights": row.tolist()}
+    return {"Audio2Face": {"Body": {}, "Facial": facial}}
+
+
+OTHER_FORMS = {
+    "a2f.json": lambda: json.dumps({str(n): live_link(row) for n, row in enumerate(WEIGHTS)}),
+    "keyed.json": lambda: json.dumps({f"{n / 30:.4f}": named(w) for n, w in enumerate(WEIGHTS)}),
+    "long.json": lambda: json.dumps(long_rows()),
+    "long.csv": long_table,
+    "lines.jsonl": lambda: "\n".join(
+        json.dumps({"timestamp": n / 30, "blendshapes": named(w)}) for n, w in enumerate(WEIGHTS)
+    ),
+    "ace.json": lambda: json.dumps(
+        {
+            "blendShapes": list(ARKIT_SHAPES),
+            "blendShapeWeights": [
+                {"timeCode": n / 30, "values": w.tolist()} for n, w in enumerate(WEIGHTS)
+            ],
+        }
+    ),
+    "facecap.txt": face_cap,
+}
+
+
+@pytest.mark.parametrize("name", OTHER_FORMS)
+def test_other_forms_of_frames(tmp_path, name):
+    """Catches frames keyed by number or time, a row a shape, lines of JSON, ACE's and Face Cap's
+    files refused, or read at another rate or with shapes exchanged."""
+    path = tmp_path / name
+    path.write_text(OTHER_FORMS[name]())
+    found = read_performance(path)
+    assert found.fps == pytest.approx(60 if name == "a2f.json" else 30)
+    assert_allclose(found.weights, WEIGHTS, atol=1e-9)
+    if name == "facecap.txt":  # pitch 5, yaw 10 degrees
+        assert_allclose(found.head[0], np.radians([10, 5, 0]), atol=1e-9)

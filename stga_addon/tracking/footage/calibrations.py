@@ -1,6 +1,7 @@
 """Which calibration a footage folder has, and its cameras; a reader for each program."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -59,11 +60,13 @@ class Program(NamedTuple):
     find      those in a folder, files or folders that stand for several, the best first
     read      shots of one of them, and sentences about what it lists and is left out
     suffixes  of the files that it reads wherever they are
+    is_as_stored  whether the program ignores EXIF's orientation
     """
 
     find: Callable[[Path], list[Path]]
     read: Callable[[Path, ImageSize], Calibrated]
     suffixes: tuple[str, ...] = ()
+    is_as_stored: bool = False
 
 
 def _transforms(root: Path) -> list[Path]:
@@ -131,7 +134,7 @@ def calibration_above(root: Path) -> Path | None:
 
 PROGRAMS = (
     Program(_transforms, _read_transforms, (".json",)),
-    Program(colmap_models, lambda path, _: read_colmap(path), (".bin", ".txt")),
+    Program(colmap_models, lambda path, _: read_colmap(path), (".bin", ".txt"), True),
     Program(
         _exports(
             ".json", lambda path: is_transforms(path) and path not in transforms_files(path.parent)
@@ -144,13 +147,15 @@ PROGRAMS = (
         _exports(".xml", lambda path: is_metashape(_head(path))),
         lambda path, _: read_metashape(path),
         (".xml",),
+        True,
     ),
     Program(
         _exports(".csv", lambda path: is_table_of_cameras(_head(path))),
         read_realitycapture_csv,
         (".csv",),
+        True,
     ),
-    Program(_xmp_folder, _read_xmp, (".xmp",)),
+    Program(_xmp_folder, _read_xmp, (".xmp",), True),
 )
 """In the order in which the calibration of a folder is looked for."""
 
@@ -203,6 +208,8 @@ def read_calibration(path: Path, image_size: ImageSize) -> Calibrated:
     shots, told = chosen[0].read(path, image_size)
     if not shots:
         raise StgaError(f"{path}: has no camera with a pose")
+    if chosen[0].is_as_stored:
+        shots = [replace(shot, is_as_stored=True) for shot in shots]
     return shots, tuple(f"{path}: {sentence}" for sentence in told)
 
 

@@ -2,6 +2,7 @@
 
 from collections import Counter
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from xml.etree.ElementTree import Element
 
@@ -93,19 +94,21 @@ def _shot(path: Path, camera: Element, label: str, sensors: dict[str | None, Ele
     where = f"{path}: camera {shorten(label)}"
     if number not in sensors:
         raise StgaError(f"{where}: sensor_id {shorten(number)} is no sensor of the file")
-    size, focal, center, lens = _sensor(sensors[number], f"{path}: sensor {shorten(number)}")
+    size, focals, center, lens = _sensor(sensors[number], f"{path}: sensor {shorten(number)}")
     transform = numbers(camera.findtext("transform", "").split(), f"{where}: transform", 16)
     pose = np.array(transform).reshape(4, 4)  # camera to world, OpenCV axes
-    posed = pinhole(size, (focal, focal), center, pose[:3, :3].T, pose[:3, 3], where)
+    posed = pinhole(size, focals, center, pose[:3, :3].T, pose[:3, 3], where)
     return Shot(label, posed, lens, where)
 
 
-def _sensor(sensor: Element, where: str) -> tuple[Pair, float, Pair, Lens]:
-    """Image size, focal length, principal point and lens, adjusted by the alignment or not."""
+def _sensor(sensor: Element, where: str) -> tuple[Pair, Pair, Pair, Lens]:
+    """Image size, focal lengths, principal point and lens, adjusted by the alignment or not.
+    PhotoScan before 1.3 writes fx, fy, and the principal point from the corner."""
     found: Sequence[Element] = sensor.findall("calibration")
     adjusted = (c for c in found if c.get("class") == "adjusted")
     calibration = next(adjusted, found[-1] if found else None)
-    if calibration is None or calibration.find("f") is None:
+    is_old = calibration is not None and calibration.find("fx") is not None
+    if calibration is None or (calibration.find("f") is None and not is_old):
         raise StgaError(
             f"{where}: has no calibration with f; align the cameras and export them again"
         )
@@ -127,7 +130,7 @@ def _sensor(sensor: Element, where: str) -> tuple[Pair, float, Pair, Lens]:
             f"{where}: p3 and p4 are not supported; optimize the cameras without them and "
             "export again"
         )
-    focal = value("f")
+    focal = value("fx" if is_old else "f")
     if not 1 <= focal <= MAX_FOCAL_PIXELS:
         raise StgaError(f"{where}: f: expected a focal length of 1 to 1e7 pixels, not {focal:g}")
     lens = Lens(
@@ -136,4 +139,9 @@ def _sensor(sensor: Element, where: str) -> tuple[Pair, float, Pair, Lens]:
         tangential=(value("p2"), value("p1")),  # Metashape's p1 belongs to x, OpenCV's to y
         affine=(value("b1") / focal, value("b2") / focal),
     )
-    return (width, height), focal, (width / 2 + value("cx"), height / 2 + value("cy")), lens
+    if is_old:
+        skew = value("skew") / focal
+        lens = replace(lens, affine=(0.0, skew))
+        return (width, height), (focal, value("fy")), (value("cx"), value("cy")), lens
+    center = width / 2 + value("cx"), height / 2 + value("cy")
+    return (width, height), (focal, focal), center, lens

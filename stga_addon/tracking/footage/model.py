@@ -30,7 +30,8 @@ class ImageFrames:
 
     def sizes(self) -> Iterator[tuple[Path, tuple[int, int]]]:
         """Width and height of each file, from its header."""
-        return ((path, image_size(path)) for path in self.files)
+        views = self.views.values()
+        return ((view.image, image_size(view.image, view.is_as_stored)) for view in views)
 
     def image(self, timestep: int) -> np.ndarray:
         return read_image(self.views[timestep])

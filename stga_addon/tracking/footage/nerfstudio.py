@@ -39,13 +39,12 @@ def read_nerfstudio(path: Path) -> Calibrated:
     is_timed = any(
         frame.record.has(key) for frame in frames for key in ("timestep_index", "keyframe")
     )
-    has_lens = any(frame.record.has(key) for frame in frames for key in ("camera_model", "k1"))
-    is_vhap = not has_lens and any(frame.record.has("timestep_index") for frame in frames)
+    convention = written_convention(frames)
     for frame in frames:
         view = frame.view
         record = frame.record
         name = frame.camera_id
-        camera = with_principal_point(view.camera, frame.principal, "vhap" if is_vhap else "opencv")
+        camera = with_principal_point(view.camera, frame.principal, convention)
         if name is None and record.has("camera_index"):
             name = f"{view.camera_index:02d}"
         timestep = view.timestep if is_timed else None
@@ -60,6 +59,13 @@ def read_nerfstudio(path: Path) -> Calibrated:
     if not is_timed and is_head_fixed(frames):
         return _of_one_camera(shots), (*repairs(frames), HEAD_FIXED)
     return shots, repairs(frames)
+
+
+def written_convention(frames: Sequence[Frame]) -> str:
+    """What `cy` means in a transforms file (`read_transforms`), by the program that wrote it."""
+    has_lens = any(frame.record.has(key) for frame in frames for key in ("camera_model", "k1"))
+    is_vhap = not has_lens and any(frame.record.has("timestep_index") for frame in frames)
+    return "vhap" if is_vhap else "opencv"
 
 
 def is_head_fixed(frames: Sequence[Frame]) -> bool:

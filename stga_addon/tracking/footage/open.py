@@ -10,8 +10,8 @@ from pathlib import Path
 
 import numpy as np
 
-from ...capture.camera import camera_from_gl
-from ...capture.images import image_size
+from ...capture.camera import camera_from_gl, scaled_to
+from ...capture.images import image_size, is_turned
 from ...capture.lens import Lens, Undistortion, undistortion
 from ...capture.model import View
 from ...capture.transforms import IMAGE_SUFFIXES
@@ -191,9 +191,8 @@ def _calibrated(
     unused = _unused(sources, calibration, [shot.image for shot in shots if shot.image is not None])
     timesteps = frames.chosen(sorted({shot.timestep or 0 for shot in shots}))
     chosen = [shot for shot in shots if (shot.timestep or 0) in timesteps]
-    return Footage(
-        sources.root, _listed_cameras(chosen, calibration), fps, warnings=(*told, *unused)
-    )
+    cameras, sentences = _with_sentences(str(sources.root), _listed_cameras(chosen, calibration))
+    return Footage(sources.root, cameras, fps, warnings=(*told, *sentences, *unused))
 
 
 def _unused(sources: Sources, calibration: Path, used: Iterable[Path]) -> tuple[str, ...]:
@@ -268,8 +267,10 @@ def _rig(
     videos = [own for own in sequences.values() if isinstance(own, Video)]
     warnings = [warning for video in videos for warning in video.sentences]
     recorded, fps, sentences = synchronized(sequences, shots, sources, frames)
-    cameras = tuple(_camera(name, shots[name], recorded[name]) for name in shots)
-    return Footage(sources.root, cameras, fps, warnings=(*warnings, *sentences))
+    cameras, told = _with_sentences(
+        str(sources.root), (_camera(name, shots[name], recorded[name]) for name in shots)
+    )
+    return Footage(sources.root, cameras, fps, warnings=(*warnings, *sentences, *told))
 
 
 def _as_calibrated(sequence: Sequence, shot: Shot) -> Sequence:
@@ -281,16 +282,58 @@ def _as_calibrated(sequence: Sequence, shot: Shot) -> Sequence:
     return sequence
 
 
-def _camera(name: str, shot: Shot, frames: Frames) -> FootageCamera:
+def _camera(name: str, shot: Shot, frames: Frames) -> tuple[FootageCamera, tuple[str, ...]]:
+    """The camera, and sentences about what its frames are other than its calibration says. Raises
+    StgaError for frames of another shape."""
+    told: tuple[str, ...] = ()
+    if isinstance(frames, ImageFrames) and shot.is_as_stored:
+        frames, told = _as_stored(shot, frames)
     width = shot.camera.width
     height = shot.camera.height
-    for path, size in frames.sizes():
-        if size != (width, height):
+    sizes = dict(frames.sizes())
+    first = next(iter(sizes.values()))
+    scaled = scaled_to(shot.camera, first)
+    if first != (width, height) and scaled is not None and set(sizes.values()) == {first}:
+        shot = replace(shot, camera=scaled)
+        if isinstance(frames, ImageFrames):
+            views = {t: replace(view, camera=scaled) for t, view in frames.views.items()}
+            frames = ImageFrames(views)
+        size = f"{first[0]} x {first[1]} pixels, the calibration of {width} x {height}"
+        told += (f"images are of {size}, which is scaled by {first[0] / width:.4g}",)
+    for path, size in sizes.items():
+        if size != (shot.camera.width, shot.camera.height):
             raise StgaError(
                 f"{path}: has {size[0]} x {size[1]} pixels, but {shot.where} has {width} x {height}"
             )
     found = undistortion(shot.camera, shot.lens, shot.where)
-    return FootageCamera(name, shot.camera if found is None else found.camera, frames, found)
+    return FootageCamera(name, shot.camera if found is None else found.camera, frames, found), told
+
+
+def _as_stored(shot: Shot, frames: ImageFrames) -> tuple[ImageFrames, tuple[str, ...]]:
+    """Frames without EXIF's orientation, where the calibration has the shape of the stored
+    pixels."""
+    size = shot.camera.width, shot.camera.height
+    views = dict(frames.views)
+    turned = False
+    for timestep, view in views.items():
+        if is_turned(view.image) and _has_shape(size, image_size(view.image, True)):
+            views[timestep] = replace(view, is_as_stored=True)
+            turned = True
+    sentence = "images are read as stored, without EXIF's orientation, as they were calibrated"
+    return ImageFrames(views), (sentence,) if turned else ()
+
+
+def _has_shape(size: tuple[int, int], other: tuple[int, int]) -> bool:
+    return (size[0] >= size[1]) == (other[0] >= other[1])
+
+
+def _with_sentences(
+    where: str, cameras: Iterable[tuple[FootageCamera, tuple[str, ...]]]
+) -> tuple[tuple[FootageCamera, ...], tuple[str, ...]]:
+    """Cameras, and each sentence about them once."""
+    listed = list(cameras)
+    told = dict.fromkeys(sentence for _, own in listed for sentence in own)
+    return tuple(camera for camera, _ in listed), tuple(f"{where}: {each}" for each in told)
 
 
 def _single_camera(sources: Sources, frames: FrameRange, focal: float | None) -> Footage:
@@ -406,19 +449,21 @@ def _with_stills(shots: Iterable[Shot], sources: Sources) -> list[Shot]:
 
 
 def _image_size(sources: Sources, label: str) -> tuple[int, int]:
-    """Size of the images of a label; for calibrations that do not hold it."""
+    """Size of the images of a label as stored; for calibrations that do not hold it."""
     name = sequence_names(sources, [label])[0]
     if name is None:
         moments = images_by_camera([label], sources.images) or {label: {}}
         name = next(iter(moments[label].values()), None)
         if name is not None and len(images_of(sources, label)) != 1:
-            return image_size(sources.images[name][0])
-        return image_size(still_image(sources, label, f"camera {label}"))
+            return image_size(sources.images[name][0], True)
+        return image_size(still_image(sources, label, f"camera {label}"), True)
     files = sequence_files(sources, name)
-    return first_frames(files).size if isinstance(files, Path) else image_size(files[0])
+    return first_frames(files).size if isinstance(files, Path) else image_size(files[0], True)
 
 
-def _listed_cameras(shots: list[Shot], calibration: Path) -> tuple[FootageCamera, ...]:
+def _listed_cameras(
+    shots: list[Shot], calibration: Path
+) -> list[tuple[FootageCamera, tuple[str, ...]]]:
     """One camera for all shots with the same name (where they have one), pose and lens."""
     if not shots:
         raise StgaError(f"{calibration}: none of its frames are in the chosen range")
@@ -429,10 +474,10 @@ def _listed_cameras(shots: list[Shot], calibration: Path) -> tuple[FootageCamera
         identity = shot.camera_name, intrinsics, _pose(shot), shot.lens
         groups.setdefault(identity, []).append(shot)
     names = [group[0].camera_name or group[0].label for group in groups.values()]
-    cameras: list[FootageCamera] = []
+    cameras: list[tuple[FootageCamera, tuple[str, ...]]] = []
     for name, group in zip(names, groups.values(), strict=True):
         unique = name if names.count(name) == 1 else f"{name} at timestep {group[0].timestep}"
-        if unique in (camera.name for camera in cameras):
+        if unique in (camera.name for camera, _ in cameras):
             raise StgaError(
                 f"{group[0].where}: two cameras are named {unique}; expected different names"
             )
@@ -450,7 +495,7 @@ def _listed_cameras(shots: list[Shot], calibration: Path) -> tuple[FootageCamera
                     raise StgaError(f"{path}: does not exist, but {shot.where} names it")
             views[timestep] = View(timestep, 0, shot.camera, shot.label, shot.image, shot.mask)
         cameras.append(_camera(unique, group[0], ImageFrames(views)))
-    return tuple(cameras)
+    return cameras
 
 
 def _pose(shot: Shot) -> bytes:

@@ -37,6 +37,7 @@ class Shot:
     fps       frames per second that the file states, whose numbers the timesteps are
     keeps_world  whether the file says that its world is that of a scene, which the capture is to
                  keep
+    is_as_stored  whether it was calibrated with the pixels as stored, without EXIF's orientation
     """
 
     label: str
@@ -49,6 +50,7 @@ class Shot:
     camera_name: str | None = None
     fps: float | None = None
     keeps_world: bool = False
+    is_as_stored: bool = False
 
 
 Calibrated = tuple[list[Shot], tuple[str, ...]]

@@ -8,15 +8,9 @@ from functools import cached_property
 from itertools import chain
 from pathlib import Path, PurePosixPath
 
-from ...capture.transforms import IMAGE_SUFFIXES
+from ...capture.transforms import IMAGE_SUFFIXES, VIDEO_SUFFIXES
 from ...errors import StgaError, shorten
 
-VIDEO_SUFFIXES = (
-    *(".mp4", ".mov", ".mkv", ".avi", ".m4v", ".webm", ".mts", ".m2ts", ".ts", ".mxf", ".mpg"),
-    *(".mpeg", ".m2v", ".vob", ".wmv", ".asf", ".flv", ".f4v", ".3gp", ".3g2", ".ogv", ".dv"),
-    ".gif",
-)
-"""Suffixes of videos that are read."""
 UNREAD_SUFFIXES = (
     *(".heic", ".heif", ".avif", ".jxl", ".jp2", ".tga", ".exr", ".hdr", ".psd", ".dng", ".cr2"),
     *(".cr3", ".nef", ".arw", ".raf", ".rw2", ".orf", ".braw", ".r3d", ".ari", ".crm"),
