@@ -431,7 +431,7 @@ class _Look:
 def _lip_gap(face: np.ndarray) -> float:
     """`_Sample.lip_gap` of landmarks (N, 2)."""
     upper, lower = face[list(INNER_LIPS)]
-    height = np.linalg.norm(face[list(EYE_CORNERS)].mean(0) - (upper + lower) / 2)
+    height = float(np.linalg.norm(face[list(EYE_CORNERS)].mean(0) - (upper + lower) / 2))
     return float(np.linalg.norm(upper - lower) / max(height, 1e-9))
 
 
