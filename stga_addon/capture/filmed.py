@@ -20,16 +20,16 @@ STILL_MM = 1.0
 
 
 def describe_filmed(capture: Capture) -> str:
-    """Such as "32 directions, from 112° on its right to 110° on its left; one expression"."""
+    """Such as "32 views, from 112° on its right to 110° on its left, 3° below to 9° above; one
+    expression"."""
     timesteps = evenly_spread(capture.timesteps, MAX_TIMESTEPS)
     directions = filmed_directions(capture, timesteps)
     parts = []
     if len(directions):
-        right, left = directions[:, 0].min(), directions[:, 0].max()
-        low, high = directions[:, 1].min(), directions[:, 1].max()
-        count = "one direction" if len(directions) == 1 else f"{len(directions)} views"
+        right, low = directions.min(0).tolist()
+        left, high = directions.max(0).tolist()
         around = f"from {_side(right)} to {_side(left)}, {_height(low)} to {_height(high)}"
-        parts.append(f"{count}, {around}")
+        parts.append(f"{len(directions)} views, {around}")
     return "; ".join([*parts, _expressions(capture, timesteps)])
 
 

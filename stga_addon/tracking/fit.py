@@ -1,7 +1,7 @@
 """From landmarks of all cameras and timesteps to a head in meters: scale, identity, expression and
 pose."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -153,6 +153,20 @@ class RecordedTake:
     images: Images = no_pictures
     masks: Images = no_pictures
     metric: bool = False
+
+
+def without_cameras(take: RecordedTake, names: Collection[str]) -> RecordedTake:
+    """The take without the landmarks of some cameras, which do not see all that is seen."""
+    landmarks = {}
+    for timestep, own in take.landmarks.items():
+        kept = [row for row, name in enumerate(own.names) if name not in names]
+        landmarks[timestep] = TimestepLandmarks(
+            tuple(own.cameras[row] for row in kept),
+            own.points[kept],
+            own.confidence[kept],
+            tuple(own.names[row] for row in kept),
+        )
+    return replace(take, landmarks=landmarks)
 
 
 @dataclass(frozen=True)

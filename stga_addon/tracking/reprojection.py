@@ -41,6 +41,19 @@ def median_px(errors: Errors) -> float:
     return float(np.median([pixels for own in errors.values() for pixels, _ in own.values()]))
 
 
+def misread_cameras(errors: Errors) -> list[str]:
+    """Cameras whose landmarks do not fit what others see, the worst first; fewer than half."""
+    share = {
+        name: float(np.median([part for _, part in own.values()]))
+        for name, own in errors.items()
+        if own
+    }
+    if not share:
+        return []
+    least = max(MIN_OUTLIER_SHARE, OUTLIER_FACTOR * float(np.median(list(share.values()))))
+    return sorted((name for name, own in share.items() if own > least), key=lambda n: -share[n])
+
+
 def check_cameras(errors: Errors) -> None:
     """Raise StgaError for a camera that does not fit what others see, or where none fits."""
     seen = {name: [part for _, part in own.values()] for name, own in errors.items() if own}

@@ -13,7 +13,7 @@ from ..flame.forward import parameters_at
 from . import fit as head_fit
 from .dense import DenseFit, fit_dense
 from .dense_head import REGIONS
-from .fit import HeadFit, Pictures, RecordedTake, posed_mesh
+from .fit import HeadFit, Pictures, RecordedTake, posed_mesh, without_cameras
 from .focal_length import FocalEstimate, scale_warnings
 from .footage.model import Footage, FootageCamera
 from .gaze import with_gaze
@@ -22,7 +22,13 @@ from .mattes import with_mattes
 from .opened import file_state
 from .pictures import picture_of_fit
 from .recorded import RecordedFootage
-from .reprojection import Errors, check_cameras, median_px, reprojection_errors
+from .reprojection import (
+    Errors,
+    check_cameras,
+    median_px,
+    misread_cameras,
+    reprojection_errors,
+)
 from .stages import Crew, Stage
 from .surface import fit_surface
 from .torso import FollowedTorso, follow_torso
@@ -91,6 +97,14 @@ def fit_landmarks(recorded: RecordedFootage, crew: Crew) -> FittedHead:
     )
     fitted = FittedHead(recorded, fit, {})
     errors = fitted.errors
+    misread = misread_cameras(errors) if recorded.footage.finds_cameras else []
+    if misread:  # the images agree with each other, so that the landmarks are wrong
+        told = f"landmarks are misread, and not used, in images of: {', '.join(misread)}"
+        footage = recorded.footage
+        footage = replace(footage, warnings=(*footage.warnings, told))
+        opened = replace(recorded.opened, footage=footage)
+        recorded = replace(recorded, opened=opened, take=without_cameras(take, misread))
+        return fit_landmarks(recorded, crew)
     check_cameras(errors)
     fitted.show(crew, errors)
     return fitted

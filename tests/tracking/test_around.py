@@ -11,7 +11,8 @@ from scipy.spatial.transform import Rotation
 
 from stga_addon.capture.lens import Lens
 from stga_addon.capture.mesh_geometry import similarity
-from stga_addon.tracking.around import with_found_cameras
+from stga_addon.tracking import around
+from stga_addon.tracking.around import Recognition, take_of, with_found_cameras
 from stga_addon.tracking.footage.open import open_footage
 from stga_addon.tracking.sharp_frames import sharpest
 from stga_addon.tracking.stages import Crew
@@ -99,6 +100,27 @@ def test_a_head_that_turns_before_a_camera_is_none(tmp_path):
     folder = write_pictures(tmp_path / "talk", [picture(still, turn) for turn in turns])
     footage, line = found(folder, tmp_path / "out")
     assert (footage.timesteps, footage.focal, line) == (tuple(range(8)), "usual", "")
+
+
+@pytest.mark.parametrize(
+    ("seen", "expected"),
+    [
+        ((85, np.nan, 0.0, 0.022), ("around", "85° apart")),
+        ((85, np.nan, 0.0, 0.21), ("talk", "the mouth moves")),
+        ((85, 0.5, 0.9, 0.21), ("around", "the room moves with it")),
+        ((85, 0.0, 0.9, 0.0), ("talk", "the room does not move with it")),
+        ((20, np.nan, 0.0, 0.0), ("talk", "20° apart")),
+    ],
+)
+def test_photos_before_a_plain_wall(tmp_path, monkeypatch, seen, expected):
+    """Catches photos of somebody who talks and turns before a plain wall, which count as one moment
+    of a still head, and photos of a still head that do not."""
+    folder = write_pictures(tmp_path / "photos", [np.zeros((8, 8, 3), np.uint8)] * COUNT)
+    monkeypatch.setattr(around, "_recognized", lambda *_: Recognition(*seen))
+    with Helpers(1) as helpers:
+        kind, why = take_of(open_footage(folder), Crew(helpers))
+    assert kind == expected[0]
+    assert expected[1] in why
 
 
 @pytest.mark.slow

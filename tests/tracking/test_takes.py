@@ -1,6 +1,7 @@
 """Several takes of one person: which they are, and whose head they are tracked with."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +14,10 @@ from stga_addon.jobs import track as jobs
 from stga_addon.jobs.track import MakeAvatar, Track
 from stga_addon.jobs.train import Train
 from stga_addon.progress import ignore
+from stga_addon.tracking.footage.open import open_footage
 from stga_addon.tracking.footage.takes import takes_in
+from stga_addon.tracking.opened import TrackingOptions
+from stga_addon.tracking.track import track as track_footage
 from stga_addon.training.settings import make_settings
 
 from .recording import record
@@ -55,6 +59,26 @@ def test_a_calibrated_rig_is_one_take(tmp_path, head):
     """Catches a rig whose cameras are taken for takes of their own."""
     record(tmp_path, head)
     assert takes_in(tmp_path / "footage") == [tmp_path / "footage"]
+
+
+def test_a_misread_face_does_not_refuse_a_walk(tmp_path, head, without_surface, monkeypatch):
+    """Catches a walk around a head that is refused for one image whose landmarks are wrong, or
+    whose head is bent by it; of calibrated cameras, one that does not fit is still refused."""
+    monkeypatch.setattr("stga_addon.tracking.seen.fit_dense", lambda *_, **__: None)
+    record(tmp_path, head)
+    options = TrackingOptions(landmarks=tmp_path / "points", mattes=False)
+    footage = open_footage(tmp_path / "footage")
+    found = replace(footage, finds_cameras=True)
+    sound = track_footage(found, tmp_path / "head.npz", tmp_path / "sound", options)
+    path = tmp_path / "points/cam3.npz"
+    arrays = dict(np.load(path))
+    np.savez(path, **{**arrays, "points": arrays["points"] + [9.0, 0.0]})
+    with refusal("camera cam3: its landmarks are off by"):
+        track_footage(footage, tmp_path / "head.npz", tmp_path / "refused", options)
+    again = track_footage(found, tmp_path / "head.npz", tmp_path / "again", options)
+    assert "landmarks are misread, and not used, in images of: cam3" in again.warnings
+    assert again.median_px == pytest.approx(sound.median_px, abs=0.05)
+    assert sound.warnings == tuple(w for w in again.warnings if "misread" not in w)
 
 
 def asked(out, footage, **more):

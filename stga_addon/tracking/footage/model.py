@@ -154,6 +154,7 @@ class Footage:
                 tracking "estimated" (from landmarks) or "avatar" (that of its camera)
     keeps_world  whether the calibration says that the capture is to keep its world
     warnings    one sentence each
+    finds_cameras  whether cameras were found in the very images
     """
 
     root: Path
@@ -162,6 +163,7 @@ class Footage:
     focal: str = "calibration"
     keeps_world: bool = False
     warnings: tuple[str, ...] = ()
+    finds_cameras: bool = False
 
     def keeps(self, world: str) -> bool:
         """Whether the cameras stay where they are, of "head", "keep" and "auto" (the calibration
