@@ -24,26 +24,26 @@ def names(node):
     return {each.id for each in ast.walk(node) if isinstance(each, ast.Name)}
 
 
-def packed_values(tree):
+def packed_values(nodes):
     """Lines that assign independent values at once, `a, b = c, d`, and swap or unpack nothing."""
-    for node in ast.walk(tree):
+    for node in nodes:
         if isinstance(node, ast.Assign) and isinstance(node.value, ast.Tuple):
             target = node.targets[0]
             if isinstance(target, ast.Tuple) and not names(target) & names(node.value):
                 yield node.lineno
 
 
-def long_functions(tree):
-    for node in ast.walk(tree):
+def long_functions(nodes):
+    for node in nodes:
         if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
             lines = (node.end_lineno or node.lineno) - node.lineno + 1
             if lines > MAX_FUNCTION_LINES:
                 yield f"{node.name} ({lines} lines)"
 
 
-def described_in_groups(tree):
+def described_in_groups(nodes):
     """Lines of docstrings that follow several constants, of which but one can be meant."""
-    for node in ast.walk(tree):
+    for node in nodes:
         body = getattr(node, "body", None)
         for group in zip(body, body[1:], body[2:], strict=False) if isinstance(body, list) else ():
             first, second, text = group
@@ -58,9 +58,10 @@ RULES = (described_in_groups, packed_values, long_functions)
 
 @cache
 def broken_rules(path):
-    """What each of RULES finds in a file, by its function; a file is read once for all of them."""
-    tree = ast.parse(path.read_text())
-    return {rule: list(rule(tree)) for rule in RULES}
+    """What each of RULES finds in a file, by its function; a file is read, and its syntax walked
+    through, once for all of them."""
+    nodes = list(ast.walk(ast.parse(path.read_text())))
+    return {rule: list(rule(nodes)) for rule in RULES}
 
 
 def breaking(rule, folder):
