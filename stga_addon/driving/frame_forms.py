@@ -131,7 +131,7 @@ def rows_of_shapes(
 ) -> list[dict[str, Any]] | None:
     """Frames of a table of a row a shape; None for other tables."""
     plain = [name.strip() for name in header]
-    entries = [dict(zip(plain, row, strict=False)) for row in rows]
+    entries: list[dict[str, Any]] = [dict(zip(plain, row, strict=False)) for row in rows]
     if not entries or not all(map(_is_row, entries)):
         return None
     if arkit_name(str(_first(entries[0], NAME_OF_SHAPE))) is None:
