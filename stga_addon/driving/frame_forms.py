@@ -20,7 +20,9 @@ VALUE_OF_SHAPE = ("value", "weight", "score", "coefficient")
 TIME_OF_ROW = ("timestamp", "time", "timeCode", "timecode", "frame", "t")
 """Keys of its time."""
 NAME_LISTS = ("Names", "names", "blendShapes")
+"""Keys of a list of shapes."""
 WEIGHT_LISTS = ("Weights", "weights", "Values", "values")
+"""Keys of the list of their weights."""
 MAX_DEPTH = 4
 """Levels of a frame in which lists of names and weights are looked for."""
 
