@@ -140,23 +140,28 @@ def open_capture(
     warnings += _unnamed_images(transforms.frames)
     point = _principal_point_warning(transforms.frames, capture.mesh, principal_point)
     warnings += [point] if point else []
-    # Limits, thresholds and the near plane are in meters: a head in millimeters cannot be trained.
-    capture, rescaled = in_meters(capture)
-    warnings += [rescaled] if rescaled else []
-    names = read_repairs(root)
-    capture = repaired(capture, names)
-    if names:
-        about = "; ".join(REPAIRS[name].about for name in names)
-        warnings.append(f"{root / REPAIRS_FILE}: the capture is read as repaired: {about}")
+    capture, told = _as_meant(capture, check=point is None)
+    warnings += told
     size = float(np.ptp(capture.neutral, axis=0).max()) if len(capture.neutral) else 0.0
     if not MIN_HEAD_EXTENT_M <= size <= MAX_HEAD_EXTENT_M:
         warnings.append(
             f"{root}: the neutral mesh measures {size:.3g} m; expected a head of "
             f"{TYPICAL_HEAD_EXTENT_M} m"
         )
-    misses = None if names or point else find_repair(capture)[1]
-    warnings += [misses] if misses else []
     return replace(capture, fps=transforms.fps, warnings=tuple(warnings))
+
+
+def _as_meant(capture: Capture, check: bool) -> tuple[Capture, list[str]]:
+    """The capture in meters and with the repairs of its folder, and a sentence for each of these,
+    or (check) for a mesh that misses the images. Raises StgaError."""
+    # Limits, thresholds and the near plane are in meters: a head in millimeters cannot be trained.
+    capture, rescaled = in_meters(capture)
+    names = read_repairs(capture.root)
+    capture = repaired(capture, names)
+    repairs = "; ".join(REPAIRS[name].about for name in names)
+    told = f"{capture.root / REPAIRS_FILE}: the capture is read as repaired: {repairs}"
+    misses = find_repair(capture)[1] if check and not names else None
+    return capture, [own for own in (rescaled, told if names else None, misses) if own]
 
 
 def is_capture(path: Path) -> bool:

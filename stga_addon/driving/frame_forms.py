@@ -20,7 +20,9 @@ VALUE_OF_SHAPE = ("value", "weight", "score", "coefficient")
 TIME_OF_ROW = ("timestamp", "time", "timeCode", "timecode", "frame", "t")
 """Keys of its time."""
 NAME_LISTS = ("Names", "names", "blendShapes")
+"""Keys of a list of shapes."""
 WEIGHT_LISTS = ("Weights", "weights", "Values", "values")
+"""Keys of the list of their weights."""
 MAX_DEPTH = 4
 """Levels of a frame in which lists of names and weights are looked for."""
 
@@ -131,7 +133,7 @@ def rows_of_shapes(
 ) -> list[dict[str, Any]] | None:
     """Frames of a table of a row a shape; None for other tables."""
     plain = [name.strip() for name in header]
-    entries = [dict(zip(plain, row, strict=False)) for row in rows]
+    entries: list[dict[str, Any]] = [dict(zip(plain, row, strict=False)) for row in rows]
     if not entries or not all(map(_is_row, entries)):
         return None
     if arkit_name(str(_first(entries[0], NAME_OF_SHAPE))) is None:

@@ -26,6 +26,7 @@ from ..progress import Say, warn
 
 MAX_SPLAT_BYTES = 16 << 30
 READ_FILES = "the folder of a run, an avatar (.npz), or splats (.ply, .spz, .splat)"
+
 CLOUDCOMPARE_PREFIX = "scalar_"
 """What CloudCompare writes before the names of other properties."""
 COLOR_NAMES = (("red", "green", "blue"), ("r", "g", "b"))

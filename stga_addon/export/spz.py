@@ -20,11 +20,13 @@ from .ply import READ_FILES
 MAGIC = b"NGSP"
 
 VERSION = 3
-"""The last packed by gzip: version 4 needs Zstandard, which Blender's Python lacks."""
+"""The last packed by gzip: version 4 needs Zstandard, a package that may be missing."""
 READ_VERSIONS = 1, 2, 3, 4
+
 STREAM_VERSION = 4
 """First version of streams that Zstandard packs, behind a table of their sizes."""
 HEADER_BYTES = 16
+
 STREAM_HEADER = struct.Struct("<4sIIBBBBI12x")
 """Header of version 4: as before, with the number of streams, and where their table begins."""
 STREAMS = 6
@@ -35,6 +37,7 @@ MAX_SPZ_BYTES = 2 << 30
 MAX_SPZ_SPLATS = 10_000_000
 MAX_SPZ_DEGREE = 4
 ANTIALIASED = 1
+
 HAS_EXTENSIONS = 2
 """Flag of files with more behind the splats, such as a safe orbit for a viewer's camera."""
 

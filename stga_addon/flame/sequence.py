@@ -64,6 +64,7 @@ MATRIX_TOLERANCE = 1e-3  # Of exports with a few decimals
 UNREAD_PARTS = ("eyelids", "eyelid_params")  # Of models that FLAME was extended by
 # Columns of a `pose` that holds several joints -> the fields they are, three columns a joint.
 POSE_LAYOUTS = {6: ("rotation", "jaw_pose"), 15: ("rotation", "neck_pose", "jaw_pose", "eyes_pose")}
+
 BODY_POSE_SIZE = 165
 """Numbers of SMPL-X's pose, as BEAT2 has it in `poses`."""
 BODY_POSE_PARTS = {"neck_pose": (45, 48), "jaw_pose": (66, 69), "eyes_pose": (69, 75)}

@@ -175,7 +175,7 @@ def render(request: Render, report: Report, say: Say) -> Written:
         _turntable_images(request, request.fps or DEFAULT_FPS)  # before anything is read
     views: Sequence[View] = ()
     if request.cameras is not None:
-        views = _camera_views(request, request.cameras, say)
+        views = camera_views(request, request.cameras, say)
     composer = Composer(request.device)
     composer.choose()
     subject = _subject(request, composer, say)
@@ -194,7 +194,7 @@ def render(request: Render, report: Report, say: Say) -> Written:
     return Written(request.output)
 
 
-def _camera_views(request: Render, path: Path, say: Say) -> list[View]:
+def camera_views(request: Render, path: Path, say: Say) -> list[View]:
     """The views of a file of cameras: transforms, or 3D Gaussian Splatting's. Raises StgaError."""
     if is_file(path) and is_gaussian_cameras(path):
         shots = read_gaussian_cameras(path)

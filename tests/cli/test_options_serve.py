@@ -14,7 +14,7 @@ ALWAYS = """
 --albedo --avatar --background --budget --cameras --capture --device --dry-run --effect
 --filmed-only --flame --focal --footage --format --fps --frames --gray-card --growth --iterations
 --knobs --landmarks --light --mattes --meshes --model --neutral --no-blend --offset --only --out
---preset --principal-point --quick --region --resume --schedule --seed --seeds
+--preset --principal-point --quick --region --repair --resume --schedule --seed --seeds
 --size --split --start --step --stop --stop-when-flat --strategy --strength --sync --take
 --target-psnr --threads --threshold --timesteps --turntable --video --world --zero-pose
 """
@@ -50,7 +50,7 @@ export a.npz --out o --format web --motion m.npz | a.npz --out o --format web --
 drive m.csv --out o.csv         | m.csv --out o.npz             | --flame --head
 drive v.mp4 --out o.npz --avatar r | m.npz --out o.csv          | --smooth --mirror --gain --exchange --flame
 drive m.csv --out o.npz         |                               | --stay-trained
-info a.npz                      | .                             | --flame --principal-point --effect --device
+info a.npz                      | .                             | --flame --principal-point --effect --device --repair
 batch plan.toml                 | .                             | --out --preset --budget --iterations --seed --flame --principal-point --device
 batch . --dry-run               | .                             | --commands
 batch . --commands              | .                             | --engine

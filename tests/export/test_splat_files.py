@@ -8,8 +8,10 @@ import pytest
 from numpy.testing import assert_allclose
 from refusal import refusal
 
-from stga_addon.export.splat_files import READERS, UNREAD_SUFFIXES, read_splats
-from stga_addon.jobs.render import Render, render
+from stga_addon.capture.camera import look_at
+from stga_addon.export.splat_files import READERS, UNREAD_SUFFIXES, is_splats, read_splats
+from stga_addon.files import write_json
+from stga_addon.jobs.render import Render, camera_views, render
 
 from .test_ply import by_hand, layout, numbered_rows
 
@@ -158,3 +160,49 @@ def test_families_that_are_not_read(tmp_path, suffix):
         render(request, lambda _: False, print)
     with refusal(rf"head\{suffix}: .*not read"):
         read_splats(source)
+
+
+def test_names_of_cloudcompare(tmp_path):
+    """Catches splats that went through CloudCompare refused: all but places have a prefix."""
+    names = layout(9)
+    prefixed = {name: name if name in "xyz" else f"scalar_{name}" for name in names}
+    rows = numbered_rows(names)
+    plain, _ = read(tmp_path / "a.ply", by_hand(KIND, dict.fromkeys(names, "float"), rows))
+    renamed = [{prefixed[name]: value for name, value in row.items()} for row in rows]
+    kinds = dict.fromkeys(prefixed.values(), "float")
+    splats, _ = read(tmp_path / "b.ply", by_hand(KIND, kinds, renamed))
+    assert_allclose(splats.sh, plain.sh)
+    assert_allclose(splats.rotation, plain.rotation)
+
+
+def test_output_of_3d_gaussian_splatting(tmp_path):
+    """Catches its folder taken for a run, an earlier iteration, and cameras that look the other
+    way or from another place, or whose principal point is on the other side."""
+    names = layout(0)
+    for iteration in (7000, 30000):
+        folder = tmp_path / f"model/point_cloud/iteration_{iteration}"
+        folder.mkdir(parents=True)
+        rows = [dict.fromkeys(names, 0.25)] * (iteration // 1000)
+        content = by_hand(KIND, dict.fromkeys(names, "float"), rows)
+        (folder / "point_cloud.ply").write_bytes(content)
+    said = []
+    assert is_splats(tmp_path / "model")
+    assert len(read_splats(tmp_path / "model", said.append)) == 30
+    assert said == [f"{tmp_path}/model: point_cloud/iteration_30000/point_cloud.ply is used"]
+    gl = look_at((0.3, 0.2, 2.0), (0, 0.1, 0), 32, 24, 40.0)
+    pose = np.linalg.inv(gl.world_to_camera)
+    lens = {"width": 32, "height": 24, "fx": 40.0, "fy": 40.0}
+    place = {"position": pose[:3, 3].tolist(), "rotation": pose[:3, :3].tolist()}
+    cameras = tmp_path / "model/cameras.json"
+    write_json(cameras, [{"id": 0, "img_name": "a", **lens, **place}])
+    request = Render(tmp_path / "model", tmp_path / "out", cameras=cameras)
+    (view,) = camera_views(request, cameras, print)
+    assert_allclose(view.camera.world_to_camera, gl.world_to_camera, atol=1e-9)
+    assert (view.camera.fl_x, view.camera.cx, view.camera.cy) == (40, 16, 12)
+    frame = {"file_path": "a.png", "transform_matrix": gl.camera_to_world_gl.tolist()}
+    lens = {"w": 32, "h": 24, "fl_x": 40.0, "cx": 16.0, "cy": 7.0}
+    for key, cy in (("transforms", 7), ("vhap", 17)):
+        timed = {"timestep_index": 0} if key == "vhap" else {}
+        write_json(tmp_path / f"{key}.json", {**lens, "frames": [{**frame, **timed}]})
+        (view,) = camera_views(request, tmp_path / f"{key}.json", print)
+        assert view.camera.cy == cy

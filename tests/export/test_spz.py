@@ -2,6 +2,7 @@
 
 import gzip
 import struct
+import sys
 from dataclasses import replace
 
 import gsply
@@ -109,3 +110,38 @@ def test_rotations_of_older_versions(tmp_path, version):
     assert_allclose(found, gsply.read_spz(tmp_path / "2.spz").quats, atol=5e-5)
     off = Rotation.from_quat(found, scalar_first=True) * turns.inv()
     assert np.degrees(np.median(off.magnitude())) < 0.8
+
+
+@pytest.mark.parametrize("degree", [0, 2])
+def test_version_4(tmp_path, monkeypatch, degree):
+    """Catches SuperSplat's default refused, streams in another order, and a traceback without the
+    library. gsply writes and reads it."""
+    pytest.importorskip("zstandard")
+    write_spz(tmp_path / "3.spz", random_splats(6, 50, 5, degree))
+    path = tmp_path / "4.spz"
+    gsply.write_spz(path, gsply.read_spz(tmp_path / "3.spz"), version=4, fractional_bits=16)
+    found = read_splats(path, print)
+    same = gsply.read_spz(path)
+    assert_allclose(found.xyz, same.means, atol=1e-6)
+    assert_allclose(found.log_scale, same.scales, atol=1e-6)
+    assert_allclose(found.sh[:, 0], same.sh0, atol=1e-6)
+    assert found.sh.shape[1] == (degree + 1) ** 2
+    path.write_bytes(path.read_bytes()[:-9])
+    with refusal("4.spz: is not a readable SPZ file"):
+        read_splats(path)
+    monkeypatch.setitem(sys.modules, "zstandard", None)
+    with refusal("4.spz: is SPZ of version 4, which needs the package zstandard"):
+        read_splats(path)
+
+
+def test_extensions(tmp_path):
+    """Catches a file refused for what a viewer keeps behind the splats."""
+    path = tmp_path / "a.spz"
+    write_spz(path, random_splats(6, 20, 5, 1))
+    expected = read_splats(path)
+    data = bytearray(gzip.decompress(path.read_bytes()))
+    data[14] |= 2
+    path.write_bytes(gzip.compress(bytes(data) + b"\x01\x00\x00\xad\x04\x00\x00\x00????"))
+    said = []
+    assert_allclose(read_splats(path, said.append).xyz, expected.xyz)
+    assert said == [f"{path}: has extensions, which are not read"]

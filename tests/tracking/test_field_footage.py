@@ -467,3 +467,51 @@ def test_what_is_no_footage(tmp_path):
     ):
         with refusal(message):
             open_footage(tmp_path / name)
+
+
+def turned(path, orientation, size):
+    """A photo whose stored pixels are red at the top left, with EXIF's orientation."""
+    image = Image.new("RGB", size, (0, 10, 20))
+    image.paste((255, 10, 20), (0, 0, size[0] // 2, size[1] // 2))
+    exif = Image.Exif()
+    exif[0x0112] = orientation
+    path.parent.mkdir(parents=True, exist_ok=True)
+    image.save(path, exif=exif)
+
+
+@pytest.mark.parametrize("orientation", [1, 3, 6, 8])
+@pytest.mark.parametrize("write", [write_colmap_text, write_export])
+def test_exif_is_ignored_as_it_was_in_the_calibration(tmp_path, orientation, write):
+    """Catches photos of a camera on its side or upside down turned, but not their poses."""
+    names = ["a.png", "b.png"]
+    if write is write_export:
+        write(tmp_path / "cameras.xml", rig(2), names)
+    else:
+        write(tmp_path / "sparse/0", rig(2), names)
+    for name in names:
+        turned(tmp_path / "images" / name, orientation, (WIDTH, HEIGHT))
+    footage = open_footage(tmp_path)
+    for camera in footage.cameras:
+        assert camera.image(0)[2, 2, 0] > 200
+        assert camera.image(0)[-3, -3, 0] < 50
+    told = [text for text in footage.warnings if "EXIF" in text]
+    assert len(told) == (orientation != 1)
+
+
+@pytest.mark.parametrize(
+    ("size", "factor"),
+    [((WIDTH // 4, HEIGHT // 4), 0.25), ((2 * WIDTH, 2 * HEIGHT), 2), ((27, 20), 27 / 40)],
+)
+def test_a_calibration_of_another_size(tmp_path, size, factor):
+    """Catches reduced images refused, or read with the focal length of the others."""
+    write_colmap_text(tmp_path / "sparse/0", rig(), NAMES)
+    write_images(tmp_path / "images", size=size)
+    footage = open_footage(tmp_path)
+    camera = footage.cameras[0].camera
+    assert (camera.width, camera.height) == size
+    assert intrinsics(camera)[0] == pytest.approx(factor * rig()[0].fl_x)
+    assert camera.cy == pytest.approx(size[1] / 2)
+    assert any("which is scaled by" in text for text in footage.warnings)
+    write_images(tmp_path / "images", size=(WIDTH, WIDTH))
+    with refusal(r"has 40 x 40 pixels, but .* has 40 x 30"):
+        open_footage(tmp_path)

@@ -72,7 +72,7 @@ def without_a_recording(images):
 
 def of_other_size(images, numbers=range(1, 7)):
     for number in numbers:
-        write_image(images / f"b/frame_{number}.png", size=(20, 15))
+        write_image(images / f"b/frame_{number}.png", size=(20, 20))
 
 
 def of_other_length(images):
@@ -108,12 +108,12 @@ def of_other_length(images):
         (
             of_other_size,
             FrameRange(),
-            r"b/frame_1.png: has 20 x 15 pixels, but .* image 'b/frame_1.png' has 40 x 30",
+            r"b/frame_1.png: has 20 x 20 pixels, but .* image 'b/frame_1.png' has 40 x 30",
         ),
         (
             lambda images: of_other_size(images, [3]),
             FrameRange(),
-            r"b/frame_3.png: has 20 x 15 pixels, but .* image 'b/frame_1.png' has 40 x 30",
+            r"b/frame_3.png: has 20 x 20 pixels, but .* image 'b/frame_1.png' has 40 x 30",
         ),
     ],
 )

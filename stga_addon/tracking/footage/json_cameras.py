@@ -14,9 +14,13 @@ from ...files import read_json
 from .shots import Calibrated, ImageSize, Shot, pinhole
 
 CAMERA_PARAMS = "camera_params.json"
+"""NeRSemble's and VHAP's file."""
 CAMERA_PARAMS_MARK = b'"world_2_cam"'
+"""Words of its beginning."""
 GAUSSIAN_MARKS = b'"position"', b'"rotation"', b'"fx"'
+"""Words of the beginning of 3D Gaussian Splatting's file."""
 HEAD_BYTES = 1 << 16
+"""Bytes of a file in which they are looked for."""
 MAX_OTHER_SIZE = 0.1
 """Relative distance of a principal point from the image's center, up to which a matrix of
 intrinsics may belong to the image's size."""

@@ -16,6 +16,7 @@ FACE_KEYS = ("expression", "exp_path", "mesh_path", "flame_path")
 """What each frame of NeRFace, IMavatar and INSTA has: a head that moves before one camera."""
 MARKS = b'"frames"', b'"transform_matrix"'
 HEAD_BYTES = 1 << 16
+
 HEAD_FIXED = (
     "its frames hold a face's expressions: they are moments of one camera, and its poses are "
     "relative to the head, which tracking finds itself"
