@@ -14,7 +14,11 @@ import bpy
 
 from ..stga_addon.capture.meshes import MESH_SUFFIXES
 from ..stga_addon.capture.open import OWN_MODELS, open_capture
-from ..stga_addon.capture.transforms import DEFAULT_PRINCIPAL_POINT, transforms_files
+from ..stga_addon.capture.transforms import (
+    DEFAULT_PRINCIPAL_POINT,
+    VIDEO_SUFFIXES,
+    transforms_files,
+)
 from ..stga_addon.driving.performers import READ_SUFFIXES
 from ..stga_addon.errors import StgaError
 from ..stga_addon.export.skinned_reader import (
@@ -45,7 +49,6 @@ from ..stga_addon.scene.objects import (
 from ..stga_addon.scene.record import capture_of, store_path
 from ..stga_addon.scene.rig.head import import_head
 from ..stga_addon.tracking.folder import describe_focal_length, is_tracked
-from ..stga_addon.tracking.footage.sources import VIDEO_SUFFIXES
 from ..stga_addon.training.run.folder import has_run, next_folder
 from . import options
 from .common import Edit, FileImport, call, file_path, flame_model_path, is_head, need, package

@@ -12,6 +12,7 @@ from typing import Any
 import bpy
 import numpy as np
 
+from ..stga_addon.capture.transforms import VIDEO_SUFFIXES
 from ..stga_addon.errors import StgaError
 from ..stga_addon.jobs import track as jobs
 from ..stga_addon.jobs.perform import has_request, read_request, request_folder
@@ -25,7 +26,6 @@ from ..stga_addon.scene.record import capture_of, stored_path
 from ..stga_addon.scene.rig.head import usable_rig
 from ..stga_addon.scene.rig.keyframes import key_current_pose
 from ..stga_addon.scene.rig.motion import sample_pose
-from ..stga_addon.tracking.footage.sources import VIDEO_SUFFIXES
 from ..stga_addon.training.settings import TrainingSettings, make_settings
 from . import common, options
 from .common import Action, Edit, FileImport, file_path, head_of, is_head, need, needs_rig

@@ -32,7 +32,7 @@ def without_spill(image: np.ndarray, mask: np.ndarray) -> np.ndarray:
     channels = list(cv2.split(image))
     others = [own for number, own in enumerate(channels) if number != key]
     excess = cv2.bitwise_and(cv2.subtract(channels[key], cv2.max(*others)), whole)
-    channels[key] -= (fraction * excess).astype(np.uint8)
+    channels[key] = cv2.subtract(channels[key], (fraction * excess).astype(np.uint8))
     return np.asarray(cv2.merge(channels))
 
 

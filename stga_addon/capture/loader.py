@@ -16,7 +16,7 @@ from .model import View
 
 Preparation = Callable[[View, np.ndarray, np.ndarray | None], tuple[np.ndarray, np.ndarray | None]]
 """(view, image (H, W, 3) uint8, mask (H, W) uint8 or None) -> image and mask."""
-_Key = tuple[Path, Path | None, int, int, float]
+_Key = tuple[Path, Path | None, bool, int, int, float]
 """Image, mask, timestep and camera of what is decoded, and its scale."""
 
 

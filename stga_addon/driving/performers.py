@@ -4,10 +4,10 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
+from ..capture.transforms import VIDEO_SUFFIXES
 from ..errors import StgaError
 from ..files import is_file, is_folder, matching
 from ..progress import Report, ignore
-from ..tracking.footage.sources import VIDEO_SUFFIXES
 from .performance import Performance
 from .performance_files import (
     csv_performance,

@@ -223,8 +223,8 @@ def motion_of(path: Path, arrays: Arrays, model: FlameModel) -> FlameSequence:
             raise StgaError(f"{path}: pose has shape {pose.shape}, expected {sizes}")
         fields = POSE_LAYOUTS[pose[0].size]
         columns = pose.reshape(len(pose), -1)
-        parts = np.split(columns, range(3, 3 * len(fields), 3), axis=1)
-        arrays = dict(zip(fields, parts, strict=True)) | arrays
+        turns = np.split(columns, range(3, 3 * len(fields), 3), axis=1)
+        arrays = dict(zip(fields, turns, strict=True)) | arrays
     moving = {name: arrays[name] for name in (*FRAME_FIELDS, "dynamic_offset") if name in arrays}
     if not moving:
         none = f"has none of {', '.join(FRAME_FIELDS)}"

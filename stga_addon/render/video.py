@@ -15,7 +15,8 @@ from ..errors import StgaError
 from ..export.playback import check_rate
 from ..files import NumberedFiles, check_writable, file_address, naming, replacing
 from ..raster.posed_splats import ComposedImage, PosedSplats
-from .client import pack_camera, pack_layers, receive, send, unpack_camera, unpack_layers
+from ..worker.messages import receive, send
+from .client import pack_camera, pack_layers, unpack_camera, unpack_layers
 from .device import Composer
 
 CODEC = "libx264"

@@ -214,8 +214,8 @@ def _with_cameras(footage: Footage, out: Path, crew: Crew) -> tuple[Footage, str
         f"{structure.points} points are on the face"
     )
     line += "; the room was left out, as it did not turn with the person" * structure.masked
-    known = set(structure.timesteps.tolist())
-    lost = [camera.source(t) for t in timesteps if t not in known]
+    found_timesteps = set(structure.timesteps.tolist())
+    lost = [camera.source(t) for t in timesteps if t not in found_timesteps]
     lost_text = (f"no camera was found of {listed(lost)}; left out",) if lost else ()
     warnings = (*footage.warnings, *lost_text)
     known = replace(footage, cameras=cameras, fps=None, focal="calibration", warnings=warnings)

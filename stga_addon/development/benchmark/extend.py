@@ -37,8 +37,8 @@ from ...training.optimize.image_preparation import image_preparation
 from ...training.optimize.precompile import precompile_kernels
 from ...training.optimize.trainer import Start, Strategy, Trainer
 from ...training.run.continuation import (
-    continued_evaluation_views,
     continued_order,
+    grouped_evaluation_views,
     starting_state,
 )
 from ...training.run.folder import Run, read_run
@@ -218,7 +218,7 @@ def compare(name: str, prepared: Prepared, arm: Arm, options: argparse.Namespace
     trainer = Trainer(capture, arm.settings, prepared.selection or {}, Start(state))
     trainer.strategy = arm.strategy
     region = arm_region(prepared)
-    evaluation_views = continued_evaluation_views(prepared.run, capture, region)
+    evaluation_views = grouped_evaluation_views(prepared.run, capture, region)
     rows = arm.settings.exposure
     exposure = known_exposure(rows, capture.views["train"]) if rows else None
     spent = 0.0

@@ -88,9 +88,9 @@ def _may_be_rig(split: _Split) -> bool:
     """Whether several cameras have an image each at several moments, most of them at all."""
     cameras = Counter(camera for camera, _ in split)
     moments = Counter(moment for _, moment in split)
-    several = len(cameras) > 1 and np.median([*cameras.values()]) > 1
-    several = several and len(set(split)) == len(split)
-    return several and len(split) >= MIN_LISTED * len(cameras) * len(moments)
+    if len(cameras) < 2 or np.median([*cameras.values()]) <= 1 or len(set(split)) < len(split):
+        return False
+    return len(split) >= MIN_LISTED * len(cameras) * len(moments)
 
 
 def _stands_still(cameras: Sequence[str], poses: Sequence[np.ndarray]) -> bool:

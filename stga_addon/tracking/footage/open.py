@@ -14,7 +14,7 @@ from ...capture.camera import camera_from_gl, scaled_to
 from ...capture.images import image_size, is_turned
 from ...capture.lens import Lens, Undistortion, undistortion
 from ...capture.model import View
-from ...capture.transforms import IMAGE_SUFFIXES
+from ...capture.transforms import IMAGE_SUFFIXES, VIDEO_SUFFIXES
 from ...errors import StgaError
 from ...files import is_file, is_folder
 from .calibrations import EXPECTED, calibration_above, find_calibration, read_calibration
@@ -28,7 +28,6 @@ from .shots import Shot, listed
 from .sources import (
     CONTAINERS,
     ORIGINALS,
-    VIDEO_SUFFIXES,
     Sources,
     calibration_images,
     find_sources,
@@ -298,8 +297,8 @@ def _camera(name: str, shot: Shot, frames: Frames) -> tuple[FootageCamera, tuple
         if isinstance(frames, ImageFrames):
             views = {t: replace(view, camera=scaled) for t, view in frames.views.items()}
             frames = ImageFrames(views)
-        size = f"{first[0]} x {first[1]} pixels, the calibration of {width} x {height}"
-        told += (f"images are of {size}, which is scaled by {first[0] / width:.4g}",)
+        both = f"{first[0]} x {first[1]} pixels, the calibration of {width} x {height}"
+        told += (f"images are of {both}, which is scaled by {first[0] / width:.4g}",)
     for path, size in sizes.items():
         if size != (shot.camera.width, shot.camera.height):
             raise StgaError(
