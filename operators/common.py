@@ -98,10 +98,10 @@ class Action:
         manager = bpy.context.window_manager
         self.report({kind}, sentence if bpy.app.background else brief)
         is_error = kind == "ERROR"
-        told = [] if is_error or manager.stga_failed else manager.stga_message.splitlines()
-        # an operator that was called by another has told it at length
+        messages = [] if is_error or manager.stga_failed else manager.stga_message.splitlines()
+        # an operator that was called by another has said it at length
         if brief != short_sentence(manager.stga_message):
-            manager.stga_message = "\n".join([*told, sentence])
+            manager.stga_message = "\n".join([*messages, sentence])
         manager.stga_failed = is_error
 
 

@@ -440,8 +440,8 @@ def read_bytes(path: Path, limit: int = MAX_FILE_BYTES) -> bytes:
         raise StgaError(f"{path}: has {size} bytes, more than the {limit} allowed")
     with naming(path, "read"):
         data = path.read_bytes()
-    if stray := stray_content(data):
-        raise StgaError(f"{path}: {stray}")
+    if unexpected := stray_content(data):
+        raise StgaError(f"{path}: {unexpected}")
     return data
 
 

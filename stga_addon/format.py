@@ -53,8 +53,8 @@ MORE_GAIN = "what may help: Growth, which adds splats there, or footage that sho
 def describe_gain(before_db: float, after_db: float) -> str:
     """Accuracy of a region before and after it was trained further, and what would help."""
     gain = after_db - before_db
-    told = f"{before_db:.2f} dB before, {after_db:.2f} dB after ({gain:+.2f})"
-    return told if gain >= MIN_SEEN_GAIN_DB else f"{told}; {MORE_GAIN}"
+    gained = f"{before_db:.2f} dB before, {after_db:.2f} dB after ({gain:+.2f})"
+    return gained if gain >= MIN_SEEN_GAIN_DB else f"{gained}; {MORE_GAIN}"
 
 
 def describe_quality(figures: Mapping[str, float]) -> str:

@@ -88,7 +88,7 @@ MAX_TOLD_SHARE = 0.99
 
 
 class Clock:
-    """How far work is and how long it takes, as people are told: neither ever goes back."""
+    """How far work is and how long it takes, as it is reported: neither ever goes back."""
 
     def __init__(self, clock: Callable[[], float] = monotonic) -> None:
         self.share = 0.0
@@ -98,7 +98,7 @@ class Clock:
         # When work lately reported how many seconds are left, and how many
         self._asked: deque[tuple[float, float]] = deque()
 
-    def told(self, progress: Progress) -> dict[str, float]:
+    def reported(self, progress: Progress) -> dict[str, float]:
         """The finite figures of some progress; `left_s`, by the share where the work does not say,
         else as before, is the least so far, and `longer` 1 where that is, or the work knows it to
         be, too little."""
@@ -128,7 +128,7 @@ class Clock:
 
 
 def after_silence(figures: Mapping[str, float], silent_s: float) -> Mapping[str, float]:
-    """The figures that were told so long ago, of which more is left than they say by now."""
+    """The figures that were reported so long ago, of which more is left than they say by now."""
     patience_s = MIN_PACE_S + (MAX_OVERRUN_RATIO - 1) * figures.get("left_s", math.inf)
     return {**figures, "longer": 1.0} if silent_s > patience_s else figures
 

@@ -140,8 +140,8 @@ def open_capture(
     warnings += _unnamed_images(transforms.frames)
     point = _principal_point_warning(transforms.frames, capture.mesh, principal_point)
     warnings += [point] if point else []
-    capture, told = _as_meant(capture, check=point is None)
-    warnings += told
+    capture, messages = _as_meant(capture, check=point is None)
+    warnings += messages
     size = float(np.ptp(capture.neutral, axis=0).max()) if len(capture.neutral) else 0.0
     if not MIN_HEAD_EXTENT_M <= size <= MAX_HEAD_EXTENT_M:
         warnings.append(
@@ -159,9 +159,9 @@ def _as_meant(capture: Capture, check: bool) -> tuple[Capture, list[str]]:
     names = read_repairs(capture.root)
     capture = repaired(capture, names)
     repairs = "; ".join(REPAIRS[name].about for name in names)
-    told = f"{capture.root / REPAIRS_FILE}: the capture is read as repaired: {repairs}"
+    about = f"{capture.root / REPAIRS_FILE}: the capture is read as repaired: {repairs}"
     misses = find_repair(capture)[1] if check and not names else None
-    return capture, [own for own in (rescaled, told if names else None, misses) if own]
+    return capture, [own for own in (rescaled, about if names else None, misses) if own]
 
 
 def is_capture(path: Path) -> bool:

@@ -141,8 +141,8 @@ def in_meters(capture: Capture) -> tuple[Capture, str | None]:
             if _in_images(capture) >= MIN_SHOWN or _in_images(meters) < MIN_SHOWN:
                 what = "meshes and cameras"
                 meters = replace(meters, views=_changed(capture.views, Repair("", scaled), None))
-            told = f"the neutral mesh measures {size:.3g}: {what} are read as {unit}meters"
-            return meters, f"{capture.root}: {told}, divided by {1 / factor:g}"
+            sentence = f"the neutral mesh measures {size:.3g}: {what} are read as {unit}meters"
+            return meters, f"{capture.root}: {sentence}, divided by {1 / factor:g}"
     return capture, None
 
 

@@ -59,25 +59,25 @@ def with_usable_views(capture: Capture) -> tuple[Capture, tuple[str, ...]]:
         split: tuple(view for view in own if view.image not in empty | plain)
         for split, own in capture.views.items()
     }
-    told = []
+    warnings = []
     for files, why in ((empty, "have an empty mask"), (plain - empty, "are of one color")):
         if files:
             shown = [view for view in views if view.image in files]
             count = f"{len(shown)} of {len(views)} images {why}"
             left_out = "they are left out of training, tracking and scores"
-            told.append(f"{capture.root}: {count} ({_timesteps(shown)}); {left_out}")
-    return replace(capture, views=usable), tuple(told)
+            warnings.append(f"{capture.root}: {count} ({_timesteps(shown)}); {left_out}")
+    return replace(capture, views=usable), tuple(warnings)
 
 
 def with_training_views(capture: Capture) -> tuple[Capture, tuple[str, ...]]:
     """`with_usable_views`. Raises StgaError where no training view is left."""
-    usable, told = with_usable_views(capture)
+    usable, warnings = with_usable_views(capture)
     if capture.views.get("train") and not usable.views["train"]:
         raise StgaError(
             f"{capture.root}: shows nobody in its training views, so there is nothing to train on: "
             "each has an empty mask or an image of one color; expected masks of 255 on the person"
         )
-    return usable, told
+    return usable, warnings
 
 
 def _timesteps(views: Iterable[View]) -> str:

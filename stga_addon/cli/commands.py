@@ -105,9 +105,9 @@ class ProgressBar(ExitStack[None]):
             self.enter_context(logging_redirect_tqdm())
         self._bar.set_description(progress.stage, refresh=progress.stage != self._stage)
         self._stage = progress.stage
-        figures = self._clock.told(progress)
-        told = [describe_left(figures), *describe_figures(figures), printable(progress.detail)]
-        self._bar.set_postfix_str("; ".join(filter(None, told)), refresh=False)
+        figures = self._clock.reported(progress)
+        shown = [describe_left(figures), *describe_figures(figures), printable(progress.detail)]
+        self._bar.set_postfix_str("; ".join(filter(None, shown)), refresh=False)
         self._bar.update(progress.share - self._bar.n)
         return False
 

@@ -143,7 +143,7 @@ def this_platform() -> str:
 
 def collect_wheels(folder: Path, target: Target, say: Say = lambda line: None) -> list[Path]:
     """The wheels that training needs on the target, downloaded into `folder` where they are
-    missing; sorted by name. say: is told each one.
+    missing; sorted by name. say: called with each one.
 
     Raises StgaError where one cannot be had.
     """

@@ -214,8 +214,8 @@ def motion_of(path: Path, arrays: Arrays, model: FlameModel) -> FlameSequence:
     if body is not None and body.ndim == 2 and body.shape[1] == BODY_POSE_SIZE:
         parts = {name: body[:, start:end] for name, (start, end) in BODY_POSE_PARTS.items()}
         arrays = parts | arrays
-        told = "poses are those of a body (SMPL-X): its head, jaw and eyes move this head"
-        warnings = (*warnings, f"{path}: {told}")
+        about = "poses are those of a body (SMPL-X): its head, jaw and eyes move this head"
+        warnings = (*warnings, f"{path}: {about}")
     pose = arrays.pop("pose", None)
     if pose is not None:
         if pose.ndim < 2 or not len(pose) or pose[0].size not in POSE_LAYOUTS:

@@ -90,8 +90,8 @@ def analyze(request: Analyze, report: Report, say: Say) -> Analyzed:
     begin = monotonic()
     report(Progress(stage="Analyzing the capture"))
     source = request.capture, request.flame, request.principal_point
-    if request.repair and (told := repair_capture(*source)):
-        say(told)
+    if request.repair and (repaired := repair_capture(*source)):
+        say(repaired)
     capture = open_capture(*source)
     if not capture.views.get("train"):
         return Analyzed((), {})

@@ -206,7 +206,7 @@ def blender_command() -> list[str]:
 
 
 def _start(command: list[str]) -> subprocess.Popen[str]:
-    # Without the variables of this Python, whose place the add-on is told.
+    # Without the variables of this Python, whose place the add-on knows.
     kept = {name: value for name, value in os.environ.items() if not name.startswith("PYTHON")}
     try:
         return subprocess.Popen(

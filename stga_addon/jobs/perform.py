@@ -92,7 +92,7 @@ def _read(path: Path, kinds: Any) -> Any:
 def perform(request: Request, report: Report = ignore, say: Say = print) -> Result:
     """Carry out a request; returns what it found.
 
-    say: told in lines what was decided and found.
+    say: called with lines about what was decided and found.
     Raises what the work raises: StgaError for mistakes and damaged files; Cancelled where the
     report stopped work that has nothing to keep; KeyboardInterrupt after Ctrl-C.
     """

@@ -567,8 +567,8 @@ def _kinds(request: MakeAvatar, report: Report, say: Say) -> list[str]:
             for own, path in zip(opened, footage, strict=True):
                 kind, why = take_of(own, Crew(helpers, steps.report, steps.show))
                 kinds.append(kind)
-                told = "around a still head" if kind == "around" else "a head that moves"
-                say(f"take: {path.name}: {told} ({why})")
+                what = "around a still head" if kind == "around" else "a head that moves"
+                say(f"take: {path.name}: {what} ({why})")
     write_json(request.out / INPUTS, {**stored, KINDS: kinds})
     return kinds
 

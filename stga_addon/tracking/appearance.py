@@ -22,7 +22,7 @@ CHANNEL_WEIGHTS = np.array([0.5, 1.5, 0.7])
 NOISE_LEVELS = 6.0
 """Standard deviation, of 255, of a pixel from the texture on skin that is followed exactly."""
 LIGHT_PRIOR = 0.02
-"""Weight of the camera's usual lighting in a view's, as a share of the points' information."""
+"""Weight of the camera's mean lighting in a view's, as a share of the points' information."""
 LIGHT_ITERATIONS = 2
 """Reweighted least squares fits of the light."""
 TEXTURE_ITERATIONS = 4
@@ -121,7 +121,7 @@ class Texture:
     """Appearance of N points without lighting.
 
     values  camera's key -> by level the channels (N, 3)
-    lights  camera's key -> (9,) usual lighting
+    lights  camera's key -> (9,) mean lighting
     trust   (N,) from 0 to 1: low for what looks different from view to view, as hair, hands and the
             mouth's inside
     """
@@ -267,21 +267,21 @@ def fitted_light(
     texture: np.ndarray,
     basis: np.ndarray,
     weight: np.ndarray,
-    usual: np.ndarray,
+    expected: np.ndarray,
     scale: float = LIGHT_SCALE,
 ) -> np.ndarray:
     """(9,) lighting under which the texture's luma (N, 3) gives that of a view (N, 3): values ≈
     texture · basis light.
 
-    basis (N, 9), weight (N,); usual (9,): the prior. Robust beyond `scale` levels.
+    basis (N, 9), weight (N,); expected (9,): the prior. Robust beyond `scale` levels.
     """
     design = basis * texture[:, :1]
     target = values[:, 0]
-    light = usual
-    prior = LIGHT_PRIOR * float((weight * texture[:, 0] ** 2).sum() + 1) * np.eye(len(usual))
+    light = expected
+    prior = LIGHT_PRIOR * float((weight * texture[:, 0] ** 2).sum() + 1) * np.eye(len(expected))
     for _ in range(LIGHT_ITERATIONS):
         weighted = design * (weight * robust(target - design @ light, scale))[:, None]
-        light = np.linalg.solve(weighted.T @ design + prior, weighted.T @ target + prior @ usual)
+        light = np.linalg.solve(weighted.T @ design + prior, weighted.T @ target + prior @ expected)
     return light
 
 
@@ -290,10 +290,10 @@ def relit(
     texture: np.ndarray,
     basis: np.ndarray,
     weight: np.ndarray,
-    usual: np.ndarray,
+    expected: np.ndarray,
 ) -> np.ndarray:
     """The texture (N, 3) in the lighting of a view; arguments as of `fitted_light`."""
-    light = fitted_light(values, texture, basis, weight, usual)
+    light = fitted_light(values, texture, basis, weight, expected)
     return texture * shading(basis, light)
 
 

@@ -65,8 +65,8 @@ CARRIED_FACTOR = 1.25
 """The same for a timestep that is moved as those beside it; which is enough where it leaves no
 region worse explained than theirs, by this factor."""
 OPENINGS_M = 0.008, 0.016  # By which the chin is moved for further starts
-USUAL_QUANTILE = 0.2
-USUAL_FACTOR = 1.5
+TYPICAL_QUANTILE = 0.2
+TYPICAL_FACTOR = 1.5
 """Other starts are tried where the first leaves a region of the face worse explained, by this
 factor, than it is at this share of the texture's timesteps."""
 DAMPING = 1e-3
@@ -158,8 +158,8 @@ def fit_dense(
     seen = in_parts(_sampled_part, list(zip(some, rows, strict=True)), 0)
     texture = average_texture([sample for part in seen for sample in part])
     started = in_parts(_started_part, [(part, texture) for part in some], len(chosen))
-    usual = np.quantile(np.concatenate(started), USUAL_QUANTILE, axis=0)
-    parts = [(part, texture, usual, settled) for part in parts_of(timesteps, PART_TIMESTEPS)]
+    typical = np.quantile(np.concatenate(started), TYPICAL_QUANTILE, axis=0)
+    parts = [(part, texture, typical, settled) for part in parts_of(timesteps, PART_TIMESTEPS)]
     found = in_parts(_solved_part, parts, 2 * len(chosen), keep=True)
     solved = {name: np.concatenate([part[name] for part in found]) for name in found[0]}
     stiffness = acceleration_precision(fit.head.model) if fit.ordered else None
@@ -197,7 +197,12 @@ def _started_part(fit: HeadFit, take: RecordedTake, texture: Texture, step: Step
 
 
 def _solved_part(
-    fit: HeadFit, take: RecordedTake, texture: Texture, usual: np.ndarray, settled: bool, step: Step
+    fit: HeadFit,
+    take: RecordedTake,
+    texture: Texture,
+    typical: np.ndarray,
+    settled: bool,
+    step: Step,
 ) -> dict[str, np.ndarray]:
     """The timesteps of a part, solved one from the other, every second one first; by name, T of
     what `_Solved` has of each."""
@@ -209,7 +214,7 @@ def _solved_part(
     ) -> tuple[_Shot, _Solved]:
         shot = solver.shot(timestep)
         found = solver.carried(shot, before, after) if before and after else None
-        found = found or solver.solve(shot, before, usual)
+        found = found or solver.solve(shot, before, typical)
         step()
         return shot, found
 
@@ -254,13 +259,13 @@ class _Solver:
         return _Shot(views, landmarks, parameters, np.zeros(len(REGIONS), bool))
 
     def solve(
-        self, shot: _Shot, before: tuple[_Shot, _Solved] | None, usual: np.ndarray
+        self, shot: _Shot, before: tuple[_Shot, _Solved] | None, typical: np.ndarray
     ) -> _Solved:
         """The parameters that explain a timestep best, or the start where none are better; before:
         another timestep and its result."""
         visible = self.head.visibility(shot.start, shot.views)
         best, error = self.started(shot, shot.start, visible)
-        if (error.regions > USUAL_FACTOR * usual).any():
+        if (error.regions > TYPICAL_FACTOR * typical).any():
             others = [self.head.opened(shot.start, distance) for distance in OPENINGS_M]
             if before is not None:
                 last, own = before
@@ -300,9 +305,9 @@ class _Solver:
         visible = self.head.visibility(values, shot.views)
         values = self._descended(shot, values, visible, CARRIED_STEPS)
         misfit, old = (self._evidence(shot, own, visible) for own in (values, shot.start))
-        usual = np.maximum(before[1].misfit, after[1].misfit)
-        is_usual = (misfit.regions <= CARRIED_FACTOR * usual).all()
-        if not (is_usual and self._is_better(old, misfit)):
+        typical = np.maximum(before[1].misfit, after[1].misfit)
+        is_typical = (misfit.regions <= CARRIED_FACTOR * typical).all()
+        if not (is_typical and self._is_better(old, misfit)):
             return None
         if self._astray(shot, values, visible).any():
             return None

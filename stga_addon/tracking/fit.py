@@ -113,8 +113,8 @@ def triangulate(
         scale = OUTLIER_SCALE * _median(distance, confidence > 0)
         floor = MIN_DISTANCE_SHARE * np.linalg.norm(to_point, axis=2)
         # a point without a ray may lie in a camera, at distance 0 from its ray
-        usual = np.maximum(np.maximum(scale, floor), np.finfo(np.float64).tiny)
-        weights = confidence / (1 + (distance / usual) ** 2) ** 2
+        typical = np.maximum(np.maximum(scale, floor), np.finfo(np.float64).tiny)
+        weights = confidence / (1 + (distance / typical) ** 2) ** 2
     seen = (confidence > 0).sum(0) >= min(2, len(cameras))
     return Triangulation(position, information, _median(distance, confidence > 0), seen)
 

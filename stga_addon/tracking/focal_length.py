@@ -108,7 +108,7 @@ def estimated_focal(
     cost = DATA_WEIGHT * CubicSpline(tried, slopes).antiderivative()(fine)
     sides = max(camera.width, camera.height), min(camera.width, camera.height)
     aspect = sides[0] / sides[1]
-    is_whole = any(abs(aspect / usual - 1) < ASPECT_TOLERANCE for usual in CAMERA_ASPECTS)
+    is_whole = any(abs(aspect / known - 1) < ASPECT_TOLERANCE for known in CAMERA_ASPECTS)
     cost += (fine / (CAMERA_SIGMA if is_whole else CROPPED_SIGMA)) ** 2 / 2
     distance = np.interp(fine, tried, np.log(distances))
     cost += ((distance - np.log(DISTANCE_M)) / DISTANCE_SIGMA) ** 2 / 2
@@ -257,12 +257,12 @@ def scale_warnings(fit: HeadFit, take: RecordedTake) -> tuple[str, ...]:
     if len(scales) < MIN_CAMERAS:
         return ()
     medians = {name: float(np.median(list(own.values()))) for name, own in scales.items()}
-    usual = float(np.median(list(medians.values())))
+    median = float(np.median(list(medians.values())))
     warnings = []
     for name, value in medians.items():
-        difference = value / usual - 1
+        difference = value / median - 1
         if abs(difference) > MAX_SCALE_DIFFERENCE:
-            worst = max(scales[name], key=lambda t: abs(scales[name][t] / usual - 1))
+            worst = max(scales[name], key=lambda t: abs(scales[name][t] / median - 1))
             size = "larger" if difference > 0 else "smaller"
             warnings.append(
                 f"camera {name}: shows the head {abs(difference):.1%} {size} than the other "
@@ -280,6 +280,6 @@ def _scale(source: np.ndarray, target: np.ndarray, weights: np.ndarray) -> float
         b = target - (used[:, None] * target).sum(0) / used.sum()
         scale = float((used * (a * b).sum(1)).sum() / (used * (a**2).sum(1)).sum())
         distance = np.linalg.norm(b - scale * a, axis=1)
-        usual = max(OUTLIER_SCALE * float(np.median(distance)), 1e-9)
-        used = weights / (1 + (distance / usual) ** 2) ** 2
+        typical = max(OUTLIER_SCALE * float(np.median(distance)), 1e-9)
+        used = weights / (1 + (distance / typical) ** 2) ** 2
     return scale

@@ -22,12 +22,12 @@ ITERATIONS = 4
 IRIS_SIGMA_M = 0.0005
 """Standard deviation of the middle of an iris, which images show sharply."""
 MAX_GAZE_RAD = 0.7
-"""Up, down or aside; no eye turns farther."""
+"""Up, down or to a side; no eye turns farther."""
 CONSTANT_GAZE_SIGMA_RAD = 0.25
 """Standard deviation of where a person looks all through a take, from straight ahead."""
 EYEBALL_SIGMA_RAD = np.array([0.06, 0.025])
-"""Standard deviation of how far the model's two eyeballs turn alike, up and aside, because they are
-off: both lie too high together, but a face is symmetric, and aside they are off against each
+"""Standard deviation of how far the model's two eyeballs turn alike, up and sideways, because they
+are off: both lie too high together, but a face is symmetric, and sideways they are off against each
 other."""
 SINGLE_EYEBALL_SIGMA_RAD = np.array([0.06, 0.15])
 """The same of a single eye, whose errors nothing is compared with."""
@@ -37,7 +37,7 @@ PARALLEL_QUANTILE = 0.8
 """Of how far a take's left eye looks to the left of the right one, at which both look in parallel:
 eyes converge on what is near, and do not look apart."""
 AXES = 2
-"""About which an eye turns: x, by which it looks up and down, and y, aside."""
+"""About which an eye turns: x, by which it looks up and down, and y, sideways."""
 
 
 def with_gaze(
@@ -102,7 +102,7 @@ def _rest(turns: np.ndarray) -> np.ndarray:
 
 
 def _constant_gaze(rest: np.ndarray) -> np.ndarray:
-    """(2,) the gaze up and aside that is most likely behind `rest` (2 E,) of one or two eyes."""
+    """(2,) the gaze up and sideways that is most likely behind `rest` (2 E,) of one or two eyes."""
     eyes = rest.reshape(-1, AXES)
     sigma = EYEBALL_SIGMA_RAD if len(eyes) > 1 else SINGLE_EYEBALL_SIGMA_RAD
     is_gaze = CONSTANT_GAZE_SIGMA_RAD**2 / (CONSTANT_GAZE_SIGMA_RAD**2 + sigma**2)
@@ -114,8 +114,8 @@ def _removal(joints: list[int], removed: np.ndarray) -> str:
     names = ["left" if joint == EYE_JOINTS[0] else "right" for joint in joints]
     degrees = np.degrees(removed).reshape(-1, AXES)
     turns = [
-        f"the {name} eye's by {up:+.0f}° down and {aside:+.0f}° to its left"
-        for name, (up, aside) in zip(names, degrees, strict=True)
+        f"the {name} eye's by {up:+.0f}° down and {sideways:+.0f}° to its left"
+        for name, (up, sideways) in zip(names, degrees, strict=True)
     ]
     return (
         "gaze: a turn that lasts all through the take is taken for the head model's error and "

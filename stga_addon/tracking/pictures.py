@@ -138,13 +138,13 @@ def write_contact_sheet(
     every = {(name, t): px for name, own in errors.items() for t, px in own.items()}
     unexplained = {t: max(own.get(t, 0.0) for own in misfit.values()) for _, t in every if misfit}
     median = float(np.median(list(every.values()))) if every else 0.0
-    usual = float(np.median(list(unexplained.values()))) if unexplained else 0.0
+    typical = float(np.median(list(unexplained.values()))) if unexplained else 0.0
 
     def rank(view: tuple[str, int]) -> tuple[float, str, int]:
-        by_images = unexplained.get(view[1], 0.0) / max(usual, 1e-9)
+        by_images = unexplained.get(view[1], 0.0) / max(typical, 1e-9)
         return every[view] / max(median, 1e-9) + by_images, *view
 
-    chart = _chart([(errors, median), (misfit, usual)], footage.timesteps)
+    chart = _chart([(errors, median), (misfit, typical)], footage.timesteps)
     shown = sorted(every, key=rank, reverse=True)[: COLUMNS * ROWS]
     (width, height) = TILE_SIZE
     top = MARGIN + CAPTION + chart.height + MARGIN

@@ -99,9 +99,9 @@ def fit_landmarks(recorded: RecordedFootage, crew: Crew) -> FittedHead:
     errors = fitted.errors
     misread = misread_cameras(errors) if recorded.footage.finds_cameras else []
     if misread:  # the images agree with each other, so that the landmarks are wrong
-        told = f"landmarks are misread, and not used, in images of: {', '.join(misread)}"
+        unused = f"landmarks are misread, and not used, in images of: {', '.join(misread)}"
         footage = recorded.footage
-        footage = replace(footage, warnings=(*footage.warnings, told))
+        footage = replace(footage, warnings=(*footage.warnings, unused))
         opened = replace(recorded.opened, footage=footage)
         recorded = replace(recorded, opened=opened, take=without_cameras(take, misread))
         return fit_landmarks(recorded, crew)
@@ -115,8 +115,8 @@ def fit_skin(fitted: FittedHead, crew: Crew) -> FittedHead:
     fitted = _with_images(fitted)
     recorded = fitted.recorded
     fit, misfits = by_images(recorded.opened.head, fitted.fit, recorded.take, crew)
-    fit, told = with_gaze(fit, recorded.take, is_stranger=True)
-    return _in_world(replace(fitted, fit=fit, misfits=misfits, warnings=told))
+    fit, warnings = with_gaze(fit, recorded.take, is_stranger=True)
+    return _in_world(replace(fitted, fit=fit, misfits=misfits, warnings=warnings))
 
 
 def fit_expressions(fitted: FittedHead, person: HeadFit, crew: Crew) -> FittedHead:

@@ -109,7 +109,7 @@ def unseen(draw: Draw, figures: Mapping[str, float]) -> None:
 
 @dataclass(frozen=True)
 class Crew:
-    """Who works on the stages of a tracking, and who is told of it."""
+    """Who works on the stages of a tracking, and who is shown it."""
 
     helpers: Helpers
     report: ReportStage = unreported
@@ -122,7 +122,7 @@ class Crew:
         at: tuple[Stage, int, int],
         keep: bool = False,
     ) -> list[Any]:
-        """The results of `Helpers.map`, whose steps are told; at: a stage, its steps before these,
-        and in all."""
+        """The results of `Helpers.map`, whose steps are reported; at: a stage, its steps before
+        these, and in all."""
         stage, before, total = at
         return self.helpers.map(work, parts, lambda n: self.report(stage, before + n, total), keep)

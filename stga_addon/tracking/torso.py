@@ -70,7 +70,7 @@ class FollowedTorso:
     parameters  timestep -> (E + 18,)
     offsets     timestep -> vertex offsets (V, 3) that shift and bend the torso; empty where it is
                 not shifted
-    motion      how it was decided; None where that cannot be told
+    motion      how it was decided; None where that is not known
     points      where the torso's surface is seen; None where it rides on the head
     """
 
@@ -95,7 +95,7 @@ def follow_torso(
     """The torso's motion in a take of heads whose parameters (E + 18,) are given by timestep.
 
     The torso turns about the neck's joint; the head is not moved. Parameters are returned as they
-    are where the torso rides on the head, and where its motion cannot be told: without masks, in
+    are where the torso rides on the head, and where its motion is not known: without masks, in
     takes shorter than MIN_TIMESTEPS, of models without a neck, and where little of a torso is seen.
     bends: whether cloth may; the model is drawn over it then.
     """
@@ -248,9 +248,9 @@ class _Follower:
         return self._take.pivot(timestep) if self._shifts else np.zeros(3)
 
     def _descended(
-        self, shot: torso_take.TorsoShot, pose: TorsoPose, usual: TorsoPose, plan: Plan
+        self, shot: torso_take.TorsoShot, pose: TorsoPose, expected: TorsoPose, plan: Plan
     ) -> TorsoPose:
-        """The pose after up to so many steps in each level of the plan; usual: the prior's."""
+        """The pose after up to so many steps in each level of the plan; expected: the prior's."""
         for level, steps in plan:
             for _ in range(steps):
                 at, by_pose = self._linearized(shot.timestep, pose)
@@ -263,7 +263,7 @@ class _Follower:
                     rate = slope @ projection_derivative(own.camera, at[rows]) @ by_pose[rows]
                     weight = np.outer(point_weights(residual, level), appearance.CHANNEL_WEIGHTS)
                     terms.append((weight, rate, residual))
-                pose, size = self._moved(pose, usual, terms)
+                pose, size = self._moved(pose, expected, terms)
                 if size < CONVERGED_STEP:
                     break
         return pose
@@ -308,12 +308,14 @@ class _Follower:
         return at, np.concatenate([by_turn, np.broadcast_to(np.eye(3), by_turn.shape)], axis=2)
 
     def _moved(
-        self, pose: TorsoPose, usual: TorsoPose, terms: Sequence[tuple[np.ndarray, ...]]
+        self, pose: TorsoPose, expected: TorsoPose, terms: Sequence[tuple[np.ndarray, ...]]
     ) -> tuple[TorsoPose, float]:
-        """The pose after a Gauss–Newton step, which keeps it near the usual one, and the step's
+        """The pose after a Gauss–Newton step, which keeps it near the expected one, and the step's
         length; terms: weights (M, C), derivatives (M, C, 6) and residuals (M, C)."""
         precision = np.repeat([CHANGE_SIGMA_RAD**-2, CHANGE_SIGMA_M**-2], 3)
-        away = np.concatenate([axis_angle(pose.turn @ usual.turn.T), pose.shift - usual.shift])
+        away = np.concatenate(
+            [axis_angle(pose.turn @ expected.turn.T), pose.shift - expected.shift]
+        )
         matrix = np.diag(precision)
         right = -precision * away
         free = 6 if self._shifts else 3

@@ -24,12 +24,12 @@ from .write_capture import write_capture
 
 @dataclass(frozen=True)
 class TrackingReport:
-    """What a person is told of a tracking; tracking.json has more.
+    """What a tracking reports to a person; tracking.json has more.
 
     median_px        median distance in pixels of all landmarks from those of the fitted head
     scale            meters per unit of the cameras' world
     warnings         one sentence each
-    torso            how the torso moves; None where that cannot be told
+    torso            how the torso moves; None where that is not known
     focal_length     of a single camera without calibration, else None
     """
 

@@ -84,7 +84,7 @@ class Helpers:
 
         work: a function of a module, which calls `step` after each of its steps; parts and results
         can be pickled.
-        done: is told how many steps there were, of all parts together; what it raises ends the
+        done: called with how many steps there were, of all parts together; what it raises ends the
         work. keep: results are arrays by name; each is kept in the folder as soon as there is one,
         and read from there instead of working on an equal part again. Raises what work raises, and
         StgaError where a helper ends before its work does.

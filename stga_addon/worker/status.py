@@ -216,7 +216,7 @@ class StatusWriter:
         self.cancel_requested = (self.folder / CANCEL_FILE).exists()
         now = time.monotonic()
         if progress.stage != self._status.message or now - self._written_s >= STATUS_INTERVAL_S:
-            figures = self._clock.told(progress)
+            figures = self._clock.reported(progress)
             said = {"message": progress.stage, "detail": progress.detail, "figures": figures}
             self._written_s = now
             self._write(0.0, progress=self._clock.share, **said)

@@ -227,7 +227,7 @@ def as_told(series):
     for now, left_s, *longer in series:
         times.append(now)
         figures = {"left_s": left_s, **dict.fromkeys(["longer"] if any(longer) else [], 1.0)}
-        told = clock.told(Progress(figures=lambda figures=figures: figures))
+        told = clock.reported(Progress(figures=lambda figures=figures: figures))
         yield told.get("left_s"), describe_left(told)
 
 

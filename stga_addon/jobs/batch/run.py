@@ -97,7 +97,7 @@ class Batch:
 class BatchRun:
     """Carries out the jobs of a batch that are not finished; each that fails fails alone.
 
-    show: called now and then; say: told in lines what happened.
+    show: called now and then; say: called with lines about what happened.
     """
 
     def __init__(

@@ -19,7 +19,7 @@ PIXELS = TILE * TILE
 
 # Columns of a projected splat, and of the gradient of one (tile, splat) pair. Alpha at the offset
 # (dx, dy) from MEAN is OPACITY · exp(−½ · (PRECISION_X·(dx − SHEAR·dy)² + PRECISION_Y·dy²)). The
-# usual three entries of the inverse covariance lose the small one of a long needle, and with it the
+# known three entries of the inverse covariance lose the small one of a long needle, and with it the
 # sign of the exponent; squares cannot.
 MEAN_X, MEAN_Y, PRECISION_X, SHEAR, PRECISION_Y, OPACITY, RED, GREEN, BLUE = range(9)
 PROJECTED = 9

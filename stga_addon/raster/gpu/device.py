@@ -258,7 +258,7 @@ class _Dispatch(NamedTuple):
 
     def encode(self, compute: Any) -> None:
         """By the library's own functions: its methods look for an error after each call, which
-        takes longer than the call; what is wrong is told when the commands are finished."""
+        takes longer than the call; what is wrong is reported when the commands are finished."""
         lib.wgpuComputePassEncoderSetPipeline(compute, self.pipeline._internal)
         lib.wgpuComputePassEncoderSetBindGroup(compute, 0, self.group._internal, 0, ffi.NULL)
         if len(self.groups) == 2:
@@ -269,7 +269,7 @@ class _Dispatch(NamedTuple):
 
 
 _Command = _Dispatch | Callable[[Any], None]
-"""Or what an encoder is told between dispatches."""
+"""Or what an encoder gets between dispatches."""
 
 
 class Recording:

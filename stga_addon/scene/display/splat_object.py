@@ -337,16 +337,16 @@ def replace_native_splats(objects: Iterable[Any]) -> str:
     would show as nothing; a sentence that says so, "" where there are none."""
     if compat.NATIVE_SPLATS:
         return ""
-    told = []
+    messages = []
     for each in objects:
         if each.get(tags.KIND) != tags.SPLATS or not _is_native(each):
             continue
         if each.library is None:
             set_input(each, splat_nodes.DISPLAY, QUADS)
-            told.append(f"{each.name} is displayed as {QUADS}")
+            messages.append(f"{each.name} is displayed as {QUADS}")
         else:
-            told.append(f"{each.name} is linked, and not displayed")
-    return "; ".join([*told, "native splats need Blender 5.3 or newer"]) if told else ""
+            messages.append(f"{each.name} is linked, and not displayed")
+    return "; ".join([*messages, "native splats need Blender 5.3 or newer"]) if messages else ""
 
 
 def _is_native(splat_object: Any) -> bool:

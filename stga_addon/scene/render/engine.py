@@ -216,7 +216,7 @@ def draw_image(
     layers: list[SceneLayer], view: View, warn: Warn = log_warning
 ) -> ComposedImage | None:
     """A final image drawn by the GPU; None where Blender has no context of it, or the GPU fails,
-    which is told once."""
+    which is reported once."""
     if not has_gpu_context():
         return None
     try:

@@ -80,7 +80,9 @@ def _read_transforms(path: Path, image_size: ImageSize) -> Calibrated:
     if is_file(path) and is_gaussian_cameras(path):
         return read_gaussian_cameras(path), ()
     parts = [read_nerfstudio(own) for own in (transforms_files(path) or [path])]
-    return [shot for shots, _ in parts for shot in shots], sum((told for _, told in parts), ())
+    return [shot for shots, _ in parts for shot in shots], sum(
+        (messages for _, messages in parts), ()
+    )
 
 
 def _exports(suffix: str, is_one: Callable[[Path], bool]) -> Callable[[Path], list[Path]]:
@@ -183,8 +185,8 @@ def find_calibration(root: Path) -> tuple[Path | None, tuple[str, ...]]:
         return None, ()
     unused = [own.relative_to(root).as_posix() for own in (*found[1:], *others) if own != root]
     unused += ["*.xmp"] if root in found[1:] else []
-    told = f"{found[0]}: is the calibration; not used: {listed(unused)}"
-    return found[0], (told,) if unused else ()
+    messages = f"{found[0]}: is the calibration; not used: {listed(unused)}"
+    return found[0], (messages,) if unused else ()
 
 
 def read_calibration(path: Path, image_size: ImageSize) -> Calibrated:
@@ -197,20 +199,20 @@ def read_calibration(path: Path, image_size: ImageSize) -> Calibrated:
             inside, unused = find_calibration(path)
             if inside is None:
                 raise StgaError(f"{path}: holds no calibration; expected {EXPECTED}")
-            shots, told = read_calibration(inside, image_size)
-            return shots, (*unused, *told)
+            shots, messages = read_calibration(inside, image_size)
+            return shots, (*unused, *messages)
     elif not is_file(path):
         raise StgaError(f"{path}: does not exist; expected {EXPECTED}")
     else:
         chosen = [program for program in PROGRAMS if path.suffix.lower() in program.suffixes]
         if not chosen:
             raise StgaError(f"{path}: is no calibration; expected {EXPECTED}")
-    shots, told = chosen[0].read(path, image_size)
+    shots, messages = chosen[0].read(path, image_size)
     if not shots:
         raise StgaError(f"{path}: has no camera with a pose")
     if chosen[0].is_as_stored:
         shots = [replace(shot, is_as_stored=True) for shot in shots]
-    return shots, tuple(f"{path}: {sentence}" for sentence in told)
+    return shots, tuple(f"{path}: {sentence}" for sentence in messages)
 
 
 def _is_unread(path: Path) -> bool:

@@ -52,14 +52,14 @@ LENSES: dict[str, tuple[int, int, int, Callable[..., Lens]]] = {
 """Model -> its number in binary files, numbers of its focal lengths (of both axes, or of each) and
 of its distortion coefficients, and the lens that these make."""
 
-USUAL_FOLDERS = (".", "sparse/0", "sparse", "colmap/sparse/0", "colmap/sparse", "colmap")
+KNOWN_FOLDERS = (".", "sparse/0", "sparse", "colmap/sparse/0", "colmap/sparse", "colmap")
 POSE_WORDS = 9  # Of an image's line before its name
 POINT_WORDS = 3  # Of a point: x, y and its number
 
 
 def colmap_models(folder: Path) -> list[Path]:
     """Folders of models in one of footage, itself and down to three levels below, in the order in
-    which they are to be tried: those of most images first, then `USUAL_FOLDERS`, and last those
+    which they are to be tried: those of most images first, then `KNOWN_FOLDERS`, and last those
     below `distorted`, where 3DGS's convert.py keeps the model of the images before undistortion."""
     found = []
     for path, names, _ in os.walk(folder):
@@ -71,8 +71,8 @@ def colmap_models(folder: Path) -> list[Path]:
 
     def order(own: Path) -> tuple[bool, int, int, list[tuple[int, str]]]:
         name = own.as_posix()
-        usual = next((n for n, known in enumerate(USUAL_FOLDERS) if name == known), None)
-        rank = len(USUAL_FOLDERS) if usual is None else usual
+        known_folder = next((n for n, known in enumerate(KNOWN_FOLDERS) if name == known), None)
+        rank = len(KNOWN_FOLDERS) if known_folder is None else known_folder
         return is_distorted(own), -counts[own], rank, natural_order(name)
 
     return [folder / own for own in sorted(found, key=order)]
@@ -80,9 +80,9 @@ def colmap_models(folder: Path) -> list[Path]:
 
 def incomplete_models(folder: Path) -> list[Path]:
     """Folders of one of footage that hold one of the two files of a model, as text or binary."""
-    usual = sorted({folder, *folder.glob("sparse"), *folder.glob("sparse/*")})
+    known_folder = sorted({folder, *folder.glob("sparse"), *folder.glob("sparse/*")})
     names = [f"{name}{suffix}" for name in ("cameras", "images") for suffix in (".bin", ".txt")]
-    damaged = (own for own in usual if not model_suffix(own))
+    damaged = (own for own in known_folder if not model_suffix(own))
     return [own / name for own in damaged for name in names if is_file(own / name)]
 
 

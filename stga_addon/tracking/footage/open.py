@@ -152,9 +152,9 @@ def _calibrated(
     sources: Sources, calibration: Path, shots: list[Shot], frames: FrameRange
 ) -> Footage:
     timed = any(shot.timestep is not None for shot in shots)
-    told: tuple[str, ...] = ()
+    messages: tuple[str, ...] = ()
     if not timed:
-        shots, told = _one_a_camera(shots, calibration)
+        shots, messages = _one_a_camera(shots, calibration)
     names = [] if timed else sequence_names(sources, (shot.label for shot in shots))
     if any(names):  # a folder of images or a video for each camera
         found: dict[str, Shot] = {}
@@ -178,7 +178,7 @@ def _calibrated(
         used += [path for shot in shots for path in calibration_images(sources, shot.label)]
         footage = _rig(sources, found, sequences, frames)
         unused = _unused(sources, calibration, used)
-        return replace(footage, warnings=(*told, *footage.warnings, *unused))
+        return replace(footage, warnings=(*messages, *footage.warnings, *unused))
     if frames.offsets or frames.sync != "none":
         raise StgaError(
             f"{calibration}: lists images, which offsets do not apply to; expected none"
@@ -186,12 +186,12 @@ def _calibrated(
     fps = next((shot.fps for shot in shots if timed and shot.fps is not None), None)
     if not timed:
         shots, sentences = _with_images(shots, sources)
-        told += sentences
+        messages += sentences
     unused = _unused(sources, calibration, [shot.image for shot in shots if shot.image is not None])
     timesteps = frames.chosen(sorted({shot.timestep or 0 for shot in shots}))
     chosen = [shot for shot in shots if (shot.timestep or 0) in timesteps]
     cameras, sentences = _with_sentences(str(sources.root), _listed_cameras(chosen, calibration))
-    return Footage(sources.root, cameras, fps, warnings=(*told, *sentences, *unused))
+    return Footage(sources.root, cameras, fps, warnings=(*messages, *sentences, *unused))
 
 
 def _unused(sources: Sources, calibration: Path, used: Iterable[Path]) -> tuple[str, ...]:
@@ -266,10 +266,10 @@ def _rig(
     videos = [own for own in sequences.values() if isinstance(own, Video)]
     warnings = [warning for video in videos for warning in video.sentences]
     recorded, fps, sentences = synchronized(sequences, shots, sources, frames)
-    cameras, told = _with_sentences(
+    cameras, messages = _with_sentences(
         str(sources.root), (_camera(name, shots[name], recorded[name]) for name in shots)
     )
-    return Footage(sources.root, cameras, fps, warnings=(*warnings, *sentences, *told))
+    return Footage(sources.root, cameras, fps, warnings=(*warnings, *sentences, *messages))
 
 
 def _as_calibrated(sequence: Sequence, shot: Shot) -> Sequence:
@@ -284,9 +284,9 @@ def _as_calibrated(sequence: Sequence, shot: Shot) -> Sequence:
 def _camera(name: str, shot: Shot, frames: Frames) -> tuple[FootageCamera, tuple[str, ...]]:
     """The camera, and sentences about what its frames are other than its calibration says. Raises
     StgaError for frames of another shape."""
-    told: tuple[str, ...] = ()
+    messages: tuple[str, ...] = ()
     if isinstance(frames, ImageFrames) and shot.is_as_stored:
-        frames, told = _as_stored(shot, frames)
+        frames, messages = _as_stored(shot, frames)
     width = shot.camera.width
     height = shot.camera.height
     sizes = dict(frames.sizes())
@@ -298,14 +298,16 @@ def _camera(name: str, shot: Shot, frames: Frames) -> tuple[FootageCamera, tuple
             views = {t: replace(view, camera=scaled) for t, view in frames.views.items()}
             frames = ImageFrames(views)
         both = f"{first[0]} x {first[1]} pixels, the calibration of {width} x {height}"
-        told += (f"images are of {both}, which is scaled by {first[0] / width:.4g}",)
+        messages += (f"images are of {both}, which is scaled by {first[0] / width:.4g}",)
     for path, size in sizes.items():
         if size != (shot.camera.width, shot.camera.height):
             raise StgaError(
                 f"{path}: has {size[0]} x {size[1]} pixels, but {shot.where} has {width} x {height}"
             )
     found = undistortion(shot.camera, shot.lens, shot.where)
-    return FootageCamera(name, shot.camera if found is None else found.camera, frames, found), told
+    return FootageCamera(
+        name, shot.camera if found is None else found.camera, frames, found
+    ), messages
 
 
 def _as_stored(shot: Shot, frames: ImageFrames) -> tuple[ImageFrames, tuple[str, ...]]:
@@ -331,8 +333,8 @@ def _with_sentences(
 ) -> tuple[tuple[FootageCamera, ...], tuple[str, ...]]:
     """Cameras, and each sentence about them once."""
     listed = list(cameras)
-    told = dict.fromkeys(sentence for _, own in listed for sentence in own)
-    return tuple(camera for camera, _ in listed), tuple(f"{where}: {each}" for each in told)
+    messages = dict.fromkeys(sentence for _, own in listed for sentence in own)
+    return tuple(camera for camera, _ in listed), tuple(f"{where}: {each}" for each in messages)
 
 
 def _single_camera(sources: Sources, frames: FrameRange, focal: float | None) -> Footage:
@@ -416,8 +418,8 @@ def _with_images(shots: list[Shot], sources: Sources) -> tuple[list[Shot], tuple
                 own = replace(shot, image=image, mask=sources.mask_of(image), camera_name=label)
                 found.append(replace(own, timestep=order[moment]))
         if found:
-            told = f"images are of {len(shots)} cameras at {len(order)} moments, by their names"
-            return found, (f"{sources.root}: {told}",) if len(order) > 1 else ()
+            messages = f"images are of {len(shots)} cameras at {len(order)} moments, by their names"
+            return found, (f"{sources.root}: {messages}",) if len(order) > 1 else ()
     return _with_stills(shots, sources), ()
 
 

@@ -135,14 +135,14 @@ def synchronized(
 def _frames_per_second(sequences: Mapping[str, Sequence]) -> float | None:
     rates = {name: own.fps for name, own in sequences.items() if isinstance(own, Video)}
     rates = {name: rate for name, rate in rates.items() if 0 < rate < FPS_LIMIT}
-    first, usual = next(iter(rates.items()), ("", None))
+    first, common = next(iter(rates.items()), ("", None))
     for name, rate in rates.items():
-        if usual is not None and abs(rate - usual) > 0.01 * usual:
+        if common is not None and abs(rate - common) > 0.01 * common:
             raise StgaError(
                 f"The video of camera {name} has {rate:g} frames a second, that of camera "
-                f"{first} {usual:g}; expected one rate"
+                f"{first} {common:g}; expected one rate"
             )
-    return usual
+    return common
 
 
 def _common_range(

@@ -11,8 +11,8 @@ from .sources import find_sources, sequence_files
 
 def takes_in(path: Path) -> list[Path]:
     """The videos and folders of images in a folder, each a take; a folder of one camera or of a
-    calibrated rig, and a file, is a take itself. Raises StgaError where they cannot be told
-    apart."""
+    calibrated rig, and a file, is a take itself. Raises StgaError where they cannot be
+    distinguished."""
     if not is_folder(path):
         return [path]
     root = Path(realpath(path))

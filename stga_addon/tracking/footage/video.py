@@ -392,8 +392,8 @@ def _timed(
         fps = (len(times) - 1) / ((times[-1] - times[0]) * time_base)
         agreeing = (rate for rate in rates if abs(rate - fps) <= RATE_TOLERANCE * fps)
         return tuple(range(len(times))), next(agreeing, fps), ()
-    usual = durations[durations <= longest]
-    fps = 1 / (time_base * float(usual.mean()))
+    typical = durations[durations <= longest]
+    fps = 1 / (time_base * float(typical.mean()))
     timesteps = np.round((np.array(times) - times[0]) * time_base * fps).astype(int)
     low, high = (1000 * time_base * float(ticks) for ticks in (durations.min(), durations.max()))
     missing = timesteps[-1] + 1 - len(np.unique(timesteps))

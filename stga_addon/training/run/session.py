@@ -189,8 +189,8 @@ def train_more(
 
 
 def _usable(capture: Capture) -> Capture:
-    usable, told = with_training_views(capture)
-    for sentence in told:
+    usable, warnings = with_training_views(capture)
+    for sentence in warnings:
         _log.warning("%s", sentence)
     return usable
 
@@ -497,8 +497,8 @@ class _Session:
         def stops(done: int, total: int) -> bool:
             if seconds is not None and tracking is not self.trainer.tracking:
                 self.fitting_s = seconds * (1 - done / total)
-            told = self._tell(f"Tracking by the avatar: {done} of {total}")
-            return told or bool(self.interrupts)
+            is_stopped = self._tell(f"Tracking by the avatar: {done} of {total}")
+            return is_stopped or bool(self.interrupts)
 
         settings = self.run.settings
         trained = TrainedAvatar(avatar, settings)
@@ -532,9 +532,9 @@ class _Session:
             quality, is_kept = self.evaluator.evaluate(render, perceptual)
         self._require_folder()
         if is_kept:
-            for name, aside in SET_ASIDE.items() if sets_aside else ():
+            for name, moved in SET_ASIDE.items() if sets_aside else ():
                 if (self.folder / name).exists():
-                    os.replace(self.folder / name, self.folder / aside)
+                    os.replace(self.folder / name, self.folder / moved)
             self._write_avatar()
         return {**quality, "evaluation_s": round(perf_counter() - begin, 3)}
 
@@ -738,9 +738,9 @@ def _resume(capture: Capture, folder: Path, run: Run, report: Report) -> _Sessio
     session.tracking_gain = found.tracking_gain
     evaluator.lines = cut_metrics(folder, found.lines)
     evaluator.count = found.evaluations
-    for name, aside in SET_ASIDE.items():
-        if (folder / aside).exists():
-            os.replace(folder / aside, folder / name)
+    for name, moved in SET_ASIDE.items():
+        if (folder / moved).exists():
+            os.replace(folder / moved, folder / name)
     if not (folder / AVATAR).exists():
         evaluator.keeps_latest = True  # those before are lost
     folders.write_run(folder, run)  # capture, model and device may be others now
