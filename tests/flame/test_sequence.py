@@ -158,6 +158,30 @@ def test_plain_expression_and_pose_files(tmp_path, tiny_flame):
         read_motion(_write(tmp_path / "other.npz", {"xyz": np.zeros((4, 3))}), tiny_flame)
 
 
+def test_a_face_of_a_body(tmp_path, tiny_flame):
+    """Catches a body's joints taken for the head's: BEAT2's files, as its trainers write them, hold
+    SMPL-X's 55 joints, among them the head (15), the jaw (22) and the eyes."""
+    body = default_rng(21).normal(0, 0.2, (3, 165))
+    arrays = {
+        "betas": np.zeros(8),
+        "poses": body,
+        "expressions": np.ones((3, 4)),
+        "trans": np.ones((3, 3)),
+        "model": np.array("smplx2020"),
+        "gender": np.array("neutral"),
+        "mocap_frame_rate": np.array(30),
+    }
+    motion = read_motion(_write(tmp_path / "beat.npz", arrays), tiny_flame)
+    frame = motion.frame(1)
+    joints = body[1].reshape(55, 3)
+    assert_array_equal(frame.neck_pose, joints[15])
+    assert_array_equal(frame.jaw_pose, joints[22])
+    assert_array_equal(frame.eyes_pose, joints[23:25].ravel())
+    assert_array_equal(frame.expr, np.ones(4))
+    assert not frame.rotation.any()
+    assert any("SMPL-X" in text for text in motion.warnings)
+
+
 def _matrices(vectors):
     return Rotation.from_rotvec(vectors.reshape(-1, 3)).as_matrix()
 
