@@ -10,7 +10,7 @@ from collections.abc import Callable, Collection, Mapping
 from dataclasses import field
 from functools import cache, wraps
 from pathlib import Path
-from typing import Any, ParamSpec, TypeVar, Union, get_args, get_origin, get_type_hints
+from typing import Any, ClassVar, ParamSpec, TypeVar, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
 
@@ -116,7 +116,11 @@ def complaint(name: str, expected: str, value: Any) -> str:
 @cache
 def type_hints(kind: Any) -> dict[str, Any]:
     hints = get_type_hints(kind)
-    return {name: hint for name, hint in hints.items() if hint is not dataclasses.KW_ONLY}
+    return {
+        name: hint
+        for name, hint in hints.items()
+        if hint is not dataclasses.KW_ONLY and get_origin(hint) is not ClassVar
+    }
 
 
 def alternatives(hint: Any) -> tuple[Any, ...]:
@@ -222,7 +226,8 @@ def from_json(
 ) -> Any:
     """A dataclass (or one of several: a union) from plain values of JSON and the arrays beside
     them. Raises StgaError naming the field, after `source`, unless each object has exactly the
-    fields of its dataclass and `validate` allows them."""
+    fields of its dataclass, of which LATER_FIELDS, with which a later version began, may be
+    missing, and `validate` allows them."""
     try:
         value = _parsed(kind, values, "", arrays or {})
         validate(value)
@@ -248,13 +253,16 @@ def _parsed(hint: Any, value: Any, where: str, arrays: Mapping[str, np.ndarray])
             chosen = names[named]
             value = {name: item for name, item in value.items() if name != KIND}
         hints = type_hints(chosen)
-        if not isinstance(value, dict) or value.keys() != hints.keys():
-            differing = hints.keys() ^ (value.keys() if isinstance(value, dict) else {})
+        known = set(hints)
+        if isinstance(value, dict):  # a file of an earlier version
+            known -= {*getattr(chosen, "LATER_FIELDS", ())} - value.keys()
+        if not isinstance(value, dict) or value.keys() != known:
+            differing = known ^ (value.keys() if isinstance(value, dict) else {})
             fields = ", ".join(sorted(map(str, differing)))[:200]
             prefix = f"{where}: " if where else ""
             raise StgaError(f"{prefix}fields are missing or unknown ({fields})")
         paths = {name: _joined(where, name) for name in hints}
-        return chosen(**{n: _parsed(hints[n], value[n], paths[n], arrays) for n in hints})
+        return chosen(**{n: _parsed(hints[n], value[n], paths[n], arrays) for n in known})
     if isinstance(value, str) and Path in kinds and str not in kinds:
         try:
             return usable_path(value)

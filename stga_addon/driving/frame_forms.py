@@ -52,7 +52,7 @@ def read_lines(path: Path, text: str) -> list[Any]:
     for number, line in enumerate(lines, start=1):
         try:
             frames.append(json.loads(line))
-        except ValueError as error:
+        except (ValueError, RecursionError) as error:
             if number < len(lines) or not frames:
                 raise StgaError(f"{path}: line {number}: is not valid JSON ({error})") from error
     return frames

@@ -8,7 +8,7 @@ import numpy as np
 
 from ..avatar.splats import SH_C0, Splats, in_world
 from ..errors import StgaError
-from ..files import read_bytes
+from ..files import is_folder, read_bytes
 from ..progress import Say, warn
 from .ply import MAX_SPLAT_BYTES, READ_FILES, read_ply
 from .spz import read_spz
@@ -53,7 +53,7 @@ def latest_iteration(folder: Path) -> Path | None:
     """The splats of the last iteration in a folder of 3D Gaussian Splatting's output, or of tools
     that write as it does; None for others."""
     found = {}
-    for path in folder.glob(GAUSSIAN_OUTPUT):
+    for path in folder.glob(GAUSSIAN_OUTPUT) if is_folder(folder) else ():
         number = path.parent.name.rpartition("_")[2]
         if number.isascii() and number.isdigit():
             found[int(number)] = path

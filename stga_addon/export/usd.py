@@ -82,7 +82,7 @@ def find_usd() -> Any:
 def _lacks_usd(path: Path, who: str) -> StgaError:
     return StgaError(
         f"{path}: USD files need the package usd-core, which {who}; install it in the Python that "
-        "trains (pip install usd-core)"
+        "trains"
     )
 
 

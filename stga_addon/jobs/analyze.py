@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from time import monotonic
+from typing import ClassVar
 
 from ..capture.open import open_capture, repair_capture
 from ..format import format_duration
@@ -51,6 +52,7 @@ class Analyze(_OfCapture):
     effects: Mapping[str, str] | None = like(TrainingSettings, "effects", needs=(CAPTURED,))
     device: str = like(Train, "device", needs=(CAPTURED,))
     timed: bool = False
+    LATER_FIELDS: ClassVar[tuple[str, ...]] = ("repair",)
     repair: bool = like(Train, "repair", needs=(CAPTURED,))
 
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from time import perf_counter
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
@@ -201,6 +201,7 @@ class MakeAvatar:
 
     track: Track
     train: Train
+    LATER_FIELDS: ClassVar[tuple[str, ...]] = ("takes",)
     takes: tuple[Path, ...] = ()
 
     @property
@@ -618,7 +619,7 @@ def extend(request: Extend, report: Report, say: Say) -> Written:
     captures = list[Path]()
     for path in request.captures:
         captures.append(path)
-        if is_footage(path, request.flame):
+        if is_footage(path):
             out = captures[-1] = request.run.with_name(f"{request.run.name}_{path.stem}")
             say(f"take: {path.name} is tracked by the avatar of {request.parent} into {out}")
             if not is_written(out):
@@ -636,19 +637,16 @@ def _tell_half(report: Report, begin: float, progress: Progress) -> bool:
     return report(replace(progress, share=begin + TRACKING_SHARE * progress.share))
 
 
-def is_footage(path: Path, flame: Path | None) -> bool:
+def is_footage(path: Path) -> bool:
     """Whether a path is that of a video or of one camera's images, and not of a capture."""
-    from ..capture.open import open_capture
+    from ..capture.transforms import transforms_files
     from ..tracking.footage.calibrations import find_calibration
     from ..tracking.footage.sources import find_sources, is_video
 
     if path.is_file():
         return is_video(path)
-    if not path.is_dir() or find_calibration(path)[0] is not None:
+    is_capture = bool(transforms_files(path)) or (path / "meshes").is_dir()
+    if not path.is_dir() or is_capture or find_calibration(path)[0] is not None:
         return False
-    try:
-        open_capture(path, flame)
-    except StgaError:
-        sources = find_sources(path)
-        return bool(sources.videos or sources.folders)
-    return False
+    sources = find_sources(path)
+    return bool(sources.videos or sources.folders)

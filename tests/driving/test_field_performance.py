@@ -267,7 +267,9 @@ def test_what_is_no_motion(tmp_path, capsys, out):
     (tmp_path / "take.bvh").write_text("HIERARCHY\nROOT Hips\n{\n}\nMOTION\n")
     (tmp_path / "face.mp4").touch()
     head = np.zeros((4, 3)), np.zeros((4, 3), int)
-    expected = ".csv, .tsv, .json, .txt, .npz, the folder of a take or of a capture"
+    expected = (
+        ".csv, .tsv, .json, .jsonl, .ndjson, .txt, .npz, the folder of a take or of a capture"
+    )
     for name, sentence in (
         ("take.bvh", f"take.bvh: is no motion; expected {expected}"),
         ("none.bvh", "none.bvh: does not exist"),

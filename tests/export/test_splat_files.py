@@ -134,13 +134,13 @@ def bomb():
     [
         (b"hello\n", "is not a readable SPZ file"),
         (packed(3)[:-20], "is not a readable SPZ file"),
-        (b"NGSP\4\0\0\0\1\0\0\0\0\0\0\0", "version 4; read are 1 to 3"),
+        (b"NGSP\5\0\0\0\1" + bytes(40), "version 5; read are 1 to 4"),
         (gzip.compress(b"NGSP\3\0\0\0\xff\xff\xff\xff" + bytes(4), mtime=0), "4294967295 splats"),
         (gzip.compress(b"NGSP\3\0\0\0\xa0\x86\1" + bytes(14), mtime=0), "9 bytes of 100000"),
         (packed(2).replace(b"\x00", b"\r\n"), "SPZ file"),
         (gzip.compress(bomb(), mtime=0), "1000000 splats in 63... bytes"),
     ],
-    ids=["text", "truncated", "version 4", "without end", "too few bytes", "as text", "bomb"],
+    ids=["text", "truncated", "version 5", "without end", "too few bytes", "as text", "bomb"],
 )
 def test_broken_spz(tmp_path, content, sentence):
     """Catches a traceback, and memory allocated on the word of a header."""

@@ -210,7 +210,7 @@ def test_a_lens_that_nothing_tells_is_that_of_the_avatars_camera(tmp_path, head)
     likely = camera_from_gl(np.eye(4), (2 * width, 2 * height), (600, 600), (width, height))
     inputs = footage, tmp_path / "head.npz", tmp_path / "out"
     fit = HeadFit(head, np.zeros(0), {}, HERE)
-    known = KnownPerson(fit, lambda mesh, camera: np.zeros((1, 1, 3), np.uint8), likely)
+    known = KnownPerson(fit, likely, lambda mesh, camera: np.zeros((1, 1, 3), np.uint8))
     found = track(*inputs, TrackingOptions(tmp_path / "points", mattes=False, person=known))
     assert (found.focal_length.source, found.focal_length.pixels) == ("avatar", 300)
     assert any("focal length is an estimate" in warning for warning in found.warnings)
