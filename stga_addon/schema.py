@@ -257,7 +257,7 @@ def _parsed(hint: Any, value: Any, where: str, arrays: Mapping[str, np.ndarray])
         if isinstance(value, dict):  # a file of an earlier version
             known -= {*getattr(chosen, "LATER_FIELDS", ())} - value.keys()
         if not isinstance(value, dict) or value.keys() != known:
-            differing = known ^ (value.keys() if isinstance(value, dict) else {})
+            differing = known ^ set(value if isinstance(value, dict) else ())
             fields = ", ".join(sorted(map(str, differing)))[:200]
             prefix = f"{where}: " if where else ""
             raise StgaError(f"{prefix}fields are missing or unknown ({fields})")

@@ -124,7 +124,8 @@ class AvatarTracking:
         """Some of the timesteps."""
         kept = [row for row, timestep in enumerate(self.timesteps) if timestep in timesteps]
         arrays = {name: own for name, own in vars(self).items() if name != "timesteps"}
-        arrays = {n: own[kept] if len(own) else own for n, own in arrays.items()}
+        count = len(self.timesteps)
+        arrays = {n: own[kept] if len(own) == count else own for n, own in arrays.items()}
         return AvatarTracking(tuple(self.timesteps[row] for row in kept), **arrays)
 
     def smoothed(self, model: FlameModel) -> "AvatarTracking":
