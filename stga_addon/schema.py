@@ -10,7 +10,7 @@ from collections.abc import Callable, Collection, Mapping
 from dataclasses import field
 from functools import cache, wraps
 from pathlib import Path
-from typing import Any, ClassVar, ParamSpec, TypeVar, Union, get_args, get_origin, get_type_hints
+from typing import Any, ParamSpec, TypeVar, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
 
@@ -116,11 +116,7 @@ def complaint(name: str, expected: str, value: Any) -> str:
 @cache
 def type_hints(kind: Any) -> dict[str, Any]:
     hints = get_type_hints(kind)
-    return {
-        name: hint
-        for name, hint in hints.items()
-        if hint is not dataclasses.KW_ONLY and get_origin(hint) is not ClassVar
-    }
+    return {name: hint for name, hint in hints.items() if hint is not dataclasses.KW_ONLY}
 
 
 def alternatives(hint: Any) -> tuple[Any, ...]:

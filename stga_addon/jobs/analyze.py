@@ -5,7 +5,6 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from time import monotonic
-from typing import ClassVar
 
 from ..capture.open import open_capture, repair_capture
 from ..format import format_duration
@@ -52,7 +51,7 @@ class Analyze(_OfCapture):
     effects: Mapping[str, str] | None = like(TrainingSettings, "effects", needs=(CAPTURED,))
     device: str = like(Train, "device", needs=(CAPTURED,))
     timed: bool = False
-    LATER_FIELDS: ClassVar[tuple[str, ...]] = ("repair",)
+    LATER_FIELDS = ("repair",)
     repair: bool = like(Train, "repair", needs=(CAPTURED,))
 
 

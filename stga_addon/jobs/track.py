@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from time import perf_counter
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -201,7 +201,7 @@ class MakeAvatar:
 
     track: Track
     train: Train
-    LATER_FIELDS: ClassVar[tuple[str, ...]] = ("takes",)
+    LATER_FIELDS = ("takes",)
     takes: tuple[Path, ...] = ()
 
     @property

@@ -4,7 +4,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -66,7 +66,7 @@ class Train:
         metavar="{auto,cpu,gpu,gpu:NAME}",
     )
     selection: Selection | None = None
-    LATER_FIELDS: ClassVar[tuple[str, ...]] = ("takes", "repair")
+    LATER_FIELDS = ("takes", "repair")
     takes: tuple[Path, ...] = ()
     repair: bool = option(
         "if the mesh misses the images, read the capture in the way that fits, from now on", False
