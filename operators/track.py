@@ -215,7 +215,7 @@ class AvatarFromVideo(Action, bpy.types.Operator, FileImport):
     )
     focal: options.field(Track, "focal", "Focal Length", options=ONCE)
     take: options.field(Track, "take", labels=TAKE_LABELS, options=ONCE)
-    python: options.python("tracks and trains", options={*ONCE, "HIDDEN"})
+    python: options.python("tracks and trains", options=UNSEEN)
     filter_glob: options.file_filter(*VIDEO_SUFFIXES)
 
     def invoke(self, context: Any, event: Any) -> set[str]:

@@ -15,8 +15,10 @@ MAX_NAMES = 6
 """Expressions that are named, the strongest first."""
 SIDES = ("Left", "Right", "_L", "_R")
 """Ends of names of expressions of one side."""
+FACE = ("left_eye", "right_eye", "nose", "mouth")
+"""Regions that expressions move."""
 STILL_MM = 1.0
-"""Median over timesteps of how far the face moves at most, below which it has one expression."""
+"""Difference between timesteps of how far the face moves, below which it has one expression."""
 
 
 def describe_filmed(capture: Capture) -> str:
@@ -64,9 +66,13 @@ def _height(degrees: float) -> str:
 
 
 def _expressions(capture: Capture, timesteps: Sequence[int]) -> str:
+    """The expressions of some timesteps, by how far eyes, nose and mouth move: shoulders do too."""
+    known = [capture.regions[name] for name in FACE if name in capture.regions]
+    of_face = np.unique(capture.faces[np.any(known, axis=0)] if known else capture.faces)
     moved = []
     for timestep in timesteps:
-        away = capture.expression_mesh(timestep, "head") - capture.neutral
+        mesh = capture.expression_mesh(timestep, "head")
+        away = (mesh - capture.neutral)[of_face]
         moved.append(1000 * float(np.linalg.norm(away - np.median(away, axis=0), axis=1).max()))
     if len(timesteps) < 2 or max(moved) - min(moved) < STILL_MM:
         return "one expression"

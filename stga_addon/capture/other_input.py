@@ -35,7 +35,7 @@ OTHER_FILES = {
     ".pkl": ("a FLAME model or its masks", "is given with --flame, beside a capture"),
     ".npz": ("a motion", "moves an avatar: stga render RUN --motion FILE --video OUT.mp4"),
     **dict.fromkeys(
-        (".heic", ".heif", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".mkv4"),
+        (".heic", ".heif", ".dng", ".cr2", ".cr3", ".nef", ".arw"),
         ("a photo", "is not read; convert it to JPEG or PNG"),
     ),
     **dict.fromkeys(

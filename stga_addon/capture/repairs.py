@@ -32,8 +32,8 @@ MIN_IN_IMAGES = 0.9
 """Fraction of the mesh within images that have no masks, where a way of reading fits."""
 MAX_BESIDE_IMAGES = 0.1
 """Fraction of it up to which images without masks do not show the mesh."""
-MAX_FOREGROUND_OF_MISS = 0.05
-"""Fit up to which a capture of which no way of reading fits is reported."""
+MAX_FIT_OF_MISS = 0.05
+"""Fit of the capture as it is written up to which a warning says that no way of reading fits."""
 CENTIMETERS = (10.0, 99.0)
 """Extents of a head's mesh, with its shoulders, in centimeters."""
 MILLIMETERS = (100.0, 990.0)
@@ -177,7 +177,7 @@ def find_repair(capture: Capture) -> tuple[str | None, str | None]:
         about = REPAIRS[best].about
         cure = f"with --repair, it is read so ({best})"
         return best, f"{capture.root}: {problem}; {about}, by which they fit: {cure}"
-    if now <= MAX_FOREGROUND_OF_MISS:
+    if now <= MAX_FIT_OF_MISS:
         tried = "neither other axes, inverse matrices, a turn by 90° nor inverted masks fit better"
         return None, f"{capture.root}: {problem}, and {tried}: check transform_matrix and meshes"
     return None, None

@@ -1,13 +1,13 @@
 """Other forms in which programs write frames of named weights: keyed by time, a row a shape, lines
 of JSON, Face Cap's text."""
 
-import json
 import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from ..errors import StgaError
+from ..files import parse_json
 from .performance import arkit_name
 
 FACE_CAP_COLUMNS = ("k", "time_ms", "px", "py", "pz", "rx", "ry", "rz", "lx", "ly", "rx2", "ry2")
@@ -51,7 +51,7 @@ def read_lines(path: Path, text: str) -> list[Any]:
     frames = []
     for number, line in enumerate(lines, start=1):
         try:
-            frames.append(json.loads(line))
+            frames.append(parse_json(line.encode()))
         except (ValueError, RecursionError) as error:
             if number < len(lines) or not frames:
                 raise StgaError(f"{path}: line {number}: is not valid JSON ({error})") from error

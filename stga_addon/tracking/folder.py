@@ -196,7 +196,7 @@ class FocalLength:
 
 def describe_focal_length(capture: Path) -> str:
     """`FocalLength.description` of what the report of a tracked capture says; "" where it has no
-    report, or from which calibration it is. Raises StgaError where the report is malformed."""
+    report, or where it is from a calibration. Raises StgaError where the report is malformed."""
     report = _read_report(capture)
     if report.get(FOCAL_KEYS["pixels"]) is None:
         return ""

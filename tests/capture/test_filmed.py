@@ -1,5 +1,7 @@
 """What a capture filmed, in words."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from stga_addon.capture.filmed import describe_filmed, filmed_directions
@@ -20,6 +22,20 @@ def test_directions_and_expressions(tmp_path):
     order = np.argsort(across)
     np.testing.assert_allclose(across[order], AZIMUTHS_DEG, atol=4)
     np.testing.assert_allclose(up[order], ELEVATIONS_DEG, atol=6)
-    told = describe_filmed(capture)
-    assert " on its right to " in told
-    assert "mouthSmile" in told
+    described = describe_filmed(capture)
+    assert " on its right to " in described
+    assert "mouthSmile" in described
+
+
+def test_shoulders_are_no_expression(tmp_path):
+    """Catches a torso that turns below the head as a face that moves by decimeters."""
+    unpack_capture(tmp_path)
+    capture = open_capture(tmp_path)
+    lowest = capture.neutral[:, 1] < np.quantile(capture.neutral[:, 1], 0.05)
+    shift = {timestep: 0.1 * number for number, timestep in enumerate(capture.timesteps)}
+
+    def shrugged(timestep, pose):
+        away = np.where(lowest, shift[timestep], 0)[:, None] * [0, 1, 0]
+        return capture.neutral + away
+
+    assert describe_filmed(replace(capture, expression_mesh=shrugged)).endswith("one expression")

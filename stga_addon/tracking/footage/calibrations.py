@@ -80,9 +80,8 @@ def _read_transforms(path: Path, image_size: ImageSize) -> Calibrated:
     if is_file(path) and is_gaussian_cameras(path):
         return read_gaussian_cameras(path), ()
     parts = [read_nerfstudio(own) for own in (transforms_files(path) or [path])]
-    return [shot for shots, _ in parts for shot in shots], sum(
-        (messages for _, messages in parts), ()
-    )
+    messages = tuple(message for _, own in parts for message in own)
+    return [shot for shots, _ in parts for shot in shots], messages
 
 
 def _exports(suffix: str, is_one: Callable[[Path], bool]) -> Callable[[Path], list[Path]]:
@@ -185,8 +184,8 @@ def find_calibration(root: Path) -> tuple[Path | None, tuple[str, ...]]:
         return None, ()
     unused = [own.relative_to(root).as_posix() for own in (*found[1:], *others) if own != root]
     unused += ["*.xmp"] if root in found[1:] else []
-    messages = f"{found[0]}: is the calibration; not used: {listed(unused)}"
-    return found[0], (messages,) if unused else ()
+    message = f"{found[0]}: is the calibration; not used: {listed(unused)}"
+    return found[0], (message,) if unused else ()
 
 
 def read_calibration(path: Path, image_size: ImageSize) -> Calibrated:

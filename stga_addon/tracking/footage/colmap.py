@@ -80,9 +80,9 @@ def colmap_models(folder: Path) -> list[Path]:
 
 def incomplete_models(folder: Path) -> list[Path]:
     """Folders of one of footage that hold one of the two files of a model, as text or binary."""
-    known_folder = sorted({folder, *folder.glob("sparse"), *folder.glob("sparse/*")})
+    folders = sorted({folder, *folder.glob("sparse"), *folder.glob("sparse/*")})
     names = [f"{name}{suffix}" for name in ("cameras", "images") for suffix in (".bin", ".txt")]
-    damaged = (own for own in known_folder if not model_suffix(own))
+    damaged = (own for own in folders if not model_suffix(own))
     return [own / name for own in damaged for name in names if is_file(own / name)]
 
 
