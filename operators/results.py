@@ -33,7 +33,7 @@ from ..stga_addon.scene.record import (
 from ..stga_addon.tracking.folder import is_flame
 from ..stga_addon.training.run.folder import AVATAR, TRACKING, has_run, read_run
 from ..stga_addon.worker.status import WorkerState
-from .common import is_head
+from .common import capture_source, is_head
 
 Answer = SliceBuilt | Shown | None
 """What a function of `SHOW` returns; None: the result is still being read."""
@@ -363,6 +363,11 @@ def show_tracked(scene: Any, capture: Path, picture: Path) -> None:
 def _fill_effects(scene: Any, state: RequestState) -> Answer:
     settings = scene.stga
     found: Any = read_result(state.folder_path)
+    if found.repaired:
+        capture, model, point = capture_source(request_head(scene, state))
+        source = {"directory": str(capture), "flame": str(model or ""), "principal_point": point}
+        _operate(scene, bpy.ops.stga.import_capture, **source)
+    settings.misfit = found.misfit
     settings.preset_timing = json.dumps(dict(found.seconds))
     settings.effects.clear()
     for decision in found.plan:

@@ -27,8 +27,10 @@ ALL_FRAMES = {"default": -1, "min": -1, "options": ONCE}
 
 
 class AnalyzeCapture(Action, bpy.types.Operator):
-    """Find out which effects the capture calls for, and how long each preset takes on this
-    machine"""
+    """Find out which effects the capture calls for, how long each preset takes on this machine, and
+    whether the mesh fits its images"""
+
+    repair: options.field(jobs.Train, "repair", options=ONCE)
 
     needs = (idle(Kind.ANALYSIS), needs_head)
 
@@ -36,7 +38,8 @@ class AnalyzeCapture(Action, bpy.types.Operator):
         settings = context.scene.stga
         source = capture_source(head_of(context))
         effects = dict(map(parse_choice, chosen_effects(settings)))
-        request = Analyze(*source, effects, settings.device, timed=True)
+        timed = not self.repair
+        request = Analyze(*source, effects, settings.device, timed=timed, repair=self.repair)
         start(context.scene, request, training_python(context))
 
 

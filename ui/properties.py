@@ -39,6 +39,7 @@ def _choose_head(settings: Any, context: Any) -> None:
     settings.selected_frames.clear()  # rows of another head
     settings.effects.clear()
     settings.preset_timing = ""
+    settings.misfit = ""
 
 
 def _of_head(tag: str) -> dict[str, Any]:
@@ -146,6 +147,7 @@ class SceneSettings(TrainOptions, bpy.types.PropertyGroup):
     preset: preset_property(update=_take_minutes)
     preset_timing: _hidden(bpy.props.StringProperty)  # JSON of `preset_times`
     effects: bpy.props.CollectionProperty(type=EffectRow)
+    misfit: _hidden(bpy.props.StringProperty)  # of the capture's mesh and images, by the analysis
     live_preview: options.boolean(
         "Live Preview", "Update the splats every few seconds during training", default=True
     )

@@ -9,6 +9,7 @@ import bpy
 from ..operators import monitor, train
 from ..operators.common import is_head, package
 from ..operators.training_python import has_training_python
+from ..stga_addon.capture.repairs import REPAIR_OPTION
 from ..stga_addon.format import format_duration
 from ..stga_addon.jobs.table import Kind
 from ..stga_addon.scene import tags
@@ -49,6 +50,8 @@ class TrainPanel(SidebarPanel, bpy.types.Panel):
             if state == WorkerState.NONE:
                 remedy = "choose its new folder and press Resume"
                 draw_text(box, context, f"{run}: does not exist; {remedy}")
+            elif REPAIR_OPTION in training.snapshot.status.error:
+                draw_repair(box)
             elif not state.failed:
                 draw_figures(box, context, training.snapshot.status)
                 draw_curve(box, run)
@@ -93,6 +96,12 @@ def draw_train_button(layout: Any, settings: Any, goes_on: str = "") -> None:
     button.resume = goes_on == "resume"
     button.more = goes_on == "more"
     button.effects = " ".join(train.chosen_effects(settings))
+
+
+def draw_repair(layout: Any) -> None:
+    """Draw the button by which the capture is read as its mesh fits the images."""
+    repair = layout.operator("stga.analyze_capture", text="Repair Capture", icon="TOOL_SETTINGS")
+    repair.repair = True
 
 
 def draw_missing_python(layout: Any, context: Any) -> None:
@@ -171,6 +180,9 @@ class EffectsPanel(ClosedPanel, bpy.types.Panel):
     def draw(self, context: Any) -> None:
         if not draw_running(self.layout, context, Kind.ANALYSIS):
             self.layout.operator("stga.analyze_capture", icon="VIEWZOOM")
+            if context.scene.stga.misfit:
+                draw_text(self.layout, context, context.scene.stga.misfit, "ERROR")
+                draw_repair(self.layout)
         for row in context.scene.stga.effects:
             effect = EFFECTS[row.name]
             box = self.layout.column(align=True)

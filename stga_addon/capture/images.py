@@ -24,6 +24,10 @@ WHITE = (255, 255, 255)
 
 WHITE_LEVEL = 247
 """Level of all channels from which a pixel without a mask counts as a white background."""
+MIN_LEFT_OUT = 0.02
+"""Fraction of the pixels that an inverted mask leaves out at least."""
+MIN_BORDER_INSIDE = 0.95
+"""Fraction of the image's upper border that lies in an inverted mask."""
 FORMATS = ("PNG", "JPEG", "WEBP", "TIFF", "BMP")
 """Pillow opens more than these, some by running other programs."""
 ORIENTATION_TAG = 0x0112
@@ -127,6 +131,19 @@ def is_labeled(mask: np.ndarray) -> bool:
     is_background = mask == 0
     is_two = 0 < level < 255 and (is_background | (mask == level)).all()
     return bool(is_two and (level == 1 or is_background.any()))
+
+
+def is_inside_out(mask: np.ndarray) -> bool:
+    """Whether a stored mask (H, W) is 255 outside of a head: along the top and the upper half of
+    the sides, and not in the middle of what it leaves out."""
+    inside = mask > mask.max(initial=0) // 2
+    upper = inside[: max(1, len(mask) // 2)]
+    rows, columns = np.nonzero(~inside)
+    if len(rows) < MIN_LEFT_OUT * inside.size:
+        return False
+    border = np.concatenate([upper[0], upper[:, 0], upper[:, -1]])
+    middle = inside[int(np.median(rows)), int(np.median(columns))]
+    return bool(border.mean() >= MIN_BORDER_INSIDE and not middle)
 
 
 def read_view(

@@ -69,6 +69,7 @@ class Capture:
     flame_file the model's file; None without one
     given_selection  timestep -> (F,) bool where the capture comes with a selection
     warnings   one sentence each
+    repair     name of the repair with which the mesh would fit its images; None where it fits
     fps        timesteps per second, counted by their numbers: with 60, timestep 30 was recorded 0.5
                s after timestep 0, also where those between are missing; None where unknown
     """
@@ -86,6 +87,7 @@ class Capture:
     flame_file: Path | None = None
     given_selection: Mapping[int, np.ndarray] = field(default_factory=dict)
     warnings: tuple[str, ...] = ()
+    repair: str | None = None
     fps: float | None = None
 
     @property

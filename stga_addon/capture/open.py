@@ -46,6 +46,7 @@ from .repairs import (
     REPAIRS,
     REPAIRS_FILE,
     find_repair,
+    in_image_size,
     in_meters,
     read_repairs,
     repaired,
@@ -127,12 +128,13 @@ def open_capture(
     if transforms_files(root):
         transforms = read_splits(root, principal_point)
     _require_files(transforms.frames)
+    transforms, resized = in_image_size(transforms)
     distorted = distortion(transforms.frames)
     if distorted:
         splits = {name: undistorted(own) for name, own in transforms.splits.items()}
         transforms = replace(transforms, splits=splits)
     capture = _open_layout(root, transforms, flame)
-    warnings = list(capture.warnings)
+    warnings = [*capture.warnings, *([resized] if resized else ())]
     if distorted:
         warnings.append(f"{distorted}; images are undistorted as they are read")
     warnings += transforms_warnings(transforms.frames, principal_point)
@@ -156,12 +158,18 @@ def _as_meant(capture: Capture, check: bool) -> tuple[Capture, list[str]]:
     or (check) for a mesh that misses the images. Raises StgaError."""
     # Limits, thresholds and the near plane are in meters: a head in millimeters cannot be trained.
     capture, rescaled = in_meters(capture)
+    sentences = [rescaled] if rescaled else []
     names = read_repairs(capture.root)
-    capture = repaired(capture, names)
-    repairs = "; ".join(REPAIRS[name].about for name in names)
-    about = f"{capture.root / REPAIRS_FILE}: the capture is read as repaired: {repairs}"
-    misses = find_repair(capture)[1] if check and not names else None
-    return capture, [own for own in (rescaled, about if names else None, misses) if own]
+    if names:
+        capture = repaired(capture, names)
+        repairs = "; ".join(REPAIRS[name].about for name in names)
+        about = f"{capture.root / REPAIRS_FILE}: the capture is read as repaired: {repairs}"
+        sentences.append(about)
+    elif names is None and check:
+        name, misses = find_repair(capture)
+        capture = replace(capture, repair=name)
+        sentences += [misses] if misses else []
+    return capture, sentences
 
 
 def is_capture(path: Path) -> bool:
@@ -185,13 +193,10 @@ def repair_capture(
     """Keep in the capture's folder how it is to be read, if its mesh misses its images but fits
     them in another way (`find_repair`); returns a sentence about that. Raises StgaError."""
     capture = open_capture(folder, flame, principal_point)
-    if not capture.views or read_repairs(capture.root):
+    if capture.repair is None:
         return None
-    name, _ = find_repair(capture)
-    if name is None:
-        return None
-    write_repairs(capture.root, [name])
-    return f"{capture.root / REPAIRS_FILE}: written: {REPAIRS[name].about}"
+    write_repairs(capture.root, [capture.repair])
+    return f"{capture.root / REPAIRS_FILE}: written: {REPAIRS[capture.repair].about}"
 
 
 def _require_files(frames: Sequence[Frame]) -> None:

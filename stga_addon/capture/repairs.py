@@ -9,10 +9,13 @@ import numpy as np
 
 from ..errors import StgaError
 from ..files import is_file, read_json, write_json
-from .camera import GL_TO_CV, Camera
+from .camera import GL_TO_CV, Camera, scaled_to
 from .mesh_geometry import pixels_of, silhouette
 from .model import Capture, View, Views, evenly_spread
+from .transforms import Frame, Transforms
 
+REPAIR_OPTION = "--repair"
+"""Option that has a capture read in the way that fits; sentences name it."""
 REPAIRS_FILE = "stga_repairs.json"
 """In the folder of a capture: how it is read other than it is written."""
 MAX_MEASURED_VIEWS = 4
@@ -96,11 +99,12 @@ REPAIRS: dict[str, Repair] = {
 """Name in the file -> what it does, the likeliest first."""
 
 
-def read_repairs(root: Path) -> tuple[str, ...]:
-    """Names of the repairs that the folder's file holds. Raises StgaError for others."""
+def read_repairs(root: Path) -> tuple[str, ...] | None:
+    """Names of the repairs that the folder's file holds; None without one, where the mesh is to be
+    measured. Raises StgaError for others."""
     path = root / REPAIRS_FILE
     if not is_file(path):
-        return ()
+        return None
     values = read_json(path)
     names = values.get("repairs") if isinstance(values, dict) else None
     if not isinstance(names, list) or not all(name in REPAIRS for name in names):
@@ -146,6 +150,47 @@ def in_meters(capture: Capture) -> tuple[Capture, str | None]:
     return capture, None
 
 
+def in_image_size(transforms: Transforms) -> tuple[Transforms, str | None]:
+    """The frames with cameras of the images' size, where all images of a camera have another one of
+    its shape; and a sentence about the first. Nothing is measured without Pillow, which Blender
+    lacks. Raises StgaError."""
+    if find_spec("PIL") is None:
+        return transforms, None
+    from .images import image_size
+
+    images: dict[int, list[Path]] = {}
+    cameras = {}
+    for frame in transforms.frames:
+        camera = frame.view.camera
+        cameras[id(camera)] = camera
+        images.setdefault(id(camera), []).append(frame.view.image)
+    scaled = {}
+    sentences = []
+    for key, camera in cameras.items():
+        size = camera.width, camera.height
+        first = image_size(images[key][0])
+        if size in (first, first[::-1]) or any(image_size(path) != first for path in images[key]):
+            continue
+        found = scaled_to(camera, first)
+        if found is not None:
+            scaled[key] = found
+            both = f"has {first[0]} x {first[1]} pixels, its camera {size[0]} x {size[1]}"
+            factor = f"scaled by {first[0] / size[0]:.4g}"
+            sentences.append(f"{images[key][0]}: {both}; the calibration is {factor}")
+
+    def fitted(frame: Frame) -> Frame:
+        camera = frame.view.camera
+        found = scaled.get(id(camera))
+        if found is None:
+            return frame
+        cx, cy = frame.principal
+        principal = cx * found.width / camera.width, cy * found.height / camera.height
+        return replace(frame, view=replace(frame.view, camera=found), principal=principal)
+
+    splits = {name: tuple(map(fitted, own)) for name, own in transforms.splits.items()}
+    return replace(transforms, splits=splits), next(iter(sentences), None)
+
+
 def _in_images(capture: Capture) -> float:
     """Fraction of the mesh that lies within the images of a few views."""
     views = evenly_spread(capture.all_views, MAX_MEASURED_VIEWS)
@@ -175,7 +220,7 @@ def find_repair(capture: Capture) -> tuple[str | None, str | None]:
     least = max(MIN_FIT, MIN_BETTER * now) if has_masks else MIN_IN_IMAGES
     if fits[best] >= least:
         about = REPAIRS[best].about
-        cure = f"with --repair, it is read so ({best})"
+        cure = f"with {REPAIR_OPTION}, it is read so ({best})"
         return best, f"{capture.root}: {problem}; {about}, by which they fit: {cure}"
     if now <= MAX_FIT_OF_MISS:
         tried = "neither other axes, inverse matrices, a turn by 90° nor inverted masks fit better"

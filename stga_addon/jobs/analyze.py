@@ -7,6 +7,7 @@ from pathlib import Path
 from time import monotonic
 
 from ..capture.open import open_capture, repair_capture
+from ..capture.repairs import REPAIR_OPTION
 from ..format import format_duration
 from ..options import When, like
 from ..progress import Progress, Report, Say
@@ -77,10 +78,13 @@ class Select(_OfCapture):
 
 @dataclass(frozen=True)
 class Analyzed:
-    """Effects that a capture calls for. seconds: preset -> training time on this machine."""
+    """Effects that a capture calls for. seconds: preset -> training time on this machine.
+    misfit: how a mesh that misses its images would fit them. repaired: whether it does so now."""
 
     plan: tuple[EffectDecision, ...]
     seconds: Mapping[str, float]
+    misfit: str = ""
+    repaired: bool = False
 
 
 def analyze(request: Analyze, report: Report, say: Say) -> Analyzed:
@@ -91,7 +95,8 @@ def analyze(request: Analyze, report: Report, say: Say) -> Analyzed:
     begin = monotonic()
     report(Progress(stage="Analyzing the capture"))
     source = request.capture, request.flame, request.principal_point
-    if request.repair and (repaired := repair_capture(*source)):
+    repaired = repair_capture(*source) if request.repair else None
+    if repaired:
         say(repaired)
     capture = open_capture(*source)
     if not capture.views.get("train"):
@@ -109,7 +114,8 @@ def analyze(request: Analyze, report: Report, say: Say) -> Analyzed:
             left_s = partial(dict[str, float], left_s=(monotonic() - begin) * (1 / share - 1))
             report(Progress(share, "Timing the presets", figures=left_s))
             seconds[preset] = next(timings).seconds
-    return Analyzed(plan, seconds)
+    misfit = next((text for text in capture.warnings if REPAIR_OPTION in text), "")
+    return Analyzed(plan, seconds, misfit, repaired is not None)
 
 
 def time_each_preset(request: TimePresets, report: Report, say: Say) -> Analyzed:

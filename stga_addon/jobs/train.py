@@ -13,6 +13,7 @@ from ..capture import model as capture_model
 from ..capture.meshes import SELECTED_WEIGHT, find_region, is_region_file
 from ..capture.model import Capture
 from ..capture.open import open_capture, repair_capture
+from ..capture.repairs import REPAIR_OPTION
 from ..capture.transforms import DEFAULT_PRINCIPAL_POINT, PRINCIPAL_POINTS
 from ..errors import StgaError
 from ..export.ply import write_ply
@@ -354,6 +355,8 @@ def _new_run(request: Train, report: Report, say: Say) -> Prepared:
     if request.repair and (repaired := repair_capture(*source)):
         say(repaired)
     opened = open_capture(*source)
+    if opened.repair is not None:
+        raise StgaError(next(text for text in opened.warnings if REPAIR_OPTION in text))
     new = _further_takes(request.takes, [opened], request.flame, request.principal_point)
     every = [opened, *new]
     capture = capture_model.join_takes(every)

@@ -4,8 +4,12 @@ import json
 import re
 import time
 
+import bpy
+import numpy as np
 import pytest
+from capture.test_repairs import FILES, shows_box, write_capture
 
+from stga_addon.capture.open import open_capture
 from stga_addon.jobs.table import Kind
 from stga_addon.training.run.folder import read_run
 from stga_addon.training.settings import PRESETS
@@ -55,6 +59,29 @@ def test_effect_choices(chosen, extension, tmp_path):
     assert run.settings.lattice == PRESETS["draft"].changes["lattice"]
     choices = {decision.effect: decision.choice for decision in run.effect_plan}
     assert choices["strain-color"] == "on"
+
+
+def test_a_capture_that_is_repaired(extension, tmp_path):
+    """Catches a mesh that misses its images of which the panel says nothing before a training, a
+    repair that leaves the scene as it was, and one that takes the shot away."""
+    source = write_capture(tmp_path / "capture", **FILES["z-up"])
+    ops.import_capture(directory=source)
+    bpy.context.scene.frame_end = 7
+    with failure(r".*one has z up, by which they fit: with --repair, it is read so"):
+        ops.train(directory=tmp_path / "run", iterations=3)
+    ops.analyze_capture()
+    assert "(z-up)" in panel().misfit
+    ops.analyze_capture(repair=True)
+    assert not panel().misfit
+    assert bpy.context.scene.frame_end == 7
+    head = panel().head
+    found = np.array([head.matrix_world @ vertex.co for vertex in head.data.vertices])
+    capture = open_capture(source)
+    shows_box(capture)
+    np.testing.assert_allclose(
+        found, np.array(capture.mesh(0))[:, [0, 2, 1]] * [1, -1, 1], atol=1e-5
+    )
+    ops.train(directory=tmp_path / "run", iterations=3)
 
 
 @pytest.fixture

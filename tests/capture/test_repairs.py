@@ -118,6 +118,28 @@ def test_other_units(tmp_path, unit, word):
     shows_box(capture)
 
 
+@pytest.mark.parametrize("size", [(30, 30), (121, 120)])
+def test_images_of_another_size_than_the_cameras(tmp_path, size):
+    """Catches a calibration at another size that is refused, or trained with its own focal length;
+    images of another shape that are scaled to it."""
+    root = write_capture(tmp_path / "capture")
+    before = open_capture(root).all_views[0].camera
+    for path in (root / "images").iterdir():
+        Image.open(path).resize(size).save(path)
+    capture = open_capture(root)
+    (warning,) = [text for text in capture.warnings if "its camera" in text]
+    assert f"has {size[0]} x {size[1]} pixels, its camera 60 x 60" in warning
+    camera = capture.all_views[0].camera
+    points = capture.mesh(0)
+    expected = (before.project(points)[0]) * np.array(size) / SIZE
+    np.testing.assert_allclose(camera.project(points)[0], expected)
+    assert read_mask(capture.all_views[0]).shape == size[::-1]
+    for path in (root / "images").iterdir():
+        Image.open(path).resize((80, 60)).save(path)
+    with refusal("has 80 x 60 pixels"):
+        read_mask(open_capture(root).all_views[0])
+
+
 def test_what_fits_is_left_as_it_is(tmp_path):
     """Catches a warning about a capture in order, and repairs of other names taken for none."""
     root = write_capture(tmp_path / "capture")

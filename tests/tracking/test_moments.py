@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from stga_addon.files import write_json
 from stga_addon.tracking.footage.moments import find_moments
@@ -55,7 +56,11 @@ def camera_params(root, pattern, scale=2):
     for moment in range(2):
         for own in CAMERAS:
             write_image(root / pattern.format(own, moment))
-            write_image(root / pattern.format(own, moment).replace("images", "alpha_map"))
+            mask = np.full((HEIGHT, WIDTH), 255, np.uint8)
+            mask[3:-5, int(own) : -3] = 40 * moment  # inverted: the head is what it leaves out
+            path = root / pattern.format(own, moment).replace("images", "alpha_map")
+            path.parent.mkdir(parents=True, exist_ok=True)
+            Image.fromarray(mask).save(path)
 
 
 def video_in_each_folder(root, pattern):
@@ -82,8 +87,8 @@ def video_in_each_folder(root, pattern):
 )
 def test_a_rig_at_several_moments(tmp_path, write, pattern):
     """Catches each image of a rig that stands still taken for a camera, or each camera for a
-    frame; masks of the images' names taken for images; matrices of another size taken as they are.
-    """
+    frame; masks of the images' names taken for images, for those of another camera, or inverted as
+    they are; matrices of another size taken as they are."""
     write(tmp_path, pattern)
     footage = open_footage(tmp_path)
     assert footage.timesteps == (0, 1)
@@ -93,6 +98,12 @@ def test_a_rig_at_several_moments(tmp_path, write, pattern):
         np.testing.assert_allclose(camera.world_to_camera, expected.world_to_camera, atol=0.01)
         assert (camera.fl_x, camera.cx, camera.cy) == (expected.fl_x, WIDTH / 2, HEIGHT / 2)
         assert "alpha" not in found.source(0)
+        if write is camera_params:
+            for timestep in (0, 1):
+                mask = found.mask(timestep)
+                assert mask[0, 0] == 0
+                assert (mask[3:-5, int(found.name[-2:]) : -3] == 255 - 40 * timestep).all()
+                assert mask[3, int(found.name[-2:]) - 1] == 0
 
 
 @pytest.mark.parametrize("names", [[f"frame_{n:03}" for n in range(12)], [*"abcdefghijkl"]])

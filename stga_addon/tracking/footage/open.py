@@ -11,9 +11,9 @@ from pathlib import Path
 import numpy as np
 
 from ...capture.camera import camera_from_gl, scaled_to
-from ...capture.images import image_size, is_turned
+from ...capture.images import image_size, is_inside_out, is_turned, stored_mask
 from ...capture.lens import Lens, Undistortion, undistortion
-from ...capture.model import View
+from ...capture.model import View, evenly_spread
 from ...capture.transforms import IMAGE_SUFFIXES, VIDEO_SUFFIXES
 from ...errors import StgaError
 from ...files import is_file, is_folder
@@ -44,6 +44,8 @@ from .video import Video, VideoFrames, first_frames
 
 ALL_FRAMES = FrameRange()
 
+MAX_MEASURED_MASKS = 6
+"""Masks, evenly spread over cameras and timesteps, that tell what 255 means."""
 USUAL_VIEW_DEG = 65.0
 """Angle of view of an unknown camera over the image's diagonal: that of a phone."""
 
@@ -99,12 +101,41 @@ def open_footage(
     footage = replace(footage, cameras=plated)
     if mattes is None:
         strays = _stray_masks(sources, plated)
-        return replace(footage, warnings=(*footage.warnings, *strays))
+        return _masks_as_meant(replace(footage, warnings=(*footage.warnings, *strays)))
     if not is_folder(mattes):
         raise StgaError(f"{mattes}: is not a folder; expected one of mattes")
     given = find_sources(Path(realpath(mattes)))
     masked = tuple(_masked(camera, sources, given, len(plated) == 1) for camera in plated)
-    return replace(footage, cameras=masked)
+    return _masks_as_meant(replace(footage, cameras=masked))
+
+
+def _masks_as_meant(footage: Footage) -> Footage:
+    """The footage with masks that are 255 outside of the head read the other way around, and a
+    sentence about that."""
+    masks = []
+    for own in footage.cameras:
+        frames = own.frames
+        views = frames.masks if isinstance(frames, VideoFrames) else frames.views
+        masks += [view for view in (views or {}).values() if view.mask is not None]
+    measured = evenly_spread(masks, MAX_MEASURED_MASKS)
+    try:
+        if not measured or not all(is_inside_out(stored_mask(view)) for view in measured):
+            return footage
+    except StgaError:  # what needs the file says so
+        return footage
+    cameras = tuple(replace(own, frames=_with_inverted(own.frames)) for own in footage.cameras)
+    sentence = f"{footage.root}: masks are 255 outside of the head; they are read the other way"
+    return replace(footage, cameras=cameras, warnings=(*footage.warnings, sentence))
+
+
+def _with_inverted(frames: Frames) -> Frames:
+    """The frames with views whose masks are inverted as they are read."""
+    is_video = isinstance(frames, VideoFrames)
+    views = frames.masks if is_video else frames.views
+    inverted = {t: replace(view, is_mask_inverted=True) for t, view in (views or {}).items()}
+    if not is_video:
+        return ImageFrames(inverted)
+    return VideoFrames(frames.video, frames.numbers, inverted or None)
 
 
 def sized(footage: Footage, size: float) -> Footage:

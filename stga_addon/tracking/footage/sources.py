@@ -20,7 +20,9 @@ CONTAINERS = ("images", "frames", "videos", "input")
 """Folders that gather those of the cameras; their names are no part of a camera's. Of pictures of
 the same names in several, the first are used."""
 ORIGINALS = "input"  # Container of the images before undistortion, by 3DGS's convert.py
-MASK_FOLDERS = ("masks", "fg_masks")
+MASK_FOLDERS = ("masks", "fg_masks", "alpha_map", "alpha_maps")
+"""At the top of the footage, or beside the folders of images, as NeRSemble has one in each moment's
+folder; a frame rate may follow (alpha_map-73fps)."""
 PLATE_FOLDER = "plates"  # Holds an image without the person for each camera, of its name
 MAX_DEPTH = 4
 MAX_FILES = 1_000_000
@@ -67,10 +69,13 @@ class Sources:
         return _without_container(path.relative_to(self.root).with_suffix("").as_posix())
 
     def mask_of(self, image: Path) -> Path | None:
-        """The mask with the same path below one of `MASK_FOLDERS`."""
+        """The mask with the same path below one of `MASK_FOLDERS`, or beside the image's folder."""
         key = self.name_of(image)
         name = _without_container(image.relative_to(self.root).as_posix())
-        return next(iter(self.masks.get(key) or self.masks.get(name, [])), None)
+        *above, _, stem = ("", *key.split("/"))
+        beside = "/".join((*above[1:], stem)) if len(above) > 1 else ""
+        found = (self.masks[each] for each in (key, name, beside) if each in self.masks)
+        return next((files[0] for files in found), None)
 
 
 def find_sources(root: Path, containers: Sequence[str] = CONTAINERS) -> Sources:
@@ -96,8 +101,9 @@ def find_sources(root: Path, containers: Sequence[str] = CONTAINERS) -> Sources:
         for path in (Path(folder, name) for name in sorted(visible, key=natural_order)):
             key = sources.name_of(path)
             suffix = path.suffix.lower()
-            first, _, rest = path.relative_to(root).as_posix().partition("/")
-            name = rest.rpartition(".")[0]
+            parts = path.relative_to(root).parts
+            first = parts[0] if len(parts) > 1 else ""
+            mask_folder = next(filter(_is_mask_folder, parts[:-1]), None)
             if suffix in VIDEO_SUFFIXES:
                 sources.videos.setdefault(key, []).append(path)
                 sources.files.append(path)
@@ -105,10 +111,12 @@ def find_sources(root: Path, containers: Sequence[str] = CONTAINERS) -> Sources:
                 sources.unread.append(path)
             elif suffix not in IMAGE_SUFFIXES:
                 continue
-            elif first in MASK_FOLDERS:
+            elif mask_folder is not None:
+                rest = [part for part in parts[:-1] if part != mask_folder]
+                name = "/".join((*rest, path.stem))
                 sources.masks.setdefault(_without_container(name), []).append(path)
             elif first == PLATE_FOLDER:
-                sources.plates.setdefault(name, path)
+                sources.plates.setdefault("/".join((*parts[1:-1], path.stem)), path)
             else:
                 own = folders.setdefault(key.rpartition("/")[0], {})
                 own.setdefault(first if first in CONTAINERS else "", []).append(path)
@@ -119,6 +127,10 @@ def find_sources(root: Path, containers: Sequence[str] = CONTAINERS) -> Sources:
             sources.folders.setdefault(name, []).append(path)
     _name_by_folder(sources)
     return sources
+
+
+def _is_mask_folder(name: str) -> bool:
+    return name.partition("-")[0] in MASK_FOLDERS
 
 
 def _name_by_folder(sources: Sources) -> None:
