@@ -78,9 +78,8 @@ def test_a_capture_that_is_repaired(extension, tmp_path):
     found = np.array([head.matrix_world @ vertex.co for vertex in head.data.vertices])
     capture = open_capture(source)
     shows_box(capture)
-    np.testing.assert_allclose(
-        found, np.array(capture.mesh(0))[:, [0, 2, 1]] * [1, -1, 1], atol=1e-5
-    )
+    z_up = capture.mesh(0)[:, [0, 2, 1]] * [1, -1, 1]
+    np.testing.assert_allclose(found, z_up, atol=1e-5)
     ops.train(directory=tmp_path / "run", iterations=3)
 
 
