@@ -47,11 +47,12 @@ OTHER_FILES = {
 
 class OtherInput(NamedTuple):
     """What a path is, as "a folder of 6 photos"; what is done with it; commands for that, the
-    likeliest first."""
+    likeliest first; whether it holds splats."""
 
     what: str
     plan: str
     commands: tuple[str, ...] = ()
+    is_rendered: bool = False
 
     @property
     def advice(self) -> str:
@@ -82,9 +83,8 @@ def _footage(path: Path, what: str) -> OtherInput:
 def _rendered(path: Path, what: str) -> OtherInput:
     source = shlex.quote(str(path))
     out = shlex.quote(f"{path.stem}_turntable.mp4")
-    return OtherInput(
-        what, "is rendered, not trained", (f"stga render {source} --turntable --video {out}",)
-    )
+    command = f"stga render {source} --turntable --video {out}"
+    return OtherInput(what, "is rendered, not trained", (command,), is_rendered=True)
 
 
 def _file(path: Path) -> OtherInput | None:

@@ -20,7 +20,7 @@ from ..capture.open import is_capture, open_capture
 from ..capture.other_input import other_input
 from ..errors import StgaError, printable
 from ..export.formats import FORMATS
-from ..export.splat_files import is_splats
+from ..export.splat_files import is_splats, read_splats
 from ..files import is_file, open_npz, write_npz
 from ..format import describe_figures, describe_left, format_table
 from ..jobs.analyze import Analyze, Select, TimePresets, holds_avatar
@@ -400,6 +400,8 @@ def _info(options: Namespace, head: OpenHead | None) -> None:
     other = None if is_capture(path) else other_input(path)
     if other is not None:
         rows = [("path", str(path)), ("what", other.what), ("next", f"it {other.plan}")]
+        if other.is_rendered:
+            rows.insert(2, ("splats", str(len(read_splats(path)))))
         rows += [("command" if n == 0 else "or", own) for n, own in enumerate(other.commands[:2])]
         print(*format_table(rows), sep="\n")
         return
