@@ -12,6 +12,7 @@ from typing import Any
 
 import bpy
 
+from ..stga_addon.capture.filmed import filmed
 from ..stga_addon.capture.meshes import MESH_SUFFIXES
 from ..stga_addon.capture.open import OWN_MODELS, open_capture
 from ..stga_addon.capture.transforms import (
@@ -111,6 +112,11 @@ class HeadImport(Edit):
         head[tags.PRINCIPAL_POINT] = principal_point
         head[tags.TRACKED] = is_tracked(capture.root)
         head[tags.FOCAL_LENGTH] = describe_focal_length(capture.root)
+        seen = filmed(capture)
+        if len(seen.directions):
+            head[tags.FILMED] = seen.text
+            head[tags.FILMED_CELLS] = seen.cells
+            head[tags.NEXT_TAKE] = seen.next_take
         scene.stga.head = head
         if set_up_scene or not heads:
             scene.frame_start = capture.timesteps[0]

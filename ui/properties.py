@@ -155,6 +155,9 @@ class SceneSettings(TrainOptions, bpy.types.PropertyGroup):
         "Show When Trained", "Show the avatar on the head when training has finished", default=True
     )
     avatar: options.path("Avatar", "Trained avatar file (.npz)", **_of_head(tags.AVATAR))
+    show_filmed: options.boolean(
+        "Filmed", "From where the head was filmed, and what to film next", default=True
+    )
     show_figures: options.boolean(
         "Figures", "Show speed, PSNR of held-out views in dB, loss, number of splats and memory"
     )

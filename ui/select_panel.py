@@ -7,10 +7,11 @@ import bpy
 
 from ..operators.common import is_head
 from ..operators.select import key_regions, possible_regions
+from ..stga_addon.capture.filmed import directions_picture
 from ..stga_addon.scene import tags
 from ..stga_addon.scene.objects import layers_of
 from ..stga_addon.scene.vertex_groups import has_heat_map, shows_residuals
-from .sidebar import SidebarPanel
+from .sidebar import SidebarPanel, draw_picture, draw_text
 
 LAYERS = ((tags.RIG, "Bones", "BONE_DATA"), (tags.CAMERA, "Cameras", "CAMERA_DATA"))
 """Collections that switches show and hide in viewports."""
@@ -41,6 +42,22 @@ class CapturePanel(SidebarPanel, bpy.types.Panel):
             how = {"text": text, "icon": icon, **toggle}
             for layer in layers_of(root, kind, context.view_layer):
                 row.prop(layer, "hide_viewport", **how)
+        if tags.FILMED_CELLS in head:
+            draw_filmed(layout, context, head)
+
+
+def draw_filmed(layout: Any, context: Any, head: Any) -> None:
+    """Draw from where the head was filmed, and what to film next."""
+    settings = context.scene.stga
+    arrow = "DISCLOSURE_TRI_DOWN" if settings.show_filmed else "DISCLOSURE_TRI_RIGHT"
+    row = layout.row()
+    row.alignment = "LEFT"
+    row.prop(settings, "show_filmed", text="Filmed", icon=arrow, emboss=False)
+    if not settings.show_filmed:
+        return
+    draw_picture(layout, head.name, directions_picture(tuple(head[tags.FILMED_CELLS])))
+    for text in filter(None, (head[tags.FILMED], head[tags.NEXT_TAKE])):
+        draw_text(layout, context, text)
 
 
 class SelectedFrames(bpy.types.UIList):

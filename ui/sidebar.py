@@ -25,8 +25,8 @@ SCALE = 8.0
 
 _previews: Any = None
 """Blender's preview collection: pictures that are not saved in the .blend file."""
-_shown: dict[Path, monitor.Curve] = {}
-"""Run folder -> the curve that its preview shows."""
+_shown: dict[str, np.ndarray] = {}
+"""Name of a preview -> the picture that it shows."""
 
 
 class SidebarPanel:
@@ -146,18 +146,22 @@ def draw_curve(layout: Any, folder: Path) -> None:
     curve = monitor.curves.get(folder)
     if curve is None:
         return
-    name = str(folder)
-    if _shown.get(folder) is not curve:
-        _shown[folder] = curve
-        pixels = curve[0]
+    pixels, *texts = curve
+    column = layout.column(align=True)
+    draw_picture(column, str(folder), pixels)
+    for text in filter(None, texts):
+        column.label(text=text)
+
+
+def draw_picture(layout: Any, name: str, pixels: np.ndarray) -> None:
+    """Draw a picture (H, W, 4) float32, from the bottom up; the same array costs nothing again."""
+    if _shown.get(name) is not pixels:
+        _shown[name] = pixels
         _previews.pop(name, None)  # a new one, because Blender keeps the texture of the old one
         preview = _previews.new(name)
         preview.image_size = pixels.shape[1], pixels.shape[0]
         preview.image_pixels_float.foreach_set(np.ascontiguousarray(pixels).ravel())
-    column = layout.column(align=True)
-    column.template_icon(_previews[name].icon_id, scale=SCALE)
-    for text in filter(None, curve[1:]):
-        column.label(text=text)
+    layout.template_icon(_previews[name].icon_id, scale=SCALE)
 
 
 def register(at_end: AtEnd) -> None:

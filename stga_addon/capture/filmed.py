@@ -1,6 +1,9 @@
-"""What a capture filmed, in words: from which directions, and which expressions."""
+"""What a capture filmed, in words and as a picture: from which directions, and which expressions;
+and what to film next."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 
@@ -19,20 +22,93 @@ FACE = ("left_eye", "right_eye", "nose", "mouth")
 """Regions that expressions move."""
 STILL_MM = 1.0
 """Difference between timesteps of how far the face moves, below which it has one expression."""
+ONE_EXPRESSION = "one expression"
+"""What is said of a face that does not move."""
+SECTOR_DEG = 15
+"""Width of the cells into which directions around a head are divided."""
+SECTORS = 360 // SECTOR_DEG
+"""Cells around a head at one elevation."""
+BANDS_DEG = (-90.0, -12.0, 25.0, 90.0)
+"""Bounds of the cells' elevations: from below, level, from above."""
+SIDE_DEG = 90
+"""How far around a head is to be filmed to both sides: to behind the ears."""
+PICTURE_PX = 160
+"""Side of the picture of directions."""
+HEAD_RADIUS = 0.3
+"""Radius of the head in that picture, as a share of half of its side; cells reach from there to its
+border."""
+FILMED_COLOR = (0.16, 0.62, 0.34, 1.0)
+UNFILMED_COLOR = (0.3, 0.3, 0.3, 1.0)
+HEAD_COLOR = (0.75, 0.6, 0.5, 1.0)
 
 
-def describe_filmed(capture: Capture) -> str:
-    """Such as "32 views, from 112° on its right to 110° on its left, 3° below to 9° above; one
-    expression"."""
+@dataclass(frozen=True)
+class Filmed:
+    """What a capture filmed. directions: (N, 2) of `filmed_directions`; expressions: in words."""
+
+    directions: np.ndarray
+    expressions: str
+
+    @property
+    def text(self) -> str:
+        """Such as "32 views, from 112° on its right to 110° on its left, 3° below to 9° above; one
+        expression"."""
+        parts = []
+        if len(self.directions):
+            right, low = self.directions.min(0).tolist()
+            left, high = self.directions.max(0).tolist()
+            around = f"from {_side(right)} to {_side(left)}, {_height(low)} to {_height(high)}"
+            parts.append(f"{len(self.directions)} views, {around}")
+        return "; ".join([*parts, self.expressions])
+
+    @property
+    def cells(self) -> list[int]:
+        """Numbers of the cells that were filmed: sectors to the left, band by band."""
+        across, up = self.directions.T
+        sector = np.round(across / SECTOR_DEG).astype(int) % SECTORS
+        band = np.digitize(up, BANDS_DEG[1:-1])
+        return sorted(set((SECTORS * band + sector).tolist()))
+
+    @property
+    def next_take(self) -> str:
+        """What to film next, in a sentence; "" where nothing is missing."""
+        level = {cell % SECTORS for cell in self.cells}
+        wanted = range(-SIDE_DEG // SECTOR_DEG, SIDE_DEG // SECTOR_DEG + 1)
+        missing = [sector * SECTOR_DEG for sector in wanted if sector % SECTORS not in level]
+        if len(self.directions) and missing:
+            ends = {"right": min(missing) < 0, "left": max(missing) > 0}
+            where = " and ".join(side for side, is_missing in ends.items() if is_missing)
+            return f"Film next: once around the head, which keeps still, for its {where or 'front'}"
+        if self.expressions == ONE_EXPRESSION:
+            return "Film next: the face talking, from the front, for its expressions"
+        return ""
+
+
+def filmed(capture: Capture) -> Filmed:
+    """Directions and expressions of a capture, of evenly spread timesteps."""
     timesteps = evenly_spread(capture.timesteps, MAX_TIMESTEPS)
     directions = filmed_directions(capture, timesteps)
-    parts = []
-    if len(directions):
-        right, low = directions.min(0).tolist()
-        left, high = directions.max(0).tolist()
-        around = f"from {_side(right)} to {_side(left)}, {_height(low)} to {_height(high)}"
-        parts.append(f"{len(directions)} views, {around}")
-    return "; ".join([*parts, _expressions(capture, timesteps)])
+    return Filmed(directions, _expressions(capture, timesteps))
+
+
+@lru_cache(maxsize=8)
+def directions_picture(cells: tuple[int, ...]) -> np.ndarray:
+    """(PICTURE_PX, PICTURE_PX, 4) float32 from the bottom up: the head, seen from above, looks
+    downwards amid the cells of directions, those from above within those from below."""
+    across, up = np.meshgrid(*2 * [np.linspace(-1, 1, PICTURE_PX)])
+    radius = np.hypot(across, up)
+    sector = np.round(np.degrees(np.arctan2(across, -up)) / SECTOR_DEG).astype(int) % SECTORS
+    bands = len(BANDS_DEG) - 1
+    inwards = (1 - radius) / (1 - HEAD_RADIUS) * bands
+    band = np.clip(np.floor(inwards).astype(int), 0, bands - 1)
+    is_filmed = np.isin(SECTORS * band + sector, cells)
+    picture = np.where(is_filmed[..., None], FILMED_COLOR, UNFILMED_COLOR)
+    is_gap = np.abs(inwards - np.round(inwards)) < 0.04
+    picture[(radius > 1) | is_gap] = 0
+    nose = np.hypot(across / 0.6, up + HEAD_RADIUS - 0.04) < 0.11
+    picture[radius < HEAD_RADIUS] = 0
+    picture[(radius < HEAD_RADIUS - 0.06) | nose] = HEAD_COLOR
+    return picture.astype(np.float32)
 
 
 def filmed_directions(capture: Capture, timesteps: Sequence[int]) -> np.ndarray:
@@ -75,7 +151,7 @@ def _expressions(capture: Capture, timesteps: Sequence[int]) -> str:
         away = (mesh - capture.neutral)[of_face]
         moved.append(1000 * float(np.linalg.norm(away - np.median(away, axis=0), axis=1).max()))
     if len(timesteps) < 2 or max(moved) - min(moved) < STILL_MM:
-        return "one expression"
+        return ONE_EXPRESSION
     text = f"{len(capture.timesteps)} moments, in which the face moves by up to {max(moved):.0f} mm"
     sequence = capture.flame
     names = () if sequence is None else sequence.model.expression_names

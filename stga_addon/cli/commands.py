@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from ..avatar.file import read_avatar
 from ..avatar.filmed import filmed_sides
-from ..capture.filmed import describe_filmed
+from ..capture.filmed import filmed
 from ..capture.model import Capture, summarize_capture
 from ..capture.open import is_capture, open_capture
 from ..capture.other_input import other_input
@@ -409,7 +409,7 @@ def _info(options: Namespace, head: OpenHead | None) -> None:
     found: Any = carry_out(request, with_bar=False)
     capture = open_capture(path, request.flame, request.principal_point)
     rows = summarize_capture(capture)
-    rows.append(("filmed", describe_filmed(capture)))
+    rows.append(("filmed", filmed(capture).text))
     lens = describe_focal_length(capture.root)
     rows += [("focal length", lens)] if lens else []
     print(*format_table(rows), sep="\n")
@@ -429,7 +429,7 @@ def _filmed_by_take(run: Path, flame: Path | None) -> list[tuple[str, str]]:
         return [("takes", f"unknown ({error})")]
     names = [f"take {number + 1}" if len(takes) > 1 else "filmed" for number in range(len(takes))]
     return [
-        (name, f"{take.root.name}: {describe_filmed(take)}")
+        (name, f"{take.root.name}: {filmed(take).text}")
         for name, take in zip(names, takes, strict=True)
     ]
 

@@ -3,8 +3,15 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
-from stga_addon.capture.filmed import describe_filmed, filmed_directions
+from stga_addon.capture.filmed import (
+    ONE_EXPRESSION,
+    Filmed,
+    directions_picture,
+    filmed,
+    filmed_directions,
+)
 from stga_addon.capture.open import open_capture
 from stga_addon.development.demo.capture import unpack_capture
 
@@ -22,9 +29,33 @@ def test_directions_and_expressions(tmp_path):
     order = np.argsort(across)
     np.testing.assert_allclose(across[order], AZIMUTHS_DEG, atol=4)
     np.testing.assert_allclose(up[order], ELEVATIONS_DEG, atol=6)
-    described = describe_filmed(capture)
+    described = filmed(capture).text
     assert " on its right to " in described
     assert "mouthSmile" in described
+
+
+@pytest.mark.parametrize(
+    ("across", "up", "text", "expected"),
+    [
+        ((-50, 100), 0, "9 moments", "for its right"),
+        ((-20, 20), 0, "9 moments", "for its right and left"),
+        ((-100, 100), 5, ONE_EXPRESSION, "the face talking"),
+        ((-100, 100), 5, "9 moments", ""),
+    ],
+)
+def test_what_to_film_next(across, up, text, expected):
+    """Catches a side that is said to be missing and was filmed, or the other one; and a picture
+    whose left is the head's right, or whose front looks up."""
+    degrees = np.arange(across[0], across[1] + 1, 15.0)
+    seen = Filmed(np.stack([degrees, np.full(len(degrees), up)], 1), text)
+    assert seen.next_take.endswith(expected) if expected == "" else expected in seen.next_take
+    assert bool(seen.next_take) == bool(expected)
+    picture = directions_picture(tuple(seen.cells))
+    green = picture[..., 1] > 0.61
+    rows, columns = np.nonzero(green & (picture[..., 0] < 0.2)) - np.array([[79.5], [79.5]])
+    found = np.degrees(np.arctan2(columns, -rows))
+    assert abs(found.min() - across[0]) < 15
+    assert abs(found.max() - across[1]) < 15
 
 
 def test_shoulders_are_no_expression(tmp_path):
@@ -38,4 +69,4 @@ def test_shoulders_are_no_expression(tmp_path):
         away = np.where(lowest, shift[timestep], 0)[:, None] * [0, 1, 0]
         return capture.neutral + away
 
-    assert describe_filmed(replace(capture, expression_mesh=shrugged)).endswith("one expression")
+    assert filmed(replace(capture, expression_mesh=shrugged)).text.endswith("one expression")
