@@ -11,13 +11,14 @@ from ..stga_addon.capture.meshes import SELECTED_WEIGHT
 from ..stga_addon.errors import StgaError
 from ..stga_addon.jobs import train as jobs
 from ..stga_addon.jobs.analyze import Analyze
+from ..stga_addon.jobs.monitor_state import Dismissed
 from ..stga_addon.jobs.table import TRAINS, Kind
 from ..stga_addon.scene import vertex_groups as groups
 from ..stga_addon.training.effect_catalog import parse_choice
 from ..stga_addon.training.run.folder import AVATAR, has_run, next_folder, read_run
 from ..stga_addon.training.settings import PRESETS, TrainingSettings, make_settings
 from ..stga_addon.worker.training_python import missing_packages
-from . import options
+from . import monitor, options
 from .common import Action, Edit, capture_source, file_path, head_of, needs_head
 from .options import ONCE
 from .request import idle, start
@@ -37,6 +38,9 @@ class AnalyzeCapture(Action, bpy.types.Operator):
     def run(self, context: Any) -> None:
         settings = context.scene.stga
         source = capture_source(head_of(context))
+        refused = monitor.state_of(context.scene, Kind.TRAINING)
+        if self.repair and refused.can_be_dismissed and refused.snapshot.state.failed:
+            monitor.handle(context.scene, Kind.TRAINING, Dismissed())
         effects = dict(map(parse_choice, chosen_effects(settings)))
         timed = not self.repair
         request = Analyze(*source, effects, settings.device, timed=timed, repair=self.repair)

@@ -11,6 +11,7 @@ from ..operators.common import UNSAVED, is_head, rig_or_none
 from ..operators.import_capture import OpenDemo
 from ..operators.pose import is_posing
 from ..operators.training_python import has_training_python
+from ..stga_addon.capture.repairs import REPAIR_OPTION
 from ..stga_addon.errors import StgaError
 from ..stga_addon.jobs.table import Kind
 from ..stga_addon.scene import tags
@@ -25,7 +26,12 @@ from ..stga_addon.worker.training_python import PYTHON_VARIABLE
 from .select_panel import has_selection
 from .show_panel import draw_input, draw_left_out
 from .sidebar import SidebarPanel, draw_end, draw_running, draw_text
-from .train_panel import draw_missing_python, draw_preferences, draw_train_button
+from .train_panel import (
+    draw_missing_python,
+    draw_preferences,
+    draw_repair,
+    draw_train_button,
+)
 
 FILM_MORE = (
     "Blue was not filmed, but is plausible. To have it as it is: film once around the person, who "
@@ -80,12 +86,23 @@ class NextStepPanel(SidebarPanel, bpy.types.Panel):
             draw_text(layout, context, "Show the trained avatar on the head")
             layout.operator("stga.show_avatar", icon="HIDE_OFF").filepath = settings.avatar
         elif has_training_python(context):
-            draw_text(layout, context, "Train an avatar, or choose a trained one under 4 Show")
-            draw_train_button(layout, settings)
+            _draw_training(layout, context, settings)
         else:
             hint = "Training needs a Python; to show a trained avatar, go to 4 Show"
             draw_text(layout, context, hint)
             draw_missing_python(layout, context)
+
+
+def _draw_training(layout: Any, context: Any, settings: Any) -> None:
+    """Draw the button that trains; where the last training was refused, why."""
+    last = monitor.state_of(context.scene, Kind.TRAINING).snapshot
+    if last.state.failed:
+        draw_text(layout, context, last.status.error, "ERROR")
+    if last.state.failed and REPAIR_OPTION in last.status.error:
+        draw_repair(layout)
+        return
+    draw_text(layout, context, "Train an avatar, or choose a trained one under 4 Show")
+    draw_train_button(layout, settings)
 
 
 def _draw_message(layout: Any, context: Any) -> None:

@@ -15,6 +15,7 @@ from stga_addon.training.run.folder import read_run
 from stga_addon.training.settings import PRESETS
 
 from .session import failure, ops, panel, state_of
+from .test_panel import draw
 
 
 @pytest.fixture
@@ -61,7 +62,7 @@ def test_effect_choices(chosen, extension, tmp_path):
     assert choices["strain-color"] == "on"
 
 
-def test_a_capture_that_is_repaired(extension, tmp_path):
+def test_a_capture_that_is_repaired(extension, tmp_path, monkeypatch):
     """Catches a mesh that misses its images of which the panel says nothing before a training, a
     repair that leaves the scene as it was, and one that takes the shot away."""
     source = write_capture(tmp_path / "capture", **FILES["z-up"])
@@ -69,10 +70,13 @@ def test_a_capture_that_is_repaired(extension, tmp_path):
     bpy.context.scene.frame_end = 7
     with failure(r".*one has z up, by which they fit: with --repair, it is read so"):
         ops.train(directory=tmp_path / "run", iterations=3)
+    monkeypatch.setattr(extension.ui.next_step, "has_training_python", lambda context: True)
+    assert "Repair Capture" in draw(extension, "next_step")
     ops.analyze_capture()
     assert "(z-up)" in panel().misfit
     ops.analyze_capture(repair=True)
     assert not panel().misfit
+    assert "Repair Capture" not in draw(extension)
     assert bpy.context.scene.frame_end == 7
     head = panel().head
     found = np.array([head.matrix_world @ vertex.co for vertex in head.data.vertices])
