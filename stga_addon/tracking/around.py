@@ -147,7 +147,9 @@ def with_found_cameras(
         return found, (f"take: around a still head, as given; {line}",)
     kind, why = take_of(footage, crew)
     if kind == "talk":
-        return footage, ()
+        return footage, (
+            f"take: a head that moves before a camera ({why}; else give --take around)",
+        )
     try:
         found, line = _with_cameras(footage, out, crew)
     except StgaError as error:
@@ -341,15 +343,16 @@ def recognize(camera: FootageCamera, fps: float | None, step: Step) -> dict[str,
     )
     pairs = []
     if turn >= MIN_TURN_DEG:
-        if isinstance(camera.frames, ImageFrames) and len(timesteps) <= MAX_PHOTOS:
-            row = sorted(samples.values(), key=lambda sample: sample.yaw)
-            pairs = list(pairwise(row))
-        else:
-            ahead = max(1, round(PAIR_S * (fps or USUAL_FPS)))
-            for number, sample in samples.items():
-                other = min(number + ahead, len(timesteps) - 1)
-                later = look.at(timesteps[other]) if other != number else None
-                pairs += [(sample, later)] if later is not None else []
+        photos = isinstance(camera.frames, ImageFrames) and len(timesteps) <= MAX_PHOTOS
+        ahead = 1 if photos else max(1, round(PAIR_S * (fps or USUAL_FPS)))
+        for number, sample in samples.items():
+            other = min(number + ahead, len(timesteps) - 1)
+            later = look.at(timesteps[other]) if other != number else None
+            pairs += [(sample, later)] if later is not None else []
+        if photos:  # whose names may tell no order
+            row = {id(sample): sample for pair in pairs for sample in pair}
+            row |= {id(sample): sample for sample in samples.values()}
+            pairs += pairwise(sorted(row.values(), key=lambda sample: sample.yaw))
     parallax, correlation = _parallax(pairs)
     gaps = [sample.lip_gap for sample in samples.values()]
     lip_change = float(np.ptp(gaps)) if gaps else 0.0
