@@ -7,6 +7,7 @@ import bpy
 from . import (
     apply_motion,
     drive,
+    duplicate,
     export,
     import_capture,
     kernels,
@@ -37,6 +38,7 @@ MODULES = (
     render_video,
     apply_motion,
     drive,
+    duplicate,
     export,
 )
 PICK = "stga.pick_avatar"

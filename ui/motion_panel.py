@@ -12,6 +12,7 @@ from ..operators.pose import needs_sliders, preparing
 from ..stga_addon.driving.live.sources import LOOPBACK, SOURCES
 from ..stga_addon.driving.performance import ARKIT_SHAPES
 from ..stga_addon.jobs.table import Kind
+from ..stga_addon.scene.objects import mover_of
 from ..stga_addon.scene.rig.keyframes import EXPRESSION_KEY, IDENTITY_KEY
 from ..stga_addon.scene.rig.motion import outside_now, stored_range
 from .sidebar import ClosedPanel, SidebarPanel, draw_running, draw_text
@@ -34,6 +35,20 @@ class MotionPanel(SidebarPanel, bpy.types.Panel):
         row.prop(settings, "motion_source")
         if other is not None:
             row.operator("stga.apply_motion", text="", icon="CHECKMARK").source = other.name
+        if not is_head(settings.head):
+            return
+        root = mover_of(settings.head)
+        if root.parent_type == "BONE":
+            text = f"Detach from {root.parent_bone}"
+            layout.operator("stga.attach_to_bone", text=text, icon="UNLINKED")
+            return
+        layout.prop(settings, "body")
+        if settings.body is not None:
+            row = layout.row(align=True)
+            row.prop_search(settings, "body_bone", settings.body.data, "bones", text="")
+            attach = row.operator("stga.attach_to_bone", icon="LINKED")
+            attach.armature = settings.body.name
+            attach.bone = settings.body_bone
 
 
 class FacePanel(SidebarPanel, bpy.types.Panel):

@@ -34,6 +34,11 @@ class SelectedFrame(bpy.types.PropertyGroup):
     splats: options.integer("Splats", "Splats on those triangles")
 
 
+def _is_body(settings: Any, thing: Any) -> bool:
+    """Whether an object is an armature that is no avatar's."""
+    return thing.type == "ARMATURE" and tags.KIND not in thing
+
+
 def _choose_head(settings: Any, context: Any) -> None:
     follow_head(settings)
     settings.selected_frames.clear()  # rows of another head
@@ -133,6 +138,12 @@ class SceneSettings(TrainOptions, bpy.types.PropertyGroup):
     motion_source: object_property(
         "From", "Another imported head, whose motion is applied to this one"
     )
+    body: object_property(
+        "Body",
+        "Armature that the avatar is attached to",
+        poll=_is_body,
+    )
+    body_bone: options.text("Bone", "Bone that carries the avatar, such as the body's neck")
     drive: bpy.props.PointerProperty(type=DriveSettings)
     splats: object_property("Splats", "Splats whose display is set here")
     run_folder: options.path(

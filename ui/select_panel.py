@@ -42,6 +42,9 @@ class CapturePanel(SidebarPanel, bpy.types.Panel):
             how = {"text": text, "icon": icon, **toggle}
             for layer in layers_of(root, kind, context.view_layer):
                 row.prop(layer, "hide_viewport", **how)
+        row = layout.row(align=True)
+        row.operator("stga.duplicate_avatar", icon="DUPLICATE")
+        row.operator("stga.duplicate_avatar", text="", icon="LINKED").linked = True
         if tags.FILMED_CELLS in head:
             draw_filmed(layout, context, head)
 
