@@ -86,7 +86,8 @@ def _animated(thing: Any) -> Iterable[Any]:
 
 def _collect(family: list[Any], copies: list[Any]) -> None:
     """Put copies into new collections beside those of their originals, shown as these are."""
-    root, new_root = family[0], copies[0]
+    root = family[0]
+    new_root = copies[0]
     layer = bpy.context.view_layer
     made: dict[Any, Any] = {}
     for original, copy in zip(family, copies, strict=True):

@@ -84,7 +84,8 @@ def test_an_avatar_on_a_body(avatar):
     bpy.context.view_layer.objects.active = body
     bpy.ops.object.mode_set(mode="EDIT")
     bone = data.edit_bones.new("spine")
-    bone.head, bone.tail = (0.1, 0.0, -0.5), (0.1, 0.05, -0.2)
+    bone.head = (0.1, 0.0, -0.5)
+    bone.tail = (0.1, 0.05, -0.2)
     bpy.ops.object.mode_set(mode="OBJECT")
     before = world(avatar)
     with failure("spine.001: is no bone of body"):

@@ -23,6 +23,7 @@ ORIGINALS = "input"  # Container of the images before undistortion, by 3DGS's co
 MASK_FOLDERS = ("masks", "fg_masks", "alpha_map", "alpha_maps")
 """At the top of the footage, or beside the folders of images, as NeRSemble has one in each moment's
 folder; a frame rate may follow (alpha_map-73fps)."""
+
 PLATE_FOLDER = "plates"  # Holds an image without the person for each camera, of its name
 MAX_DEPTH = 4
 MAX_FILES = 1_000_000
@@ -72,8 +73,8 @@ class Sources:
         """The mask with the same path below one of `MASK_FOLDERS`, or beside the image's folder."""
         key = self.name_of(image)
         name = _without_container(image.relative_to(self.root).as_posix())
-        *above, _, stem = ("", *key.split("/"))
-        beside = "/".join((*above[1:], stem)) if len(above) > 1 else ""
+        folders = key.split("/")[:-2]
+        beside = "/".join([*folders, image.stem]) if folders else ""
         found = (self.masks[each] for each in (key, name, beside) if each in self.masks)
         return next((files[0] for files in found), None)
 
