@@ -112,11 +112,12 @@ def open_footage(
 def _masks_as_meant(footage: Footage) -> Footage:
     """The footage with masks that are 255 outside of the head read the other way around, and a
     sentence about that."""
-    masks = []
-    for own in footage.cameras:
-        frames = own.frames
-        views = frames.masks if isinstance(frames, VideoFrames) else frames.views
-        masks += [view for view in (views or {}).values() if view.mask is not None]
+    masks = [
+        view
+        for own in footage.cameras
+        for view in _mask_views(own.frames).values()
+        if view.mask is not None
+    ]
     measured = evenly_spread(masks, MAX_MEASURED_MASKS)
     try:
         if not measured or not all(is_inside_out(stored_mask(view)) for view in measured):
@@ -130,12 +131,16 @@ def _masks_as_meant(footage: Footage) -> Footage:
 
 def _with_inverted(frames: Frames) -> Frames:
     """The frames with views whose masks are inverted as they are read."""
-    is_video = isinstance(frames, VideoFrames)
-    views = frames.masks if is_video else frames.views
-    inverted = {t: replace(view, is_mask_inverted=True) for t, view in (views or {}).items()}
-    if not is_video:
-        return ImageFrames(inverted)
-    return VideoFrames(frames.video, frames.numbers, inverted or None)
+    views = _mask_views(frames)
+    inverted = {t: replace(view, is_mask_inverted=True) for t, view in views.items()}
+    if isinstance(frames, VideoFrames):
+        return VideoFrames(frames.video, frames.numbers, inverted or None)
+    return ImageFrames(inverted)
+
+
+def _mask_views(frames: Frames) -> Mapping[int, View]:
+    """Timestep -> the view that names its mask, if there is one."""
+    return frames.masks or {} if isinstance(frames, VideoFrames) else frames.views
 
 
 def sized(footage: Footage, size: float) -> Footage:

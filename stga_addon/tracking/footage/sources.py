@@ -123,8 +123,8 @@ def find_sources(root: Path, containers: Sequence[str] = CONTAINERS) -> Sources:
                 own = folders.setdefault(key.rpartition("/")[0], {})
                 own.setdefault(first if first in CONTAINERS else "", []).append(path)
                 sources.files.append(path)
-    for name, parts in folders.items():
-        for path in _without_copies(parts, containers):
+    for name, contained in folders.items():
+        for path in _without_copies(contained, containers):
             sources.images.setdefault(sources.name_of(path), []).append(path)
             sources.folders.setdefault(name, []).append(path)
     _name_by_folder(sources)
