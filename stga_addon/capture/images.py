@@ -134,8 +134,8 @@ def is_labeled(mask: np.ndarray) -> bool:
 
 
 def is_inside_out(mask: np.ndarray) -> bool:
-    """Whether a stored mask (H, W) is 255 outside of a head: along the top and the upper half of
-    the sides, and not in the middle of what it leaves out."""
+    """Whether a stored mask (H, W) is inverted. An inverted mask is bright along the top and the
+    upper half of the sides of the image, and dark in the middle of its dark region."""
     inside = mask > mask.max(initial=0) // 2
     upper = inside[: max(1, len(mask) // 2)]
     rows, columns = np.nonzero(~inside)

@@ -51,7 +51,8 @@ def read_mesh(path: Path) -> Mesh:
 
 
 def checked_mesh(path: Path, vertices: np.ndarray, faces: np.ndarray) -> Mesh:
-    """The arrays as float64 and int32. Raises StgaError where they are no mesh (`read_mesh`)."""
+    """A mesh of the arrays, as float64 and int32. Raises StgaError as `read_mesh` does, if they are
+    not a valid triangle mesh."""
     triples = all(own.ndim == 2 and own.shape[1] == 3 for own in (vertices, faces))
     if not triples or not len(faces):
         raise StgaError(

@@ -68,7 +68,7 @@ def other_input(path: Path) -> OtherInput | None:
 
 
 def is_gaussian_output(folder: Path) -> bool:
-    """Whether a folder is the output of 3D Gaussian Splatting, beside whose splats lie points."""
+    """Whether a folder is the output of 3D Gaussian Splatting, with folders `iteration_…`."""
     return any((folder / GAUSSIAN_FOLDER).glob("iteration_*"))
 
 

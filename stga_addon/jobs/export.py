@@ -124,7 +124,7 @@ class Export:
     )
 
     def check(self) -> None:
-        """Raise StgaError for another format's file name."""
+        """Raise StgaError if the output's suffix does not fit the format."""
         check_suffix(self.output, self.file_format)
 
 

@@ -124,8 +124,10 @@ class ShadowMap:
         step: float = TAP_STEP,
         normals: np.ndarray | None = None,
     ) -> np.ndarray:
-        """(N,) float32, 0…1: how much light reaches points (N, 3) lifted off the surface, whose
-        normals (N, 3) make `bias` larger on slopes."""
+        """Fraction of the lamp's light that reaches points: (N,) float32, 0…1.
+
+        points: (N, 3), lifted off the surface. normals: (N, 3); on slopes they enlarge `bias`.
+        """
         found = np.empty(len(points), np.float32)
         biases = np.full(len(points), bias, np.float32)
         if normals is not None:

@@ -133,7 +133,8 @@ class DenseHead:
         return self._posed[level].positions(*split(values))
 
     def linearized(self, values: np.ndarray, level: int) -> tuple[np.ndarray, np.ndarray]:
-        """Positions (M, 3) of a level's points, and derivatives (M, 3, K + 18)."""
+        """Positions (M, 3) of the points of a pyramid level, and their derivatives
+        (M, 3, K + 18) by `values`."""
         return self._posed[level].linearized(*split(values))
 
     def light_basis(self, values: np.ndarray, level: int = ALL_POINTS) -> np.ndarray:

@@ -146,13 +146,13 @@ def yield_processor(typing: Any) -> Any:
 
 @intrinsic
 def acquire(typing: Any, lock: Any) -> Any:
-    """Wait for a lock of Python's C interface, an address."""
+    """Wait until a lock of Python's C API, given by its address, is free, and take it."""
     return types.void(types.int64), _lock_call("PyThread_acquire_lock", 1)
 
 
 @intrinsic
 def release(typing: Any, lock: Any) -> Any:
-    """Let go a lock of Python's C interface, an address; any thread may."""
+    """Release a lock of Python's C API, given by its address; any thread may."""
     return types.void(types.int64), _lock_call("PyThread_release_lock")
 
 

@@ -220,7 +220,8 @@ def _is_own(owner: Any, shown: Any) -> bool:
 
 
 def all_layers(depsgraph: Any, cache: SplatCache, view: Any = None) -> list[SceneLayer]:
-    """`visible_layers`, and native splats of others."""
+    """Layers of all visible splats: the add-on's (`visible_layers`) and native ones of other
+    objects."""
     return visible_layers(depsgraph, cache, view) + native_layers(depsgraph, cache, view)
 
 

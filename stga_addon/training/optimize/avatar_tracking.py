@@ -129,7 +129,10 @@ class AvatarTracking:
         return AvatarTracking(tuple(self.timesteps[row] for row in kept), **arrays)
 
     def smoothed(self, model: FlameModel) -> "AvatarTracking":
-        """Over time, where images do not say; model: the person's. Not where scale was sought."""
+        """The motion, smoothed over time, most where the images determine it least.
+
+        model: the person's head model. Must not be called if the scale was fitted.
+        """
         count = model.n_expression
         shift = np.full(SHIFT_SIZE, solve.TRANSLATION_ACCELERATION_M**-2)
         stiffness = np.insert(solve.acceleration_precision(model), count, shift)
