@@ -49,6 +49,10 @@ MIN_UNPACKED_BYTES = 32 << 20
 """Bytes to which any file of packed splats may unpack."""
 MAX_UNPACKED_RATIO = 16
 """How many times its size a larger one may unpack to; splats reach 3, without harmonics 10."""
+MIN_ARRAYS_BYTES = 384 << 20
+"""Bytes to which any npz may unpack besides: a motion of 6000 frames whose offsets are zero."""
+MIN_NUMBER_BYTES = 4
+"""What a number of an npz counts for at least, as readers make floats of small ones."""
 MAX_NAME_BYTES = 255
 """Longest name of a file or folder on the file systems of Linux, macOS and Windows."""
 PARTIAL_NAME = re.compile(
@@ -616,6 +620,11 @@ class NpzFile:
         """The arrays that are among `names`, by default every one, of at most `limit` bytes."""
         wanted = {n: each for n, each in self.entries.items() if names is None or n in names}
         unpacked = sum(entry.file_size for entry in wanted.values())
+        if unpacked > MIN_ARRAYS_BYTES // MIN_NUMBER_BYTES:
+            limit = min(limit, MIN_ARRAYS_BYTES + MAX_UNPACKED_RATIO * file_size(self.path))
+            for _, (shape, dtype) in self._each(wanted, _read_outline):
+                small = MIN_NUMBER_BYTES - dtype.itemsize if dtype.kind in "iuf" else 0
+                unpacked += max(small, 0) * math.prod(shape)
         if unpacked > limit:
             problem = f"unpacks to {unpacked} bytes, more than the {limit} allowed"
             raise StgaError(f"{self.path}: {problem}")

@@ -136,13 +136,17 @@ def test_flipped_bits(tmp_path):
 
 
 def test_hostile_npz(tmp_path):
-    """Catches a small archive of oversized arrays, and arrays counted that are not read."""
+    """Catches a small archive of oversized arrays, arrays counted that are not read, and bytes that
+    a reader would make numbers of eight bytes of."""
     path = tmp_path / "a.npz"
     np.savez_compressed(path, a=np.zeros(100_000), b=np.zeros(10))
     assert path.stat().st_size < 10_000
     with refusal(r"unpacks to \d+ bytes, more than the 100000 allowed"):
         read_npz(path, limit=100_000)
     assert list(read_npz(path, ("b",), limit=100_000)) == ["b"]
+    np.savez_compressed(path, a=np.zeros(120 << 20, np.int8))
+    with refusal("unpacks to"):
+        read_npz(path)
 
 
 KILLED = """

@@ -2,7 +2,7 @@
 
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping, Sequence, Set
 
 import numpy as np
 
@@ -12,11 +12,17 @@ from .clocks import numbers
 AXES = {"yaw": 0, "pitch": 1, "roll": 2, "y": 0, "x": 1, "z": 2, "w": 3}
 """How an angle's name ends -> its place in (yaw, pitch, roll), or of the quaternion's real part."""
 _ROTATION = "(?:rotation|rot|quaternion|quat|eulerangles?|euler|angles?|orientation|pose)"
-_NAME = re.compile(f"(?:head|{_ROTATION})*(yaw|pitch|roll)|head{_ROTATION}+([xyzw])")
-_LIKE_A_ROTATION = re.compile(f"head$|head.*({_ROTATION}|matrix|transform|yaw|pitch|roll)")
+_UNIT = "(?P<unit>deg(?:ree)?s?|rad(?:ian)?s?)?"
+_NAME = re.compile(f"(?:(?:head|{_ROTATION})*(yaw|pitch|roll)|head{_ROTATION}+([xyzw])){_UNIT}")
+_LIKE_A_ROTATION = re.compile(
+    "(?!.*(?:eye|gaze|camera|mouth|jaw|hand))"
+    f"(?:head[xyz]?$|.*(?:{_ROTATION}|matrix|transform|yaw|pitch|roll)|r[xyz]$)"
+)
 
 NECK_RAD = np.radians([100.0, 80.0, 80.0])
 """Yaw, pitch and roll that no neck reaches."""
+STRAINED_RAD = np.radians([80.0, 60.0, 50.0])
+"""Yaw, pitch and roll that few necks reach, in radians; tiny angles in degrees may seem to."""
 MAX_OUTLIERS = 0.01
 """Fraction of rows beyond `NECK_RAD` that tracking errors explain."""
 HALF_TURN_RAD = math.pi + 0.01
@@ -27,14 +33,16 @@ WHOLE_TURN_DEG = 360.0
 def find_head(
     where: str, columns: Mapping[str, Sequence[object]]
 ) -> tuple[np.ndarray | None, list[str]]:
-    """(T, 3) yaw, pitch and roll as the columns hold them, None without any; and a sentence each
-    for what was guessed, and for what is called a head's and is not used.
+    """(T, 3) yaw, pitch and roll in radians, None without any; and a sentence each for what was
+    guessed, and for what is called a head's and is not used.
 
     columns  name -> texts or numbers (T,) of what is no shape. Angles about x, y and z are pitch,
              yaw and roll; with w they are a quaternion of a right-handed system with y up, z ahead
-    Raises StgaError, beginning with `where`, for texts that are no numbers.
+    Raises StgaError, beginning with `where`, for texts that are no numbers, and for angles beyond a
+    turn in degrees.
     """
     axes: dict[str, str] = {}
+    units = set()
     others = []
     for name, cells in columns.items():
         parts = name.lower().split(".")
@@ -43,6 +51,7 @@ def find_head(
         found = next(filter(None, map(_NAME.fullmatch, tails)), None)
         if found is not None and not any(cell in (None, "") for cell in cells):
             axes.setdefault(found[1] or found[2], name)
+            units.add((found["unit"] or "")[:3])
         elif any(map(_LIKE_A_ROTATION.match, tails)):
             others.append(name)
     named = [axis for axis in ("yaw", "pitch", "roll") if axis in axes]
@@ -56,11 +65,11 @@ def find_head(
     for name in used:
         values[:, AXES[name]] = numbers(where, axes[name], columns[axes[name]])
     if named:
-        return values[:, :3], notes
+        return _in_radians(where, values[:, :3], units, notes)
     origin = axes["x"].rpartition(".")[0] or axes["x"]
     if "w" not in axes:
         notes.append(f"{origin}: angles about x, y, z are read as pitch, yaw, roll")
-        return values[:, :3], notes
+        return _in_radians(where, values[:, :3], units, notes)
     notes.append(f"{origin}: is read as a quaternion x, y, z, w, with y up")
     return _of_quaternions(values), notes
 
@@ -78,22 +87,33 @@ def _of_quaternions(values: np.ndarray) -> np.ndarray:
     return np.stack([yaw, pitch, np.arctan2(2 * (w * z + x * y), 1 - 2 * (x * x + z * z))], axis=1)
 
 
-def in_radians(where: str, head: np.ndarray) -> tuple[np.ndarray, list[str]]:
-    """The angles (T, 3) in radians, and a sentence where their unit is guessed, or where no neck
-    turns so far. Raises StgaError, beginning with `where`, for angles beyond a turn in degrees."""
+def _in_radians(
+    where: str, head: np.ndarray, units: Set[str], notes: list[str]
+) -> tuple[np.ndarray, list[str]]:
+    """The angles (T, 3) in radians, and the notes with a sentence where their unit is guessed, or
+    where no neck turns so far. Raises StgaError, beginning with `where`, for angles beyond a turn
+    in degrees.
+
+    units: which of "deg" and "rad" the columns' names hold; "" of names without
+    """
     turn = float(np.abs(head).max())
     if not turn <= WHOLE_TURN_DEG:
         problem = "head rotation is beyond a turn, or not finite; expected radians"
         raise StgaError(f"{where}: {problem}")
-    beyond = np.abs(np.remainder(head + math.pi, 2 * math.pi) - math.pi) > NECK_RAD
-    far = float(np.abs(head[beyond]).max(initial=0))
+    if units == {"deg"}:
+        return np.radians(head), notes
+    reached = np.abs(np.remainder(head + math.pi, 2 * math.pi) - math.pi)
     # a camera on its side or upside down turns the roll alone
-    is_degrees = turn > WHOLE_TURN_RAD or beyond[:, :2].any(axis=1).mean() > MAX_OUTLIERS
-    if is_degrees:
-        return np.radians(head), [f"the head's angles reach {turn:.4g}; they are read as degrees"]
+    is_beyond = (reached > NECK_RAD)[:, :2].any(axis=1).mean() > MAX_OUTLIERS
+    if turn > WHOLE_TURN_RAD or (is_beyond and units != {"rad"}):
+        guess = f"the head's angles reach {turn:.4g}; they are read as degrees"
+        return np.radians(head), [*notes, guess]
     if turn > HALF_TURN_RAD:
-        return head, [f"the head's angles reach {turn:.4g}; they are read as radians"]
-    if beyond.any():
-        guess = "they are read as radians, though no neck turns so far"
-        return head, [f"the head's angles reach {far:.4g}; {guess}"]
-    return head, []
+        return head, [*notes, f"the head's angles reach {turn:.4g}; they are read as radians"]
+    strained = reached > STRAINED_RAD
+    if strained.any(axis=1).mean() > MAX_OUTLIERS or (reached > NECK_RAD).any():
+        far = float(np.abs(head[strained]).max())
+        necks = "no neck turns" if (reached > NECK_RAD).any() else "few necks turn"
+        guess = f"they are read as radians, though {necks} so far"
+        notes = [*notes, f"the head's angles reach {far:.4g}; {guess}"]
+    return head, notes

@@ -19,7 +19,7 @@ from .frame_forms import (
     read_lines,
     rows_of_shapes,
 )
-from .head_rotations import find_head, in_radians
+from .head_rotations import find_head
 from .performance import COLUMN, COUNT, MAX_WEIGHT, FacePacket, Performance, arkit_name, columns_of
 
 REQUEST = b"iFacialMocap_sahuasouryya9218sauhuiayeta91555dy3719"
@@ -164,7 +164,7 @@ def frames_performance(path: Path, document: Any) -> Performance:
             _number(f"{where}: {shorten(name)}", value)
         if not shapes and isinstance(frame, dict):
             continue
-        rest = {name: value for name, value in found.items() if name not in shapes}
+        rest = _flat({name: value for name, value in found.items() if name not in shapes})
         if isinstance(frame, dict):
             rest |= _flat({key: value for key, value in frame.items() if value is not found})
         for name, value in rest.items():
@@ -175,6 +175,9 @@ def frames_performance(path: Path, document: Any) -> Performance:
     about = {**(inner if isinstance(inner, dict) else {}), **outer}
     key = next((key for key in RATE_KEYS if key in about), "")
     fps = _number(f"{path}: {key}", about[key]) if key else None
+    aside = _beside(outer, frames)
+    if len(rows) == len(frames):
+        others |= {name: values for name, values in aside.items() if name not in others}
     listed = list(dict.fromkeys(name for row in rows for name in row))
     columns, guesses = columns_of(str(path), listed)
     if len(rows) < len(frames):
@@ -218,6 +221,20 @@ def _flat(values: dict[str, Any], prefix: str = "", depth: int = 0) -> dict[str,
     return found
 
 
+def _beside(outer: dict[str, Any], frames: list[Any]) -> dict[str, list[object]]:
+    """Columns of the lists that stand beside that of the frames and are as long, as times do."""
+    lists = {
+        name: value
+        for name, value in outer.items()
+        if isinstance(value, list) and value is not frames and len(value) == len(frames)
+    }
+    rows = [
+        _flat({name: value[row] for name, value in lists.items()}) for row in range(len(frames))
+    ]
+    names = dict.fromkeys(name for row in rows for name in row)
+    return {name: [row.get(name) for row in rows] for name in list(names)[:MAX_OTHERS]}
+
+
 def _first(entry: dict[str, Any], keys: tuple[str, ...], default: Any) -> Any:
     """The value of the first of the keys that is there."""
     return next((entry[key] for key in keys if key in entry), default)
@@ -259,9 +276,6 @@ def _performance(
     if head is None:
         head, notes = find_head(where, others)
         guesses += notes
-        if head is not None:
-            head, notes = in_radians(where, head)
-            guesses += notes
     times, notes = find_times(where, others, fps)
     if times is None:
         if fps is None:

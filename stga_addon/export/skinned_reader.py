@@ -209,7 +209,10 @@ def _arrays(entries: dict[str, Any], packed: bytes) -> dict[str, np.ndarray]:
         raise ValueError("its arrays are not whole")
     for name in [name for name in arrays if name.endswith(AXES)]:
         axes = arrays.pop(name)
-        arrays[name.removesuffix(AXES)] = arrays[name.removesuffix(AXES)] @ axes.T
+        own = name.removesuffix(AXES)
+        if axes.shape != 2 * arrays[own].shape[-1:]:
+            raise ValueError(f"{name} of shape {axes.shape}, not one row a column")
+        arrays[own] = arrays[own] @ axes.T
     return arrays
 
 
@@ -306,6 +309,8 @@ def _animated(
         if ("rotation", joint) not in outputs:
             raise ValueError(f"its motion does not turn joint {joint}")
     frames = len(values(outputs["rotation", joints[0]]))
+    if frames > len(binary):
+        raise ValueError(f"its motion of {frames} frames is longer than the file can hold")
     turns = np.stack([values(outputs["rotation", joint], frames, 4) for joint in joints], axis=1)
     if ("translation", joints[0]) not in outputs:
         raise ValueError("its motion does not move the root")

@@ -173,6 +173,7 @@ def test_degrees_and_percent(tmp_path):
         ((5.5, 0, 0), 1, "reach 5.5; they are read as radians"),
         ((2.5, 2, 1), np.pi / 180, "reach 2.5; they are read as degrees"),
         ((0.1, 0.2, 3), 1, "reach 3; they are read as radians, though no neck turns so far"),
+        ((0.5, 1.2, 0), 1, "reach 1.2; they are read as radians, though few necks turn so far"),
     ],
 )
 def test_angles_that_no_neck_has(tmp_path, head, unit, sentence):
@@ -185,6 +186,7 @@ def test_angles_that_no_neck_has(tmp_path, head, unit, sentence):
 
 
 ANGLES = (0.1, 0.2, 0.3)
+DEGREES = np.degrees(ANGLES).tolist()
 TURN = Rotation.from_euler("YXZ", ANGLES).as_quat().tolist()
 
 
@@ -196,12 +198,14 @@ TURN = Rotation.from_euler("YXZ", ANGLES).as_quat().tolist()
         ({"head_rotation": [0.2, 0.1, 0.3]}, "angles about x, y, z"),
         ({"headRotation": TURN}, "quaternion"),
         ({"headYaw": 0.1, "headPitch": 0.2, "headRoll": 0.3}, None),
+        (dict(zip(("yaw_deg", "Pitch (deg)", "roll degrees"), DEGREES, strict=True)), None),
+        ({"blendShapes": {"jawOpen": 0.1, "headRotation": [0.2, 0.1, 0.3]}}, "angles about x"),
         ({"headMatrix": [1.0] * 16, "leftEye": {"yaw": 1}}, "headMatrix: not read"),
     ],
 )
 def test_head_rotations_in_json(tmp_path, entry, sentence):
-    """Catches rotations beside the weights that are dropped silently, other axes, and an
-    eye's taken for the head's."""
+    """Catches rotations beside the weights that are dropped silently, other axes, names with a
+    unit, and an eye's taken for the head's."""
     frames = [{"blendShapes": {"jawOpen": 0.1}, **entry} for _ in range(COUNT)]
     (tmp_path / "a.json").write_text(json.dumps({"fps": 30, "frames": frames}))
     found = read_performance(tmp_path / "a.json")
@@ -235,6 +239,7 @@ def test_eight_shapes(tmp_path, suffix):
         ("timecode", lambda n: f"00:00:{n // 30:02d}:{n % 30:02d}", {}, 30, None),
         ("frame", lambda n: n, {"frame_rate": 30}, 30, None),
         ("frame", lambda n: n, {}, 60, "says no times"),
+        ("frame", lambda n: n, {"timestamps_ms": [n * 40 for n in range(COUNT)]}, 25, None),
     ],
 )
 def test_times_in_json(tmp_path, key, times, about, fps, sentence):

@@ -197,6 +197,14 @@ def set_bind(document, binary, matrix, column, row, value):
     binary[at : at + 4] = np.float32(value).tobytes()
 
 
+def set_frames(document, count):
+    """Make a motion of so many frames of zeros, which need no data."""
+    for sampler in document["animations"][0]["samplers"]:
+        accessor = document["accessors"][sampler["output"]]
+        accessor.pop("bufferView")
+        accessor["count"] = count
+
+
 @pytest.mark.parametrize(
     ("damage", "problem"),
     [
@@ -211,6 +219,7 @@ def set_bind(document, binary, matrix, column, row, value):
         (lambda d, b: set_bind(d, b, 1, 3, 0, np.nan), "matrices that are not finite"),
         (lambda d, _: d["animations"][0]["channels"].pop(2), "does not turn joint 1"),
         (lambda d, _: d["animations"][0]["channels"].pop(1), "does not move the root"),
+        (lambda d, _: set_frames(d, 90_000), "motion of 90000 frames is longer"),
         (
             lambda d, _: d["meshes"][0]["primitives"][0].update(targets=[{"POSITION": 4}] * 999),
             "of another type or length",
@@ -269,6 +278,10 @@ def test_a_rig_with_some_of_the_joints(tmp_path):
         ({"arrays": {"page": {**BYTES, "shape": [1 << 29]}}}, "larger than any"),
         ({"arrays": {"xyz": {**BYTES, "shape": [1 << 25]}}}, "larger than any"),
         *(({"fps": fps}, "fps is") for fps in (NAN, 0, 1e300, -10)),
+        (
+            {"arrays": {f"xyz{end}": {**BYTES, "shape": [9, 1]} for end in ("", "_axes")}},
+            "not one row a column",
+        ),
         ({"expressions": 3}, "3 expressions"),
         ({"background": [2, 0, 0]}, "background"),
     ],
@@ -276,7 +289,12 @@ def test_a_rig_with_some_of_the_joints(tmp_path):
 def test_damaged_splats_are_refused(changes, problem, tmp_path):
     """Catches an exception of numpy or zlib, or memory taken, by a file of another kind."""
     document, binary = document_of(ten_splats.FILE.read_bytes())
-    document["extras"]["stga_splats"] |= changes
+    header = document["extras"]["stga_splats"]
+    header |= changes
+    if len(header["arrays"]) == 2:  # whose bytes are to be whole
+        packed = gzip.compress(bytes(18))
+        binary += packed
+        header |= {"byteOffset": len(binary) - len(packed), "byteLength": len(packed)}
     data = glb_bytes(document, binary).replace(str(NAN).encode(), b"  NaN")
     (tmp_path / "a.glb").write_bytes(data)
     with refusal(problem):
