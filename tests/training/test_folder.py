@@ -18,6 +18,7 @@ from stga_addon.training.run import checkpoint as checkpoint_files
 from stga_addon.training.run import folder, metrics_log
 from stga_addon.training.run.checkpoint import Checkpoint
 from stga_addon.training.run.folder import Run
+from stga_addon.training.run.identity import RunIdentity
 from stga_addon.training.settings import STRATEGIES, Rates, make_settings
 
 from .toys import random_state
@@ -55,6 +56,24 @@ def test_run_round_trip(tmp_path, strategy):
     for run in (make_run(strategy=strategy, **changes), bare):
         folder.write_run(tmp_path, run)
         assert repr(folder.read_run(tmp_path)) == repr(run)
+
+
+@pytest.mark.parametrize("run", ["runs/anna", "anna run", "work/runs/anna_2"])
+def test_paths_of_a_project_that_was_moved(tmp_path, run):
+    """Catches Refine, Extend and `stga render RUN` that end with "OLD/capture: is not a folder"
+    once capture and run were moved together; and a run, or what is elsewhere, taken for it."""
+    for name in (f"{run}/run.json", "captures/anna/flame.npz", "runs/parent/run.json"):
+        (tmp_path / "old" / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / "old" / name).touch()
+    here = tmp_path / "old/captures/anna"
+    further = folder.Continuation(tmp_path / "old/runs/parent", "", 0, 1)
+    stored = replace(make_run(), capture=here, flame=here / "flame.npz", continuation=further)
+    away = replace(stored, takes=(folder.Take(Path("/none/take"), 9, RunIdentity(*"12345678")),))
+    folder.write_run(tmp_path / "old" / run, away)
+    assert repr(folder.read_run(tmp_path / "old" / run)) == repr(away)
+    (tmp_path / "old").rename(tmp_path / "new")
+    found = folder.read_run(tmp_path / "new" / run)
+    assert repr(found) == repr(away).replace(f"{tmp_path}/old", f"{tmp_path}/new")
 
 
 @pytest.mark.parametrize(

@@ -1,11 +1,12 @@
 """Folder of a training run (docs/formats.md#run-folder): its run.json, lock and smaller files, and
 the capture that it was trained on."""
 
+import os
 import re
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 
 import numpy as np
@@ -40,6 +41,9 @@ SELECTION = "selection.npz"
 WORLD_FILE = "world.ply"
 TRACKING = "tracking.npz"
 RESIDUALS = "residuals.npz"
+
+MAX_FOLDERS_UP = 2
+"""From the folder of a run to that of its project."""
 
 
 @dataclass(frozen=True)
@@ -127,13 +131,33 @@ def has_run(folder: Path) -> bool:
 
 
 def read_run(folder: Path) -> Run:
-    """Raises StgaError where the folder holds no run, a damaged one or one of another version."""
+    """The run, with the paths of a project that was moved as a whole. Raises StgaError where the
+    folder holds no run, a damaged one or one of another version."""
     if not has_run(folder):
         raise StgaError(f"{folder}: holds no run ({RUN} is missing)")
     path = folder / RUN
     with naming(path, "read"):
         state = path.stat()
-    return _remembered(path, state.st_ino, state.st_mtime_ns, state.st_size)
+    run = _remembered(path, state.st_ino, state.st_mtime_ns, state.st_size)
+    found = partial(_moved_with, folder.absolute())
+    takes = tuple(replace(take, capture=found(take.capture)) for take in run.takes)
+    further = run.continuation
+    if further is not None:
+        further = replace(further, parent=found(further.parent))
+    flame = None if run.flame is None else found(run.flame)
+    capture = found(run.capture)
+    return replace(run, capture=capture, flame=flame, takes=takes, continuation=further)
+
+
+def _moved_with(run: Path, path: Path) -> Path:
+    """A path that a run stores: where nothing is there, what has its name and as many of its
+    folders' as possible beside the run, or above that."""
+    places = (
+        above.joinpath(*path.parts[first:])
+        for first in range(1, 0 if os.path.exists(path) else len(path.parts))
+        for above in run.parents[: MAX_FOLDERS_UP + 1]
+    )
+    return next((each for each in places if each != run and os.path.exists(each)), path)
 
 
 @lru_cache(maxsize=8)
