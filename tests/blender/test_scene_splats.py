@@ -43,6 +43,16 @@ def test_objects_without_splats_are_not_asked():
     assert visible_layers(plain, SplatCache()) == []
 
 
+def test_a_render_while_an_extension_is_enabled(monkeypatch):
+    """Catches a render that ends in the middle: Blender hides the file's data meanwhile."""
+    from _bpy_restrict_state import _data_restrict
+
+    shown_avatar()
+    depsgraph = bpy.context.evaluated_depsgraph_get()
+    monkeypatch.setattr(bpy, "data", _data_restrict)
+    assert len(visible_layers(depsgraph, SplatCache())) == 1
+
+
 def test_a_selection_is_read_once(monkeypatch):
     """Catches vertex groups read at every redraw, and what was painted, removed or is another
     frame's not shown."""

@@ -90,8 +90,10 @@ class SplatCache:
     def get(self, splat_object: Any) -> Avatar | Splats:
         key = _key(splat_object.data)
         if key not in self._stored:
-            current = {_key(mesh) for mesh in bpy.data.meshes}
-            self._keep(lambda known: known in current)
+            meshes = _unless_hidden("meshes")
+            if meshes is not None:
+                current = {_key(mesh) for mesh in meshes}
+                self._keep(lambda known: known in current)
             is_avatar = tags.CONVENTION in splat_object
             mesh = splat_object.data
             read = stored_avatar(splat_object) if is_avatar else read_splats(mesh)
@@ -122,6 +124,12 @@ class SplatCache:
         self._frames = {key: frames for key, frames in self._frames.items() if is_kept(key[:3])}
 
 
+def _unless_hidden(kind: str) -> Any:
+    """Data of the file; None while Blender enables an extension, which may be during a render, and
+    hides them."""
+    return getattr(bpy.data, kind, None)
+
+
 def _key(mesh: Any) -> tuple[Any, ...]:
     return mesh.session_uid, mesh.get(tags.REVISION, ""), len(mesh.vertices)
 
@@ -135,7 +143,8 @@ def visible_layers(
     """The splats of each visible object at the depsgraph's frame. view: the SpaceView3D to draw,
     None for a final image, where holdouts count and what the camera does not see is left out.
     Raises StgaError where a head is gone or has other triangles."""
-    if not any(VERSION in tree for tree in bpy.data.node_groups):  # a file without splats
+    trees = _unless_hidden("node_groups")
+    if trees is not None and not any(VERSION in tree for tree in trees):  # a file without splats
         return []
 
     def find_visible() -> list[tuple[Any, Matrix]]:
