@@ -289,7 +289,7 @@ def test_an_analysis_says_how_long_it_takes(monkeypatch):
         return what
 
     timings = (take(20.0, SimpleNamespace(preset=name, seconds=1.0)) for name in PRESETS)
-    capture = SimpleNamespace(views={"train": [0]})
+    capture = SimpleNamespace(views={"train": [0]}, warnings=())
     monkeypatch.setattr(analysis, "monotonic", lambda: now[0])
     monkeypatch.setattr(analysis, "open_capture", lambda *_: take(2.0, capture))
     monkeypatch.setattr(plan, "plan_effects", lambda *_: take(8.0, (None, ())))
