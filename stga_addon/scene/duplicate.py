@@ -22,7 +22,7 @@ BLOCKS = ("objects", "meshes", "armatures", "actions", "node_groups", "materials
 
 
 def duplicate_avatar(head: Any, linked: bool = False) -> Any:
-    """Copy the avatar of a head beside it, into a collection of its own; the new head.
+    """Copy the avatar of a head beside all heads, into a collection of its own; the new head.
 
     linked: whether both play the same keyframes. Raises StgaError where the head cannot be copied.
     """
@@ -40,7 +40,8 @@ def duplicate_avatar(head: Any, linked: bool = False) -> Any:
         bpy.data.batch_remove(unused)
         unused = {block for block in set(_blocks()) - before if not block.users}
     new_head = copies[family.index(head)]
-    place_beside(new_head, [head])
+    heads = [each for each in bpy.context.scene.objects if each.get(tags.KIND) == tags.HEAD]
+    place_beside(new_head, [each for each in heads if each != new_head])
     return new_head
 
 

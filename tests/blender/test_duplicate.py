@@ -64,6 +64,8 @@ def test_a_copy_lives_by_itself(avatar, linked):
         apart = world(copy) - world(avatar)
         np.testing.assert_allclose(apart, np.broadcast_to(apart[0], apart.shape), atol=1e-6)
     assert aside[0] > np.ptp(world(avatar)[:, 0])
+    ops.duplicate_avatar(linked=linked)
+    assert world(panel().head)[:, 0].min() > world(copy)[:, 0].max()
     before = world(avatar)
     rig = find_rig(copy)
     rig.animation_data_clear()
