@@ -12,7 +12,7 @@ from typing import Any
 
 import bpy
 
-from ..stga_addon.capture.filmed import filmed
+from ..stga_addon.capture.filmed import Filmed, filmed
 from ..stga_addon.capture.meshes import MESH_SUFFIXES
 from ..stga_addon.capture.open import OWN_MODELS, open_capture
 from ..stga_addon.capture.transforms import (
@@ -112,11 +112,7 @@ class HeadImport(Edit):
         head[tags.PRINCIPAL_POINT] = principal_point
         head[tags.TRACKED] = is_tracked(capture.root)
         head[tags.FOCAL_LENGTH] = describe_focal_length(capture.root)
-        seen = filmed(capture)
-        if len(seen.directions):
-            head[tags.FILMED] = seen.text
-            head[tags.FILMED_CELLS] = seen.cells
-            head[tags.NEXT_TAKE] = seen.next_take
+        _store_filmed(head, filmed(capture))
         scene.stga.head = head
         if set_up_scene or not heads:
             scene.frame_start = capture.timesteps[0]
@@ -143,6 +139,14 @@ class HeadImport(Edit):
 
     def is_told(self, warning: str) -> bool:
         return not self.ignored_warning or self.ignored_warning not in warning
+
+
+def _store_filmed(head: Any, found: Filmed) -> None:
+    """Store what the panel draws of it; nothing of a capture without views."""
+    head.pop(tags.FILMED_CELLS, None)
+    if len(found.directions):
+        head[tags.FILMED] = f"{found.text}\n{found.next_take}".strip()
+        head[tags.FILMED_CELLS] = found.cells
 
 
 def _select(head: Any, objects: Any) -> None:

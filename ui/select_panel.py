@@ -50,7 +50,8 @@ class CapturePanel(SidebarPanel, bpy.types.Panel):
 
 
 def draw_filmed(layout: Any, context: Any, head: Any) -> None:
-    """Draw from where the head was filmed, and what to film next."""
+    """Draw from where the head was filmed, and, before it has splats, what to film next: these may
+    be of further takes."""
     settings = context.scene.stga
     arrow = "DISCLOSURE_TRI_DOWN" if settings.show_filmed else "DISCLOSURE_TRI_RIGHT"
     row = layout.row()
@@ -59,7 +60,8 @@ def draw_filmed(layout: Any, context: Any, head: Any) -> None:
     if not settings.show_filmed:
         return
     draw_picture(layout, head.name, directions_picture(tuple(head[tags.FILMED_CELLS])))
-    for text in filter(None, (head[tags.FILMED], head[tags.NEXT_TAKE])):
+    lines = head[tags.FILMED].splitlines()
+    for text in lines if settings.splats is None else lines[:1]:
         draw_text(layout, context, text)
 
 

@@ -158,29 +158,28 @@ def in_image_size(transforms: Transforms) -> tuple[Transforms, str | None]:
         return transforms, None
     from .images import image_size
 
-    images: dict[int, list[Path]] = {}
-    cameras = {}
+    alike: dict[tuple[float, ...], list[Frame]] = {}
     for frame in transforms.frames:
-        camera = frame.view.camera
-        cameras[id(camera)] = camera
-        images.setdefault(id(camera), []).append(frame.view.image)
-    scaled = {}
+        alike.setdefault(_intrinsics(frame.view.camera), []).append(frame)
+    sizes = {}
     sentences = []
-    for key, camera in cameras.items():
+    for key, frames in alike.items():
+        camera = frames[0].view.camera
+        images = [frame.view.image for frame in frames]
         size = camera.width, camera.height
-        first = image_size(images[key][0])
-        if size in (first, first[::-1]) or any(image_size(path) != first for path in images[key]):
+        first = image_size(images[0])
+        if size in (first, first[::-1]) or scaled_to(camera, first) is None:
             continue
-        found = scaled_to(camera, first)
-        if found is not None:
-            scaled[key] = found
+        if all(image_size(path) == first for path in images):
+            sizes[key] = first
             both = f"has {first[0]} x {first[1]} pixels, its camera {size[0]} x {size[1]}"
             factor = f"scaled by {first[0] / size[0]:.4g}"
-            sentences.append(f"{images[key][0]}: {both}; the calibration is {factor}")
+            sentences.append(f"{images[0]}: {both}; the calibration is {factor}")
 
     def fitted(frame: Frame) -> Frame:
         camera = frame.view.camera
-        found = scaled.get(id(camera))
+        size = sizes.get(_intrinsics(camera))
+        found = None if size is None else scaled_to(camera, size)
         if found is None:
             return frame
         cx, cy = frame.principal
@@ -189,6 +188,10 @@ def in_image_size(transforms: Transforms) -> tuple[Transforms, str | None]:
 
     splits = {name: tuple(map(fitted, own)) for name, own in transforms.splits.items()}
     return replace(transforms, splits=splits), next(iter(sentences), None)
+
+
+def _intrinsics(camera: Camera) -> tuple[float, ...]:
+    return camera.width, camera.height, camera.fl_x, camera.fl_y, camera.cx, camera.cy
 
 
 def _in_images(capture: Capture) -> float:

@@ -175,9 +175,9 @@ def frames_performance(path: Path, document: Any) -> Performance:
     about = {**(inner if isinstance(inner, dict) else {}), **outer}
     key = next((key for key in RATE_KEYS if key in about), "")
     fps = _number(f"{path}: {key}", about[key]) if key else None
-    aside = _beside(outer, frames)
+    beside = _columns_beside(outer, frames)
     if len(rows) == len(frames):
-        others |= {name: values for name, values in aside.items() if name not in others}
+        others |= {name: values for name, values in beside.items() if name not in others}
     listed = list(dict.fromkeys(name for row in rows for name in row))
     columns, guesses = columns_of(str(path), listed)
     if len(rows) < len(frames):
@@ -221,7 +221,7 @@ def _flat(values: dict[str, Any], prefix: str = "", depth: int = 0) -> dict[str,
     return found
 
 
-def _beside(outer: dict[str, Any], frames: list[Any]) -> dict[str, list[object]]:
+def _columns_beside(outer: dict[str, Any], frames: list[Any]) -> dict[str, list[object]]:
     """Columns of the lists that stand beside that of the frames and are as long, as times do."""
     lists = {
         name: value

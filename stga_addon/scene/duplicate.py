@@ -90,7 +90,8 @@ def _collect(family: list[Any], copies: list[Any]) -> None:
     root = family[0]
     new_root = copies[0]
     layer = bpy.context.view_layer
-    made: dict[Any, Any] = {}
+    # which cannot be copied
+    made = {scene.collection: scene.collection for scene in bpy.data.scenes}
     for original, copy in zip(family, copies, strict=True):
         for collection in original.users_collection:
             if collection not in made:
@@ -110,7 +111,8 @@ def _collect(family: list[Any], copies: list[Any]) -> None:
 
 def _parent_of(collection: Any) -> Any:
     every = [*(scene.collection for scene in bpy.data.scenes), *bpy.data.collections]
-    return next(each for each in every if collection.name in each.children)
+    parents = (each for each in every if collection.name in each.children)
+    return next(parents, bpy.context.scene.collection)
 
 
 def attach_to_bone(head: Any, armature: Any, bone: str) -> None:
@@ -122,13 +124,20 @@ def attach_to_bone(head: Any, armature: Any, bone: str) -> None:
         raise StgaError(f"{head.name}: is linked, or has lost the Empty that holds it")
     if bone and (armature is None or bone not in armature.data.bones):
         raise StgaError(f"{bone}: is no bone of {getattr(armature, 'name', 'an armature')}")
-    if bone and armature.parent is not None and root in _above(armature):
+    if bone and root in _above(armature):
         raise StgaError(f"{armature.name}: belongs to the avatar itself")
     root.parent = armature if bone else None
     root.parent_type = "BONE" if bone else "OBJECT"
     root.parent_bone = bone
+    if not bone:
+        root.matrix_world = place
+        return
+    root.matrix_parent_inverse.identity()
     bpy.context.view_layer.update()
-    root.matrix_world = place
+    basis = root.matrix_basis
+    # its own location and rotation, which may have keyframes, stay
+    to_bone = basis @ root.matrix_world.inverted() @ place @ basis.inverted()
+    root.matrix_parent_inverse = to_bone
 
 
 def _above(thing: Any) -> Iterator[Any]:

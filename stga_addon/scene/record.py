@@ -12,14 +12,13 @@ from typing import Any
 
 import bpy
 
+from ..training.run.folder import MAX_FOLDERS_UP
 from . import tags
 
 PATH_TAGS = (tags.CAPTURE, tags.FLAME_MODEL, tags.RUN, tags.AVATAR, tags.WORLD)
 """Properties of a head, or of the world's splats, that are paths."""
 SCENE_PATHS = ("training_run", "tracking_capture", "avatar_folder")
 """Properties of a scene's settings: what its last requests were about."""
-MAX_FOLDERS_UP = 2
-"""From a .blend file to a folder that holds all of its project."""
 COPIED = "copybuffer.blend"
 """The file through which Blender copies and pastes."""
 

@@ -20,10 +20,10 @@ IMAGE_SIZE = "stga_image_size"  # on a camera: width, height in pixels
 PIXEL_ASPECT = "stga_pixel_aspect"  # on a camera: fl_x / fl_y, the height of a pixel over its width
 CONVENTION = "stga_convention"  # on splats that follow a head: `Avatar.convention`
 ANTIALIASED = "stga_antialiased"  # on splats that follow a head: `Avatar.antialiased`
-FILMED = "stga_filmed"  # on splats that follow a head: `avatar.filmed.filmed_sides`; on the head:
-# `capture.filmed.Filmed.text`
+# on splats that follow a head: `avatar.filmed.filmed_sides`; on the head: lines of
+# `capture.filmed.Filmed`, its text and its next take
+FILMED = "stga_filmed"
 FILMED_CELLS = "stga_filmed_cells"  # on the head: `capture.filmed.Filmed.cells`
-NEXT_TAKE = "stga_next_take"  # on the head: `capture.filmed.Filmed.next_take`
 SHOWN_UNSEEN = "stga_shown_unseen"  # on the head: its first avatar has shown what is not filmed
 REVISION = "stga_revision"  # on a splat object's mesh: changes whenever splats are written into it
 RELIT_FRAME = "stga_relit_frame"  # on that mesh: the frame in whose light other engines show it

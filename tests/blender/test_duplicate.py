@@ -43,6 +43,7 @@ def test_a_copy_lives_by_itself(avatar, linked):
     """Catches a copy whose splats, drivers or bones are the original's, whose keyframes are shared
     or copied against what was asked for, that is not beside it, and data that nothing uses."""
     splats = panel().splats
+    bpy.context.scene.collection.objects.link(find_rig(avatar))
     groups = set(bpy.data.node_groups)
     cameras = len(bpy.data.cameras)
     ops.duplicate_avatar(linked=linked)
@@ -58,12 +59,12 @@ def test_a_copy_lives_by_itself(avatar, linked):
     assert set(bpy.data.node_groups) == groups
     assert len(bpy.data.cameras) == cameras
     assert not bpy.data.libraries
-    aside = world(copy).mean(0) - world(avatar).mean(0)
+    distance = world(copy).mean(0) - world(avatar).mean(0)
     for timestep in copy[tags.TIMESTEPS]:
         bpy.context.scene.frame_set(timestep)
         apart = world(copy) - world(avatar)
         np.testing.assert_allclose(apart, np.broadcast_to(apart[0], apart.shape), atol=1e-6)
-    assert aside[0] > np.ptp(world(avatar)[:, 0])
+    assert distance[0] > np.ptp(world(avatar)[:, 0])
     ops.duplicate_avatar(linked=linked)
     assert world(panel().head)[:, 0].min() > world(copy)[:, 0].max()
     before = world(avatar)
@@ -89,10 +90,14 @@ def test_an_avatar_on_a_body(avatar):
     bone.head = (0.1, 0.0, -0.5)
     bone.tail = (0.1, 0.05, -0.2)
     bpy.ops.object.mode_set(mode="OBJECT")
+    root = avatar.parent
+    for frame in (0, 9):  # keyframes of the avatar's place stay
+        root.keyframe_insert("location", frame=frame)
     before = world(avatar)
     with failure("spine.001: is no bone of body"):
         ops.attach_to_bone(armature="body", bone="spine.001")
     ops.attach_to_bone(armature="body", bone="spine")
+    bpy.context.scene.frame_set(bpy.context.scene.frame_current)
     np.testing.assert_allclose(world(avatar), before, atol=1e-6)
     posed = body.pose.bones["spine"]
     rest = np.array(body.matrix_world @ posed.matrix)
@@ -102,6 +107,7 @@ def test_an_avatar_on_a_body(avatar):
     turn = np.array(body.matrix_world @ posed.matrix) @ np.linalg.inv(rest)
     expected = before @ turn[:3, :3].T + turn[:3, 3]
     np.testing.assert_allclose(world(avatar), expected, atol=1e-5)
+    root.animation_data_clear()
     ops.attach_to_bone()
     np.testing.assert_allclose(world(avatar), expected, atol=1e-5)
     posed.rotation_euler = (0.0, 0.0, 0.0)

@@ -97,7 +97,7 @@ FILES = {
 @pytest.mark.parametrize("name", FILES)
 def test_a_mesh_that_misses_its_images(tmp_path, name):
     """Catches a capture of other axes, inverse matrices, another up or inverted masks that trains
-    to nothing, without a word; a repair that is not named, not kept, or not the right one."""
+    to nothing, without a warning; a repair that is not named, not kept, or not the right one."""
     root = write_capture(tmp_path / "capture", **FILES[name])
     (warning,) = [text for text in open_capture(root).warnings if "--repair" in text]
     assert f"({name})" in warning

@@ -132,7 +132,7 @@ def find_sources(root: Path, containers: Sequence[str] = CONTAINERS) -> Sources:
 
 
 def _is_mask_folder(name: str) -> bool:
-    return name.partition("-")[0] in MASK_FOLDERS
+    return re.sub(r"-[\d.]+fps$", "", name) in MASK_FOLDERS
 
 
 def _name_by_folder(sources: Sources) -> None:
