@@ -19,6 +19,7 @@ from ..stga_addon.scene.display import splat_nodes, splat_object
 from ..stga_addon.scene.display.splat_nodes import AS_TRAINED, LIMITS, NATIVE, POINTS, QUADS
 from ..stga_addon.scene.light import throw_shadow, throws_shadow
 from ..stga_addon.scene.objects import show_progress
+from ..stga_addon.scene.render import film_set
 from ..stga_addon.scene.render.scene_splats import forget_frame, relight_frame
 from ..stga_addon.scene.render.viewport_display import ENGINE, is_shown_as_trained
 from ..stga_addon.scene.rig.head import LINKED
@@ -133,7 +134,8 @@ def leaves_out(scene: Any) -> list[str]:
     if scene.render.engine != ENGINE:
         return []
     others = (thing for thing in scene.objects if tags.KIND not in thing and not thing.hide_render)
-    left_out = ["meshes"] if any(thing.type in SURFACES for thing in others) else []
+    has_set = not film_set.shows_set(scene) and any(thing.type in SURFACES for thing in others)
+    left_out = ["meshes"] if has_set else []
     return [*left_out, *(["depth of field"] if _has_blur(scene) else [])]
 
 
@@ -157,6 +159,24 @@ def _own_as_trained(context: Any) -> list[Any]:
 PREVIEW_SAMPLES = 4
 """EEVEE's samples of a viewport that shows splats as transparent quads: 16, its default, take
 minutes where the processor draws."""
+
+
+class ChooseSet(Edit, bpy.types.Operator):
+    """Choose whether images of the engine STGA Splats show the scene's other objects: EEVEE renders
+    them in the same press, as a scene of its own, and the compositor combines both by depth"""
+
+    bl_label = "Set"
+
+    shown: options.choice(
+        "Set",
+        "What images show beside splats",
+        ("SHOWN", "Shown", "The other objects, in front of the splats and behind them"),
+        ("LEFT_OUT", "Left Out", "Splats alone"),
+    )
+
+    def run(self, context: Any) -> None:
+        change = film_set.show_set if self.shown == "SHOWN" else film_set.leave_out_set
+        change(context.scene)
 
 
 class PreviewImages(Edit, bpy.types.Operator):

@@ -24,6 +24,7 @@ from ..stga_addon.scene.display.splat_object import shows_nodes
 from ..stga_addon.scene.gpu.context import has_gpu_context
 from ..stga_addon.scene.light import MODE_CHANGED, lighting_settings, throws_shadow, world_light
 from ..stga_addon.scene.render import viewport_display
+from ..stga_addon.scene.render.film_set import shows_set
 from ..stga_addon.scene.render.scene_splats import level_exposure, light_hint
 from ..stga_addon.scene.render.viewport_display import ENGINE
 from .sidebar import SidebarPanel, columns, draw_running, draw_text
@@ -195,7 +196,10 @@ def draw_left_out(layout: Any, context: Any) -> None:
     hint = left_out_hint(context.scene)
     if hint:
         draw_text(layout, context, hint, "INFO")
-        show = layout.operator("stga.preview_images", text="Show All", icon="SHADING_RENDERED")
+        row = layout.row(align=True)
+        if "meshes" in leaves_out(context.scene):
+            row.operator("stga.choose_set", text="Show Set", icon="SCENE_DATA").shown = "SHOWN"
+        show = row.operator("stga.preview_images", text="Show All", icon="SHADING_RENDERED")
         show.with_engine = True
 
 
@@ -229,6 +233,8 @@ class RenderPanel(bpy.types.Panel):
         has_python = has_training_python(context)
         layout.use_property_split = True
         draw_left_out(layout, context)
+        shown = "Shown" if shows_set(context.scene) else "Left Out"
+        layout.operator_menu_enum("stga.choose_set", "shown", text=f"Set: {shown}")
         layout.prop(context.scene.render, "film_transparent", text="Transparent Film")
         layout.prop(context.view_layer, "use_pass_z", text="Depth Pass")
         if missing_packages() and not has_gpu_context():

@@ -272,6 +272,54 @@ def allow_depth_write(shader: Any) -> None:
         shader.depth_write("ANY")
 
 
+def compositor_tree(scene: Any) -> Any:
+    """The scene's tree of compositor nodes; None without one, or where it is not used."""
+    if hasattr(scene, "compositing_node_group"):  # from 5.0 on
+        return scene.compositing_node_group
+    return scene.node_tree if scene.use_nodes else None
+
+
+def new_compositor_tree(scene: Any) -> Any:
+    """Give the scene a tree of compositor nodes that passes its image on."""
+    if not hasattr(scene, "compositing_node_group"):
+        scene.use_nodes = True
+        return scene.node_tree
+    tree = bpy.data.node_groups.new(f"{scene.name} Compositor", "CompositorNodeTree")
+    tree.interface.new_socket("Image", in_out="OUTPUT", socket_type="NodeSocketColor")
+    layers = tree.nodes.new("CompositorNodeRLayers")
+    layers.scene = scene
+    output = tree.nodes.new("NodeGroupOutput")
+    output.location.x = 700.0
+    tree.links.new(layers.outputs["Image"], output.inputs["Image"])
+    scene.compositing_node_group = tree
+    return tree
+
+
+def compositor_math(nodes: Any, operation: str, *values: Any) -> Any:
+    """Output of a Math node of the compositor, whose own kind went with 5.0."""
+    own = "CompositorNodeMath"
+    kind = own if hasattr(bpy.types, own) else "ShaderNodeMath"
+    return nodes.out(kind, {"Value": list(values)}, operation=operation)
+
+
+def compositor_mix(nodes: Any, factor: Any, first: Any, second: Any) -> Any:
+    """Output of a Mix node of the compositor: second where factor is 1."""
+    own = "CompositorNodeMixRGB"
+    if hasattr(bpy.types, own):
+        return nodes.out(own, {"Fac": factor, "Image": [first, second]})
+    inputs = {"Factor": factor, "A": first, "B": second}
+    return nodes.out("ShaderNodeMix", inputs, data_type="RGBA")
+
+
+def alpha_over(nodes: Any, background: Any, foreground: Any) -> Any:
+    """Output of an Alpha Over node, whose inputs have names of their own from 5.0 on."""
+    node = nodes.add("CompositorNodeAlphaOver")
+    images = [each for each in node.inputs if each.type == "RGBA"]
+    for socket, image in zip(images, (background, foreground), strict=True):
+        nodes.tree.links.new(image, socket)
+    return node.outputs[0]
+
+
 def working_space() -> str:
     """The color space that is scene-linear in the open file; `REC709` before Blender 5.0."""
     spaces = getattr(bpy.data, "colorspace", None)

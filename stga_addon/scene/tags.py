@@ -34,6 +34,7 @@ WORLD = "stga_world"  # on splats of a run's world: their file
 PERFORMANCE = "stga_performance"  # on an action: keyframes of another motion than the capture's
 HELD = "stga_held"  # on an action: the part of the capture's motion that is held outside of it
 
+SET = "stga_set"  # on a scene: the scene that renders its set, `render.film_set`
 OWN_RESOLUTION = "stga_own_resolution"  # on a scene, while a capture's camera is looked through
 
 # Kinds of object.

@@ -23,6 +23,7 @@ from ..gpu.renderer import CompositeTarget, SplatRenderer
 from ..layers import SceneLayer
 from ..light import settings_values
 from ..objects import Warn, after_render, log_warning
+from .film_set import shows_set, update_set
 from .scene_splats import SplatCache, all_layers
 from .view_transform import combined, inverse_view, measure, needs_inverse, scene_background, srgb
 from .viewport_display import ENGINE, display, is_drawn_by_engine, region_view
@@ -150,9 +151,10 @@ class SplatsEngine(bpy.types.RenderEngine):  # type: ignore[misc]
             problem = "The view transform could not be measured in time and changes colors"
             self.report({"WARNING"}, f"{problem}; render again, or choose Standard")
         assert image.depth is not None
-        threshold = max(depsgraph.view_layer.pass_alpha_threshold, MIN_ALPHA)
-        covered = image.alpha - hidden >= threshold
-        background = scene_background(scene)
+        with_set = shows_set(scene)
+        chosen = 0.0 if with_set else depsgraph.view_layer.pass_alpha_threshold
+        covered = image.alpha - hidden >= max(chosen, MIN_ALPHA)
+        background = None if with_set else scene_background(scene)
         return {
             "Combined": combined(image.rgb, image.alpha, background, inverse, hidden),
             "Depth": np.where(covered, image.depth, BACKGROUND_DEPTH)[..., None],
@@ -233,9 +235,11 @@ def draw_image(
 
 @persistent
 def _before_render(*_: Any) -> None:
-    """Measure the view transforms of all scenes of this engine: a compositor may render any."""
+    """Measure the view transforms of all scenes of this engine, and bring their sets up to date: a
+    compositor may render any."""
     for scene in [scene for scene in bpy.data.scenes if scene.render.engine == ENGINE]:
         measure(scene)
+        update_set(scene)
 
 
 def register(

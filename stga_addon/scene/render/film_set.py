@@ -1,0 +1,156 @@
+"""The set of a shot: objects that the engine STGA Splats leaves out. EEVEE renders them as a second
+scene in the same press, and nodes of the compositor combine both images by depth."""
+
+from collections.abc import Iterator
+from contextlib import suppress
+from typing import Any
+
+import bpy
+
+from ...errors import StgaError
+from .. import compat, tags
+from ..display import splat_nodes
+from ..display.node_builder import Nodes, new_socket
+from ..display.splat_object import get_input
+from ..light import throw_shadow, throws_shadow
+
+NODE = "STGA Set"
+"""Name of the node that combines both images, and of its group."""
+LAYERS = "STGA Set Layers"
+"""Name of the node that renders the second scene."""
+PASSES = "Image", "Depth"
+"""Outputs of the splats' Render Layers node that the combined ones replace."""
+
+
+def shows_set(scene: Any) -> bool:
+    """Whether images of the scene are combined with its set."""
+    tree = compat.compositor_tree(scene)
+    return tree is not None and scene.render.use_compositing and NODE in tree.nodes
+
+
+def show_set(scene: Any) -> None:
+    """Add the second scene, and the nodes that combine it with the splats' images; heads throw
+    their shadows. Nodes that follow the splats' Render Layers follow the combination."""
+    if shows_set(scene):
+        return
+    scene.render.use_compositing = True
+    tree = compat.compositor_tree(scene) or compat.new_compositor_tree(scene)
+    own = next((node for node in tree.nodes if _renders(node, scene)), None)
+    if own is None:
+        own = tree.nodes.new("CompositorNodeRLayers")
+        own.scene = scene
+    scene[tags.SET] = bpy.data.scenes.new(f"{scene.name} Set")
+    update_set(scene)
+    layers = tree.nodes.new("CompositorNodeRLayers")
+    layers.name = layers.label = LAYERS
+    layers.scene = scene[tags.SET]
+    layers.location = own.location.x, own.location.y - 400.0
+    both = tree.nodes.new("CompositorNodeGroup")
+    both.name = both.label = NODE
+    both.node_tree = _depth_combine()
+    both.location = own.location.x + 350.0, own.location.y
+    for name in PASSES:
+        for link in list(own.outputs[name].links):
+            tree.links.new(both.outputs[name], link.to_socket)
+        tree.links.new(own.outputs[name], both.inputs[f"Splats {name}"])
+        tree.links.new(layers.outputs[name], both.inputs[f"Set {name}"])
+    for splats in _splats_of(scene):
+        with suppress(StgaError):  # splats of no head
+            head = get_input(splats, splat_nodes.HEAD)
+            if head is not None and head.library is None and not throws_shadow(splats):
+                throw_shadow(splats, True)
+
+
+def leave_out_set(scene: Any) -> None:
+    """Remove the second scene and its nodes; what followed the combination follows the splats'
+    images again. Heads' shadows stay as they are."""
+    tree = compat.compositor_tree(scene)
+    both = None if tree is None else tree.nodes.get(NODE)
+    if both is not None:
+        for name in PASSES:
+            source = both.inputs[f"Splats {name}"].links
+            for link in list(both.outputs[name].links) if source else ():
+                tree.links.new(source[0].from_socket, link.to_socket)
+        for node in (both, tree.nodes.get(LAYERS)):
+            if node is not None:
+                tree.nodes.remove(node)
+    other = scene.pop(tags.SET, None)
+    if other is not None:
+        bpy.data.scenes.remove(other)
+
+
+def update_set(scene: Any) -> None:
+    """Let the second scene show what the scene shows now: its objects without splats, camera, world
+    and film."""
+    other = scene.get(tags.SET)
+    if other is None:
+        return
+    wanted = {each for each in _rendered(scene.view_layers[0].layer_collection) if _is_set(each)}
+    present = set(other.collection.objects)
+    for each in present - wanted:
+        other.collection.objects.unlink(each)
+    for each in wanted - present:
+        other.collection.objects.link(each)
+    if compat.EEVEE != other.render.engine != "CYCLES":
+        other.render.engine = compat.EEVEE
+    values = {"camera": _camera(scene), "world": scene.world}
+    for name, value in values.items():
+        if getattr(other, name) != value:
+            setattr(other, name, value)
+    other.render.film_transparent = scene.render.film_transparent
+    for layer in (scene.view_layers[0], other.view_layers[0]):
+        layer.use_pass_z = True
+
+
+def _camera(scene: Any) -> Any:
+    """The camera of the current frame, which markers may choose."""
+    bound = [each for each in scene.timeline_markers if each.camera is not None]
+    past = [each for each in bound if each.frame <= scene.frame_current]
+    return max(past, key=lambda each: each.frame).camera if past else scene.camera
+
+
+def _renders(node: Any, scene: Any) -> bool:
+    return node.bl_idname == "CompositorNodeRLayers" and node.scene == scene
+
+
+def _is_set(thing: Any) -> bool:
+    """Whether an object belongs to the set: all but splats, and heads that are hidden in images."""
+    return thing.get(tags.KIND) != tags.SPLATS
+
+
+def _splats_of(scene: Any) -> list[Any]:
+    return [each for each in scene.objects if each.get(tags.KIND) == tags.SPLATS]
+
+
+def _rendered(layer_collection: Any) -> Iterator[Any]:
+    """The objects of collections that a view layer shows in images."""
+    if layer_collection.exclude or layer_collection.collection.hide_render:
+        return
+    yield from layer_collection.collection.objects
+    for child in layer_collection.children:
+        yield from _rendered(child)
+
+
+def _depth_combine() -> Any:
+    """A group that lays the nearer image over the other at each pixel. Where the set's edges cross
+    the splats, the choice is antialiased; splats' own edges blend by their alpha."""
+    tree = bpy.data.node_groups.new(NODE, "CompositorNodeTree")
+    for side in ("Splats", "Set"):
+        new_socket(tree, f"{side} Image", "INPUT", "Color")
+        new_socket(tree, f"{side} Depth", "INPUT", "Float")
+    new_socket(tree, "Image", "OUTPUT", "Color")
+    new_socket(tree, "Depth", "OUTPUT", "Float")
+    new_socket(tree, "Mask", "OUTPUT", "Float").description = "Share of splats in each pixel"
+    nodes = Nodes(tree)
+    splats, splat_depth, others, other_depth, *_ = nodes.add("NodeGroupInput").outputs
+    is_behind = compat.compositor_math(nodes, "GREATER_THAN", splat_depth, other_depth)
+    hidden = nodes.out("CompositorNodeAntiAliasing", {"Image": is_behind})
+    before = compat.alpha_over(nodes, others, splats)
+    behind = compat.alpha_over(nodes, splats, others)
+    nearest = compat.compositor_math(nodes, "MINIMUM", splat_depth, other_depth)
+    alpha = nodes.add("CompositorNodeSeparateColor", {"Image": splats}).outputs["Alpha"]
+    seen = compat.compositor_math(nodes, "SUBTRACT", 1.0, hidden)
+    mask = compat.compositor_math(nodes, "MULTIPLY", alpha, seen)
+    image = compat.compositor_mix(nodes, hidden, before, behind)
+    nodes.finish("NodeGroupOutput", {"Image": image, "Depth": nearest, "Mask": mask})
+    return tree
