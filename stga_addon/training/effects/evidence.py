@@ -72,20 +72,27 @@ def compare(before: np.ndarray, after: np.ndarray) -> Evidence:
 
 @dataclass(frozen=True)
 class CameraColors:
-    """Cameras (C,), their gain (C, 3) and offset (C, 3) in levels, against the mean camera."""
+    """Cameras (C,), their gain (C, 3) and offset (C, 3) in levels, against the mean of some."""
 
     camera: np.ndarray
     gain: np.ndarray
     offset: np.ndarray
 
     def undo(self, color: np.ndarray, camera: np.ndarray) -> np.ndarray:
-        """color (S, K, 3) of the cameras (S,), as the mean camera would have seen it."""
+        """color (S, K, 3) of the cameras (S,), as that mean camera would have seen it."""
         row = np.searchsorted(self.camera, camera)
         return (color - self.offset[row][:, None]) / self.gain[row][:, None]
 
+    def against(self, chosen: np.ndarray) -> "CameraColors":
+        """The same against the mean of the cameras that are chosen (C,) bool."""
+        gain = self.gain / self.gain[chosen].mean(0)
+        offset = self.offset - self.offset[chosen].mean(0) * gain
+        return CameraColors(self.camera, gain, offset)
+
 
 def fit_cameras(samples: Samples, color: np.ndarray) -> CameraColors:
-    """From color (S, K, 3), NaN if unseen, by least squares: cameras and triangles in turn."""
+    """From color (S, K, 3), NaN if unseen, by least squares: cameras and triangles in turn; against
+    the mean of all."""
     camera, row = np.unique(samples.camera, return_inverse=True)
     fitted = CameraColors(camera, np.ones((len(camera), 3)), np.zeros((len(camera), 3)))
     for _ in range(CAMERA_FIT_ITERATIONS):
@@ -99,7 +106,7 @@ def fit_cameras(samples: Samples, color: np.ndarray) -> CameraColors:
             prior = [[CAMERA_PRIOR_SAMPLES * TYPICAL_LEVEL**2], [offset_prior]]
             fits.append(fit_lines(x[known].T, own[known].T, np.array(prior)))
         gain, offset = np.stack(fits, axis=1)
-        fitted = CameraColors(camera, gain / gain.mean(0), offset - offset.mean(0))
+        fitted = CameraColors(camera, gain, offset).against(np.ones(len(camera), bool))
     return fitted
 
 

@@ -1,5 +1,6 @@
 """Measurements of a capture that the rules of effects ask for, each made once and only if asked."""
 
+from collections import Counter
 from dataclasses import replace
 from functools import cache, cached_property
 
@@ -50,7 +51,12 @@ class CaptureFacts:
 
     @cached_property
     def camera_colors(self) -> CameraColors:
-        return evidence.fit_cameras(self.samples, self.stable_colors)
+        """Against the mean of the cameras that filmed most moments, so that an avatar of photos all
+        around and a talk looks as in the talk."""
+        found = evidence.fit_cameras(self.samples, self.stable_colors)
+        moments = Counter(view.camera_index for view in self.views)
+        counts = np.array([moments[camera] for camera in found.camera.tolist()])
+        return found.against(counts > counts.max() / 2)
 
     @cached_property
     def drift(self) -> np.ndarray:

@@ -175,6 +175,20 @@ def test_cameras_of_different_exposure(painted):
     assert abs(gain * 120 + offset - 120).max() > 8.0
 
 
+def test_exposure_of_photos_and_a_talk(painted):
+    """Catches an avatar of photos all around and a talk that is brighter or darker than the talk."""
+    gain, offset = unlike_cameras()
+    capture = painted(gain=gain, offset=offset)
+    views = [view for view in capture.views["train"] if view.camera_index == 3 or not view.timestep]
+    found = CaptureFacts(replace(capture, views={"train": views}), SETTINGS).camera_colors
+    assert (found.gain[3] == 1).all()
+    assert (found.offset[3] == 0).all()
+    for level in (80, 120, 160):
+        shown = gain[3] * level + offset[3]
+        differences = found.gain * shown + found.offset - (gain * level + offset)
+        assert abs(differences).max() < 4.0
+
+
 def test_background(painted):
     """Catches a background guessed without masks, and splats of the wall behind the head."""
     plan, settings = planned(painted(background=(0, 0, 0), **FEW_VIEWS))
