@@ -129,25 +129,12 @@ class ChooseDisplay(Edit, bpy.types.Operator):
             space.shading.type = "MATERIAL"
 
 
-def leaves_out(scene: Any) -> list[str]:
-    """What the engine STGA Splats leaves out of the scene's images; nothing by other engines."""
-    if scene.render.engine != ENGINE:
-        return []
+def leaves_out_set(scene: Any) -> bool:
+    """Whether the engine STGA Splats leaves other objects out of the scene's images."""
+    if scene.render.engine != ENGINE or film_set.shows_set(scene):
+        return False
     others = (thing for thing in scene.objects if tags.KIND not in thing and not thing.hide_render)
-    has_set = not film_set.shows_set(scene) and any(thing.type in SURFACES for thing in others)
-    left_out = ["meshes"] if has_set else []
-    return [*left_out, *(["depth of field"] if _has_blur(scene) else [])]
-
-
-def _has_blur(scene: Any) -> bool:
-    dof = None if scene.camera is None else getattr(scene.camera.data, "dof", None)
-    return dof is not None and dof.use_dof
-
-
-def whole_engine(scene: Any) -> str:
-    """The engine that shows what STGA Splats leaves out: EEVEE blurs camera quads with what is
-    behind them."""
-    return "CYCLES" if _has_blur(scene) and not compat.NATIVE_SPLATS else compat.EEVEE
+    return any(thing.type in SURFACES for thing in others)
 
 
 def _own_as_trained(context: Any) -> list[Any]:
@@ -184,16 +171,7 @@ class PreviewImages(Edit, bpy.types.Operator):
     through the scene's camera as quads that face it, without one as points"""
 
     bl_label = "Preview for EEVEE/Cycles"
-    needs = (
-        need(
-            lambda context: leaves_out(context.scene) or _own_as_trained(context),
-            "No splats are displayed as trained",
-        ),
-    )
-
-    with_engine: options.boolean(
-        "Choose Engine", "Let EEVEE or Cycles render, whichever shows the whole scene", options=ONCE
-    )
+    needs = (need(_own_as_trained, "No splats are displayed as trained"),)
 
     def run(self, context: Any) -> None:
         scene = context.scene
@@ -202,8 +180,6 @@ class PreviewImages(Edit, bpy.types.Operator):
         mode = NATIVE if compat.NATIVE_SPLATS else mode
         for thing in _own_as_trained(context):
             splat_object.choose_display(thing, mode)
-        if self.with_engine:
-            scene.render.engine = whole_engine(scene)
         splat_object.use_transparent_bounces(scene)
         if mode == QUADS:
             self._limit_samples(scene.eevee)

@@ -10,20 +10,20 @@ import bpy
 from bpy.app.handlers import persistent
 
 from ..operators.common import AtEnd, register_handlers
-from ..operators.show import GRAY, leaves_out, whole_engine
+from ..operators.show import GRAY, leaves_out_set
 from ..operators.training_python import has_training_python
 from ..stga_addon.errors import StgaError
 from ..stga_addon.jobs.table import Kind
 from ..stga_addon.render.client import missing_packages
-from ..stga_addon.scene import compat, tags
+from ..stga_addon.scene import tags
 from ..stga_addon.scene.compat import modifier_input_owner
 from ..stga_addon.scene.display import splat_nodes, splat_object
 from ..stga_addon.scene.display.splat_attributes import UNSEEN
-from ..stga_addon.scene.display.splat_nodes import AS_TRAINED, LIMITS, NATIVE, QUADS
+from ..stga_addon.scene.display.splat_nodes import AS_TRAINED, LIMITS, NATIVE
 from ..stga_addon.scene.display.splat_object import shows_nodes
 from ..stga_addon.scene.gpu.context import has_gpu_context
 from ..stga_addon.scene.light import MODE_CHANGED, lighting_settings, throws_shadow, world_light
-from ..stga_addon.scene.render import viewport_display
+from ..stga_addon.scene.render import lens, viewport_display
 from ..stga_addon.scene.render.film_set import shows_set
 from ..stga_addon.scene.render.scene_splats import level_exposure, light_hint
 from ..stga_addon.scene.render.viewport_display import ENGINE
@@ -181,26 +181,15 @@ def _before_image(scene: Any, *_: Any) -> None:
 
 def left_out_hint(scene: Any) -> str | None:
     """A sentence where the engine STGA Splats leaves out what the scene's images are to show."""
-    left_out = leaves_out(scene)
-    if not left_out:
-        return None
-    engine = "Cycles" if whole_engine(scene) == "CYCLES" else "EEVEE"
-    display = NATIVE if compat.NATIVE_SPLATS else QUADS
-    names = " and ".join(left_out)
-    whole = f"{engine} with {display} shows all in one image"
-    return f"STGA Splats leaves out {names}; {whole}"
+    return "STGA Splats leaves out other objects" if leaves_out_set(scene) else None
 
 
 def draw_left_out(layout: Any, context: Any) -> None:
-    """Say what the engine leaves out of images, with the button that chooses another."""
+    """Say that the engine leaves out the set, with the button that shows it."""
     hint = left_out_hint(context.scene)
     if hint:
         draw_text(layout, context, hint, "INFO")
-        row = layout.row(align=True)
-        if "meshes" in leaves_out(context.scene):
-            row.operator("stga.choose_set", text="Show Set", icon="SCENE_DATA").shown = "SHOWN"
-        show = row.operator("stga.preview_images", text="Show All", icon="SHADING_RENDERED")
-        show.with_engine = True
+        layout.operator("stga.choose_set", text="Show Set", icon="SCENE_DATA").shown = "SHOWN"
 
 
 def _pop_up(hint: str) -> None:
@@ -232,9 +221,10 @@ class RenderPanel(bpy.types.Panel):
         layout = self.layout
         has_python = has_training_python(context)
         layout.use_property_split = True
-        draw_left_out(layout, context)
         shown = "Shown" if shows_set(context.scene) else "Left Out"
         layout.operator_menu_enum("stga.choose_set", "shown", text=f"Set: {shown}")
+        if lens.is_blurred(context.scene):
+            layout.prop(context.scene.eevee, "taa_render_samples", text="Samples of Blur")
         layout.prop(context.scene.render, "film_transparent", text="Transparent Film")
         layout.prop(context.view_layer, "use_pass_z", text="Depth Pass")
         if missing_packages() and not has_gpu_context():

@@ -37,6 +37,10 @@ def wall(y, left, right):
     return [(left, y, -9.0), (right, y, -9.0), (right, y, 9.0), (left, y, 9.0)]
 
 
+def links_of(tree):
+    return {(link.from_socket.path_from_id(), link.to_socket.path_from_id()) for link in tree.links}
+
+
 def image_nodes(scene):
     """Render Layers and the output, which the set's nodes come between, and what is between."""
     tree = compat.new_compositor_tree(scene)
@@ -107,7 +111,7 @@ def test_sets_keep_what_the_compositor_does(shot, tmp_path):
     nodes or scenes behind once it is left out."""
     board("wall", BEHIND, wall(6.0, -20.0, 20.0))
     tree, exposure = image_nodes(shot)
-    before = {(link.from_socket.path_from_id(), link.to_socket.path_from_id()) for link in tree.links}
+    before = links_of(tree)
     scenes = len(bpy.data.scenes)
     show_set(shot)
     assert film_set.shows_set(shot)
@@ -119,7 +123,5 @@ def test_sets_keep_what_the_compositor_does(shot, tmp_path):
     film_set.leave_out_set(shot)
     assert not film_set.shows_set(shot)
     assert len(bpy.data.scenes) == scenes
-    assert before == {
-        (link.from_socket.path_from_id(), link.to_socket.path_from_id()) for link in tree.links
-    }
+    assert links_of(tree) == before
     assert render(tmp_path)["A"][0, 0] == 0.0

@@ -171,7 +171,7 @@ def test_what_an_image_leaves_out_is_said_in_a_small_window(extension, monkeypat
         preferences=SimpleNamespace(system=SimpleNamespace(ui_scale=1.0)),
     )
     monkeypatch.setattr(extension.ui.show_panel, "bpy", SimpleNamespace(context=context))
-    hint = "STGA Splats leaves out meshes; EEVEE with Camera Quads shows all in one image"
+    hint = "Scene lights count in As Trained only; Relight Frame stores them for other engines"
     extension.ui.show_panel._pop_up(hint)
     assert " ".join(said) == hint
     assert max(map(len, said)) * 7 < 320

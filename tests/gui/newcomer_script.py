@@ -582,25 +582,21 @@ def click_on_the_head():
 
 
 def left_out():
-    """A mesh and a blur that the engine leaves out, and the button that shows all."""
+    """A mesh that the engine leaves out, and the button that shows it."""
     yield opened(FIRST)
     scene = bpy.context.scene
     engine = module("stga_addon.scene.render.engine").ENGINE
+    shows_set = module("stga_addon.scene.render.film_set").shows_set
     with in_viewport():
         bpy.ops.mesh.primitive_cube_add(size=0.06, location=(0.05, -0.15, 0))
-    seen["shows all"] = []
-    for scene.camera.data.dof.use_dof in (False, True):
-        scene.render.engine = engine
-        yield 0.5
-        shot(f"left out {scene.camera.data.dof.use_dof}")
-        said = drawn_panels.drawn()["Next Step"].text
-        what = "leaves out meshes and depth" if scene.camera.data.dof.use_dof else "out meshes;"
-        name, options = drawn_panels.buttons()["Next Step: Show All"]
-        options = {option: value for option, value in options.items() if option == "with_engine"}
-        click("Show All", getattr(bpy.ops.stga, name.split(".")[1]), **options)
-        seen["shows all"].append(what in said and scene.render.engine != engine)
-    scene.camera.data.dof.use_dof = False
     scene.render.engine = engine
+    yield 0.5
+    shot("left out")
+    said = drawn_panels.drawn()["Next Step"].text
+    click("Show Set", bpy.ops.stga.choose_set, shown="SHOWN")
+    seen["shows all"] = "leaves out other objects" in said and shows_set(scene)
+    with in_viewport():
+        bpy.ops.stga.choose_set(shown="LEFT_OUT")
     bpy.context.preferences.view.render_display_type = "WINDOW"
     with in_viewport():
         bpy.ops.render.render("INVOKE_DEFAULT")

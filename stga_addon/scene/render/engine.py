@@ -23,7 +23,9 @@ from ..gpu.renderer import CompositeTarget, SplatRenderer
 from ..layers import SceneLayer
 from ..light import settings_values
 from ..objects import Warn, after_render, log_warning
+from . import lens
 from .film_set import shows_set, update_set
+from .lens import Sample
 from .scene_splats import SplatCache, all_layers
 from .view_transform import combined, inverse_view, measure, needs_inverse, scene_background, srgb
 from .viewport_display import ENGINE, display, is_drawn_by_engine, region_view
@@ -136,9 +138,53 @@ class SplatsEngine(bpy.types.RenderEngine):  # type: ignore[misc]
         """Values (H, W, channels) of each pass, top row first. view_name: of a stereo image, or
         empty."""
         scene = depsgraph.scene
-        view = self._view(depsgraph, border, view_name)
-        layers = all_layers(depsgraph, SplatCache())
-        self.update_stats("", f"{sum(len(layer.splats) for layer in layers)} splats")
+        self._warn_of_view_transform(scene)
+        with_set = shows_set(scene)
+        background = None if with_set else scene_background(scene)
+        inverse = inverse_view(scene)
+        cache = SplatCache()
+        frame = scene.frame_current + scene.frame_subframe
+        offset = 0.0
+        color = share = distance = np.zeros(1)
+        samples = lens.samples(scene, view_camera(scene, view_name))
+        for taken, sample in enumerate(samples):
+            if sample.offset != offset:
+                offset = sample.offset
+                self._go_to(frame + offset)
+                cache.frame_changed()
+            layers = all_layers(depsgraph, cache)
+            view = self._view(depsgraph, border, view_name, sample)
+            image, hidden = self._layers_image(layers, view)
+            assert image.depth is not None
+            color = color + combined(image.rgb, image.alpha, background, inverse, hidden)
+            seen = image.alpha - hidden
+            share = share + seen
+            distance = distance + seen * image.depth
+            self.update_stats("", f"{sum(len(layer.splats) for layer in layers)} splats")
+            self.update_progress((taken + 1) / len(samples))
+            if self.test_break():
+                break
+        if offset:
+            self._go_to(frame)
+        count = taken + 1
+        chosen = 0.0 if with_set else depsgraph.view_layer.pass_alpha_threshold
+        covered = share / count >= max(chosen, MIN_ALPHA)
+        depth = np.where(covered, distance / np.maximum(share, MIN_ALPHA), BACKGROUND_DEPTH)
+        return {"Combined": color / count, "Depth": depth[..., None]}
+
+    def _go_to(self, frame: float) -> None:
+        whole = int(np.floor(frame))
+        self.frame_set(whole, frame - whole)
+
+    def _warn_of_view_transform(self, scene: Any) -> None:
+        if inverse_view(scene) is None and needs_inverse(scene):
+            problem = "The view transform could not be measured in time and changes colors"
+            self.report({"WARNING"}, f"{problem}; render again, or choose Standard")
+
+    def _layers_image(
+        self, layers: list[SceneLayer], view: View
+    ) -> tuple[ComposedImage, np.ndarray]:
+        """One image, and the part (H, W) of its alpha that holdouts hide."""
         held_out = any(layer.holdout for layer in layers)
         shown = [layer.painted(0.0) if layer.holdout else layer for layer in layers]
         image = self._image(shown, view)
@@ -146,22 +192,13 @@ class SplatsEngine(bpy.types.RenderEngine):  # type: ignore[misc]
         if held_out:  # white where splats are seen, black where holdouts hide them
             white = [layer.painted(0.0 if layer.holdout else 1.0) for layer in layers]
             hidden = np.clip(image.alpha - self._image(white, view).rgb[0], 0, image.alpha)
-        inverse = inverse_view(scene)
-        if inverse is None and needs_inverse(scene):
-            problem = "The view transform could not be measured in time and changes colors"
-            self.report({"WARNING"}, f"{problem}; render again, or choose Standard")
-        assert image.depth is not None
-        with_set = shows_set(scene)
-        chosen = 0.0 if with_set else depsgraph.view_layer.pass_alpha_threshold
-        covered = image.alpha - hidden >= max(chosen, MIN_ALPHA)
-        background = None if with_set else scene_background(scene)
-        return {
-            "Combined": combined(image.rgb, image.alpha, background, inverse, hidden),
-            "Depth": np.where(covered, image.depth, BACKGROUND_DEPTH)[..., None],
-        }
+        return image, hidden
 
-    def _view(self, depsgraph: Any, border: tuple[int, int, int, int], view_name: str) -> View:
-        """Of the scene's camera, or the eye of it, or the camera, that a view is seen by."""
+    def _view(
+        self, depsgraph: Any, border: tuple[int, int, int, int], view_name: str, sample: Sample
+    ) -> View:
+        """Of the scene's camera, or the eye of it, or the camera, that a view is seen by, from a
+        point of its aperture."""
         scene = depsgraph.scene
         eye = None
         camera = view_camera(scene, view_name)
@@ -171,7 +208,8 @@ class SplatsEngine(bpy.types.RenderEngine):  # type: ignore[misc]
             eye = Eye(pose, self.camera_shift_x(camera))
         evaluated = camera.evaluated_get(depsgraph) if camera is not None else None
         size = self.resolution_x, self.resolution_y
-        return camera_view(render_camera(evaluated, depsgraph, *size, border, eye), evaluated)
+        view = camera_view(render_camera(evaluated, depsgraph, *size, border, eye), evaluated)
+        return lens.seen_from(view, evaluated, sample.point)
 
     def _image(self, layers: list[SceneLayer], view: View) -> ComposedImage:
         image = draw_image(layers, view, partial(self.report, {"WARNING"}))

@@ -21,6 +21,9 @@ LAYERS = "STGA Set Layers"
 PASSES = "Image", "Depth"
 """Outputs of the splats' Render Layers node that the combined ones replace."""
 
+FILM = "film_transparent", "use_motion_blur", "motion_blur_shutter", "motion_blur_position"
+"""Settings of images that both scenes have in common."""
+
 
 def shows_set(scene: Any) -> bool:
     """Whether images of the scene are combined with its set."""
@@ -97,7 +100,9 @@ def update_set(scene: Any) -> None:
     for name, value in values.items():
         if getattr(other, name) != value:
             setattr(other, name, value)
-    other.render.film_transparent = scene.render.film_transparent
+    for name in FILM:
+        if hasattr(scene.render, name):
+            setattr(other.render, name, getattr(scene.render, name))
     for layer in (scene.view_layers[0], other.view_layers[0]):
         layer.use_pass_z = True
 

@@ -176,7 +176,7 @@ def test_cameras_of_different_exposure(painted):
 
 
 def test_exposure_of_photos_and_a_talk(painted):
-    """Catches an avatar of photos all around and a talk that is brighter or darker than the talk."""
+    """Catches an avatar of photos and a talk that is brighter or darker than the talk."""
     gain, offset = unlike_cameras()
     capture = painted(gain=gain, offset=offset)
     views = [view for view in capture.views["train"] if view.camera_index == 3 or not view.timestep]

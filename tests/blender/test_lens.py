@@ -1,0 +1,107 @@
+"""Depth of field and motion blur of splats against Cycles, on a dot of light."""
+
+import bpy
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+from stga_addon.avatar.splats import SH_C0
+from stga_addon.scene import compat
+from stga_addon.scene.display.splat_object import show_world_splats
+
+from .session import placed
+from .test_engine import _engine, camera_at, render  # noqa: F401
+from .test_film_set import board
+from .test_splat_object import random_splats
+
+DOT_M = 0.02
+"""Half the side of the dot, at 2 m from the camera."""
+APERTURES = {
+    "disk": {},
+    "three blades, turned": {"aperture_blades": 3, "aperture_rotation": 0.4},
+    "wide": {"aperture_ratio": 2.0},
+}
+
+
+@pytest.fixture
+def scene():
+    """A dot of splats and one of a mesh at the same place, of which one is shown."""
+    splats = random_splats(1, 1, degree=0, extent=0.0)
+    splats.log_scale[:] = np.log(DOT_M / 2)
+    splats.opacity[:] = 12.0
+    splats.sh[:] = 0.5 / SH_C0
+    shown = show_world_splats(splats, "dot")
+    corners = [(-DOT_M, -DOT_M), (DOT_M, -DOT_M), (DOT_M, DOT_M), (-DOT_M, DOT_M)]
+    mesh = board("mesh", (1.0, 1.0, 1.0), [(x, 0.0, z) for x, z in corners])
+    camera = camera_at(lens=40.0)
+    camera.location = 0.0, -2.0, 0.0
+    camera.rotation_euler = np.pi / 2, 0.0, 0.0
+    scene = bpy.context.scene
+    scene.eevee.taa_render_samples = 64
+    scene.world = None
+    return scene, shown, mesh
+
+
+def moments(image):
+    """Center (2,) and covariance (2, 2) of an image's light, in pixels."""
+    light = image / image.sum()
+    place = np.stack(np.mgrid[: image.shape[0], : image.shape[1]], -1).astype(float)
+    center = (place * light[..., None]).sum((0, 1))
+    apart = place - center
+    return center, np.einsum("hw,hwi,hwj->ij", light, apart, apart)
+
+
+def by_both(shot, folder):
+    """Moments of the dot by STGA Splats and by Cycles."""
+    scene, shown, mesh = shot
+    mesh.hide_render = True
+    ours = moments(render(folder)["A"])
+    mesh.hide_render = False
+    shown.hide_render = True
+    engine = scene.render.engine
+    scene.render.engine = "CYCLES"
+    scene.cycles.samples = 256
+    scene.cycles.use_denoising = False
+    theirs = moments(render(folder)["A"])
+    scene.render.engine = engine
+    shown.hide_render = False
+    return ours, theirs
+
+
+@pytest.mark.parametrize("name", APERTURES)
+def test_depth_of_field_is_that_of_cycles(scene, name, tmp_path):
+    """Catches a blur of another size or shape than Blender's, a focus at the wrong distance, and a
+    dot that leaves its place."""
+    dof = scene[0].camera.data.dof
+    dof.use_dof = True
+    dof.aperture_fstop = 0.05
+    dof.focus_object = placed("focus", None)
+    dof.focus_object.location = 0.3, -0.6, 0.2
+    for key, value in APERTURES[name].items():
+        setattr(dof, key, value)
+    (center, spread), (other_center, other_spread) = by_both(scene, tmp_path)
+    assert_allclose(center, other_center, atol=0.4)
+    assert_allclose(spread, other_spread, atol=0.06 * spread.max())
+    assert spread.trace() > 8.0
+
+
+@pytest.mark.parametrize("position", ["START", "END"])
+def test_motion_blur_is_that_of_cycles(scene, position, tmp_path):
+    """Catches a shutter that opens at another time, or for another time, than Blender's, and a
+    scene that is left at another frame."""
+    own, *dots = scene
+    own.render.use_motion_blur = True
+    own.render.motion_blur_shutter = 0.8
+    own.render.motion_blur_position = position
+    own.frame_set(10)
+    for dot in dots:
+        for frame, x in ((9, -0.5), (11, 0.5)):
+            dot.location.x = x
+            dot.keyframe_insert("location", index=0, frame=frame)
+        for key in compat.action_curves(dot)[0].keyframe_points:
+            key.interpolation = "LINEAR"  # Cycles moves in straight lines within an exposure
+    (center, spread), (other_center, other_spread) = by_both(scene, tmp_path)
+    assert own.frame_current_final == 10
+    assert_allclose(center, other_center, atol=0.4)
+    assert_allclose(spread, other_spread, atol=0.06 * spread.max())
+    assert spread.trace() > 8.0
