@@ -94,6 +94,8 @@ def update_set(scene: Any) -> None:
         other.collection.objects.unlink(each)
     for each in wanted - present:
         other.collection.objects.link(each)
+    if wanted != present:
+        other.view_layers[0].update()  # else Blender 5.3 crashes as it renders the scene
     if compat.EEVEE != other.render.engine != "CYCLES":
         other.render.engine = compat.EEVEE
     values = {"camera": _camera(scene), "world": scene.world}
