@@ -170,6 +170,8 @@ class _Search:
         self._extract(masked, step)
         self._match(step)
         best = self._mapped(step)
+        if best is not None and best.num_reg_images() < len(self._names):
+            best = self._mapped_again(best)
         if best is None:
             none = np.zeros((0, 3, 4))
             return Structure(np.zeros(0, np.int64), none, 0.0, 0.0, 0, 0, 0.0, masked)
@@ -280,8 +282,22 @@ class _Search:
             options=options,
             next_image_callback=step,
         )
-        size = lambda own: (own.num_reg_images(), own.num_points3D())  # noqa: E731
-        return max(found.values(), key=size, default=None)
+        return max(found.values(), key=_size, default=None)
+
+    def _mapped_again(self, found: Any) -> Any:
+        """The larger one of a model that lacks images, and of what COLMAP finds from its focal
+        length: from one that is far off, first pairs of images are placed wrong, and images that
+        only they see are lost."""
+        if self._options.keeps_focal:
+            return found
+        database = self._colmap.Database.open(self._folder / DATABASE)
+        (camera,) = database.read_all_cameras()
+        (known,) = found.cameras.values()
+        camera.params = [known.params[0], *camera.params[1:]]
+        database.update_camera(camera)
+        database.close()
+        again = self._mapped(lambda: None)
+        return found if again is None else max(found, again, key=_size)
 
     def _with_lens(self, model: Any) -> Any:
         """The model after a last, robust bundle adjustment; with a radial distortion where the
@@ -346,6 +362,10 @@ class _Search:
                 near = faces[0]
                 boxes[name] = np.stack([near.min(0), near.max(0)])
         return boxes
+
+
+def _size(model: Any) -> tuple[int, int]:
+    return model.num_reg_images(), model.num_points3D()
 
 
 def _name(image: Any) -> str:

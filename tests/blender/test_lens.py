@@ -144,7 +144,16 @@ def test_blurred_splats_are_those_of_cycles(scene, blur, tmp_path):
     theirs = render(tmp_path)["A"]
     own.camera.data.dof.use_dof = own.render.use_motion_blur = False
     sharp = render(tmp_path)["A"]
-    own.render.engine = "STGA_SPLATS"; ss = render(tmp_path)["A"]; print("both sharp", -10 * np.log10(np.mean((ss - sharp) ** 2)), ss.sum(), sharp.sum(), ours.sum(), theirs.sum())
+    own.render.engine = "STGA_SPLATS"
+    ss = render(tmp_path)["A"]
+    print(
+        "both sharp",
+        -10 * np.log10(np.mean((ss - sharp) ** 2)),
+        ss.sum(),
+        sharp.sum(),
+        ours.sum(),
+        theirs.sum(),
+    )
     error = np.mean((ours - theirs) ** 2)
     print("PSNR", -10 * np.log10(error), "sharp", -10 * np.log10(np.mean((sharp - theirs) ** 2)))
     assert -10 * np.log10(error) > 35.0

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from stga_addon.capture.lens import Lens
 from stga_addon.capture.mesh_geometry import similarity
-from stga_addon.tracking import around
+from stga_addon.tracking import around, structure_from_motion
 from stga_addon.tracking.around import Recognition, take_of, with_found_cameras
 from stga_addon.tracking.footage.open import open_footage
 from stga_addon.tracking.sharp_frames import sharpest
@@ -91,6 +91,33 @@ def test_cameras_are_those_that_filmed(tmp_path, pictures, k):
         else:
             assert own.camera.fl_x == pytest.approx(camera.fl_x, rel=0.02)
             np.testing.assert_array_equal(own.image(0), image)
+
+
+@pytest.mark.slow
+def test_images_that_a_wrong_focal_length_lost(tmp_path, pictures, monkeypatch):
+    """Catches photos at the ends of a walk that are left out, because COLMAP began from a focal
+    length that is far off."""
+    pytest.importorskip("pycolmap")
+    mapped = structure_from_motion._Search._mapped
+    begun = []
+
+    def without_the_last(search, step):
+        model = mapped(search, step)
+        with search._colmap.Database.open(search._folder / "features.db") as database:
+            begun.append(database.read_all_cameras()[0].params[0])
+        for image in list(model.reg_image_ids())[-2:] if len(begun) == 1 else ():
+            model.deregister_frame(model.image(image).frame_id)
+        return model
+
+    monkeypatch.setattr(structure_from_motion._Search, "_mapped", without_the_last)
+    camera = open_footage(write_pictures(tmp_path / "photos", pictures)).cameras[0]
+    options = structure_from_motion.SearchOptions(None, False, False, 1, 1, 0)
+    found = structure_from_motion.find_structure(
+        camera, list(range(COUNT)), options, tmp_path / "scratch", lambda: None
+    )
+    assert found["timesteps"].tolist() == list(range(COUNT))
+    assert begun[0] == 1.2 * 256  # COLMAP's guess
+    assert begun[1:] == pytest.approx([walk(1)[0].fl_x], rel=0.05)
 
 
 def test_many_photos_from_behind_ear_to_ear(tmp_path):
