@@ -15,10 +15,12 @@ from stga_addon.scene.display.splat_object import (
 )
 
 from .session import placed
-from .test_engine import _engine, camera_at, render  # noqa: F401
+from .test_engine import HEIGHT, WIDTH, _engine, camera_at, render  # noqa: F401
 from .test_film_set import board
 from .test_splat_object import random_splats
 
+ZOOM = 4
+"""Of images in which clouds are compared."""
 DOT_M = 0.02
 """Half the side of the dot, at 2 m from the camera."""
 APERTURES = {
@@ -112,6 +114,7 @@ def test_motion_blur_is_that_of_cycles(scene, position, tmp_path):
     assert spread.trace() > 8.0
 
 
+@pytest.mark.nightly
 @pytest.mark.skipif(not compat.NATIVE_SPLATS, reason="this Blender has no splats of its own")
 @pytest.mark.parametrize("blur", ["lens", "shutter"])
 def test_blurred_splats_are_those_of_cycles(scene, blur, tmp_path):
@@ -121,14 +124,15 @@ def test_blurred_splats_are_those_of_cycles(scene, blur, tmp_path):
     for each in (dot, mesh):
         bpy.data.objects.remove(each)
     splats = random_splats(1, 300, degree=0, extent=0.3)
-    splats.log_scale[:] += 3.5
+    splats.log_scale[:] += 4.0
     splats.sh[:] = 0.5 / SH_C0
     shown = show_world_splats(splats, "cloud")
-    own.eevee.taa_render_samples = 256
+    own.eevee.taa_render_samples = 128
     own.camera.data.dof.use_dof = blur == "lens"
-    own.camera.data.dof.aperture_fstop = 0.2
+    own.camera.data.dof.aperture_fstop = 0.08
     own.camera.data.dof.focus_distance = 1.6
     own.render.use_motion_blur = blur == "shutter"
+    own.render.resolution_percentage = 100 * ZOOM
     own.frame_set(10)
     for frame, x in ((9, -0.2), (11, 0.2)):
         shown.location.x = x
@@ -139,22 +143,15 @@ def test_blurred_splats_are_those_of_cycles(scene, blur, tmp_path):
     choose_display(shown, splat_nodes.NATIVE)
     use_transparent_bounces(own)
     own.render.engine = "CYCLES"
-    own.cycles.samples = 1024
+    own.cycles.samples = 256
     own.cycles.use_denoising = False
     theirs = render(tmp_path)["A"]
     own.camera.data.dof.use_dof = own.render.use_motion_blur = False
     sharp = render(tmp_path)["A"]
-    own.render.engine = "STGA_SPLATS"
-    ss = render(tmp_path)["A"]
-    print(
-        "both sharp",
-        -10 * np.log10(np.mean((ss - sharp) ** 2)),
-        ss.sum(),
-        sharp.sum(),
-        ours.sum(),
-        theirs.sum(),
+    # Cycles is noisy: of its samples, each passes a splat or not
+    ours, theirs, sharp = (
+        image.reshape(HEIGHT, ZOOM, WIDTH, ZOOM).mean((1, 3)) for image in (ours, theirs, sharp)
     )
     error = np.mean((ours - theirs) ** 2)
-    print("PSNR", -10 * np.log10(error), "sharp", -10 * np.log10(np.mean((sharp - theirs) ** 2)))
     assert -10 * np.log10(error) > 35.0
     assert np.mean((sharp - theirs) ** 2) > 4 * error
