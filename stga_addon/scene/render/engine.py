@@ -143,6 +143,7 @@ class SplatsEngine(bpy.types.RenderEngine):  # type: ignore[misc]
         background = None if with_set else scene_background(scene)
         inverse = inverse_view(scene)
         cache = SplatCache()
+        renderers = list[SplatRenderer]()  # freed here, in the thread of its GPU context
         frame = scene.frame_current + scene.frame_subframe
         offset = 0.0
         color = share = distance = np.zeros(1)
@@ -154,7 +155,7 @@ class SplatsEngine(bpy.types.RenderEngine):  # type: ignore[misc]
                 cache.frame_changed()
             layers = all_layers(depsgraph, cache)
             view = self._view(depsgraph, border, view_name, sample)
-            image, hidden = self._layers_image(layers, view)
+            image, hidden = self._layers_image(layers, view, renderers)
             assert image.depth is not None
             color = color + combined(image.rgb, image.alpha, background, inverse, hidden)
             seen = image.alpha - hidden
@@ -182,16 +183,19 @@ class SplatsEngine(bpy.types.RenderEngine):  # type: ignore[misc]
             self.report({"WARNING"}, f"{problem}; render again, or choose Standard")
 
     def _layers_image(
-        self, layers: list[SceneLayer], view: View
+        self, layers: list[SceneLayer], view: View, renderers: list[SplatRenderer]
     ) -> tuple[ComposedImage, np.ndarray]:
-        """One image, and the part (H, W) of its alpha that holdouts hide."""
+        """One image, and the part (H, W) of its alpha that holdouts hide. renderers: as of
+        `draw_image`."""
         held_out = any(layer.holdout for layer in layers)
         shown = [layer.painted(0.0) if layer.holdout else layer for layer in layers]
-        image = self._image(shown, view)
+        image = self._image(shown, view, renderers)
         hidden = np.zeros_like(image.alpha)
         if held_out:  # white where splats are seen, black where holdouts hide them
             white = [layer.painted(0.0 if layer.holdout else 1.0) for layer in layers]
-            hidden = np.clip(image.alpha - self._image(white, view).rgb[0], 0, image.alpha)
+            hidden = np.clip(
+                image.alpha - self._image(white, view, renderers).rgb[0], 0, image.alpha
+            )
         return image, hidden
 
     def _view(
@@ -211,8 +215,10 @@ class SplatsEngine(bpy.types.RenderEngine):  # type: ignore[misc]
         view = camera_view(render_camera(evaluated, depsgraph, *size, border, eye), evaluated)
         return lens.seen_from(view, evaluated, sample.point)
 
-    def _image(self, layers: list[SceneLayer], view: View) -> ComposedImage:
-        image = draw_image(layers, view, partial(self.report, {"WARNING"}))
+    def _image(
+        self, layers: list[SceneLayer], view: View, renderers: list[SplatRenderer]
+    ) -> ComposedImage:
+        image = draw_image(layers, view, partial(self.report, {"WARNING"}), renderers)
         if image is None:
             posed = [in_range(layer.posed(view.camera.position), view) for layer in layers]
             image = _rasterizer.compose(posed, view.camera, with_depth=True)
@@ -253,16 +259,21 @@ _told: set[str] = set()
 
 
 def draw_image(
-    layers: list[SceneLayer], view: View, warn: Warn = log_warning
+    layers: list[SceneLayer],
+    view: View,
+    warn: Warn = log_warning,
+    renderers: list[SplatRenderer] | None = None,
 ) -> ComposedImage | None:
     """A final image drawn by the GPU; None where Blender has no context of it, or the GPU fails,
-    which is reported once."""
+    which is reported once. renderers: where one is kept for the next image."""
     if not has_gpu_context():
         return None
+    kept = [] if renderers is None else renderers
     try:
-        renderer = SplatRenderer()
-        renderer.draw(layers, view)
-        return renderer.read()
+        if not kept:
+            kept.append(SplatRenderer())
+        kept[0].draw(layers, view)
+        return kept[0].read()
     except Exception as error:  # of many kinds, by device and version
         reason = f"Splats are not drawn by Blender's GPU module ({error})"
         if reason not in _told:
