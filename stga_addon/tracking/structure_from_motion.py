@@ -170,7 +170,7 @@ class _Search:
         self._extract(masked, step)
         self._match(step)
         best = self._mapped(step)
-        if best is not None and best.num_reg_images() < len(self._names):
+        if best is not None and not self._options.keeps_focal:
             best = self._mapped_again(best)
         if best is None:
             none = np.zeros((0, 3, 4))
@@ -262,7 +262,7 @@ class _Search:
         return sorted({*range(max(0, number - NEAR_IMAGES), number), *loops})
 
     def _mapped(self, step: Step) -> Any | None:
-        """COLMAP's model of most images; None where it finds none."""
+        """COLMAP's largest model; None where it finds none."""
         colmap = self._colmap
         options = colmap.IncrementalPipelineOptions()
         options.num_threads = self._options.threads
@@ -282,14 +282,12 @@ class _Search:
             options=options,
             next_image_callback=step,
         )
-        return max(found.values(), key=_size, default=None)
+        return max(found.values(), key=_observations, default=None)
 
     def _mapped_again(self, found: Any) -> Any:
-        """The larger one of a model that lacks images, and of what COLMAP finds from its focal
-        length: from one that is far off, first pairs of images are placed wrong, and images that
-        only they see are lost."""
-        if self._options.keeps_focal:
-            return found
+        """The model, or that which COLMAP finds from its focal length, whichever sees points more
+        often: from a focal length that is far off, images are lost or placed wrong, as are the
+        first pairs of which they see points."""
         database = self._colmap.Database.open(self._folder / DATABASE)
         (camera,) = database.read_all_cameras()
         (known,) = found.cameras.values()
@@ -297,7 +295,7 @@ class _Search:
         database.update_camera(camera)
         database.close()
         again = self._mapped(lambda: None)
-        return found if again is None else max(found, again, key=_size)
+        return found if again is None else max(found, again, key=_observations)
 
     def _with_lens(self, model: Any) -> Any:
         """The model after a last, robust bundle adjustment; with a radial distortion where the
@@ -364,8 +362,8 @@ class _Search:
         return boxes
 
 
-def _size(model: Any) -> tuple[int, int]:
-    return model.num_reg_images(), model.num_points3D()
+def _observations(model: Any) -> int:
+    return int(model.compute_num_observations())
 
 
 def _name(image: Any) -> str:

@@ -94,9 +94,9 @@ def test_cameras_are_those_that_filmed(tmp_path, pictures, k):
 
 
 @pytest.mark.slow
-def test_images_that_a_wrong_focal_length_lost(tmp_path, pictures, monkeypatch):
-    """Catches photos at the ends of a walk that are left out, because COLMAP began from a focal
-    length that is far off."""
+def test_images_that_a_wrong_focal_length_loses(tmp_path, pictures, monkeypatch):
+    """Catches photos at the ends of a walk that are left out, or placed wrong, because COLMAP began
+    from a focal length that is far off."""
     pytest.importorskip("pycolmap")
     mapped = structure_from_motion._Search._mapped
     begun = []
