@@ -37,6 +37,7 @@ class DemoOptions:
         help=f"iterations of each training (default {DEMO_ITERATIONS})",
     )
     device: str = like(Train, "device")
+    shot: bool = option("write shot.blend as well, a film scene around the avatar", False)
     footage: bool = option("make an avatar from the capture's images alone as well", False)
 
 
@@ -50,7 +51,7 @@ def run_demo_command(options: Namespace, head: object) -> None:
     budget: dict[str, Any] = {"iterations": given.iterations or DEMO_ITERATIONS}
     if given.seconds is not None:
         budget = {"seconds": given.seconds}
-    run_demo(given.out, budget, device=device)
+    run_demo(given.out, budget, device=device, with_shot=given.shot)
     if given.footage:
         avatar_from_footage(given.out, budget, given.device)
 

@@ -41,11 +41,13 @@ MAX_POSITION_ERROR_M = 1e-5
 """Largest distance between a splat in Blender and in numpy."""
 
 
-def run_demo(out: Path, budget: Mapping[str, Any], device: str = "cpu") -> None:
+def run_demo(
+    out: Path, budget: Mapping[str, Any], device: str = "cpu", with_shot: bool = False
+) -> None:
     """Unpack the demo's capture, import it into Blender, select, train, and show the avatar.
 
     budget: the setting that limits training, `seconds` or `iterations`; device: one of
-    `choose_device`.
+    `choose_device`; with_shot: also write shot.blend, a film scene around the avatar.
 
     Leaves avatar.npz, avatar.html, demo.blend, comparison.png, selection.png and metrics.json in
     `out`. Needs Blender's bpy. Raises StgaError where the folder cannot be written or Blender
@@ -60,6 +62,8 @@ def run_demo(out: Path, budget: Mapping[str, Any], device: str = "cpu") -> None:
     head, selection = _import_and_select(capture)
     avatar = _train(capture, out, budget, selection, device)
     error = _show(capture, avatar, head, out / "demo.blend")
+    if with_shot:
+        _make_shot(out / "shot.blend")
     _picture(capture, avatar, selection, out)
     _page(capture, avatar, selection, out / "avatar.html")
     metrics = {
@@ -151,6 +155,17 @@ def _show(capture: Capture, avatar: Avatar, head: object, path: Path) -> float:
             f"more than {MAX_POSITION_ERROR_M:g} m"
         )
     return worst
+
+
+def _make_shot(path: Path) -> None:
+    """Build the shot in the open file."""
+    import bpy
+
+    from ...scene import tags
+    from .shot import make_shot
+
+    heads = [each for each in bpy.context.scene.objects if each.get(tags.KIND) == tags.HEAD]
+    make_shot(heads[0], path)
 
 
 def _picture(capture: Capture, avatar: Avatar, selection: dict[int, np.ndarray], out: Path) -> None:

@@ -13,6 +13,7 @@ from stga_addon.cli.main import main
 from stga_addon.development.demo import run
 from stga_addon.development.demo.capture import unpack_capture
 from stga_addon.files import read_json, write_json
+from stga_addon.scene.render.film_set import shows_set
 
 bpy = pytest.importorskip("bpy", reason="Blender's module bpy is not installed")
 
@@ -43,7 +44,7 @@ def test_demo(tmp_path, monkeypatch):
     """Catches a break in the README's first command, and a demo.blend that is empty."""
     monkeypatch.setattr(run, "unpack_capture", unpack_few)
     demo = tmp_path / "demo"
-    run.run_demo(demo, {"iterations": 60})
+    run.run_demo(demo, {"iterations": 60}, with_shot=True)
     metrics = json.loads((demo / "metrics.json").read_text())
     assert metrics["blender_position_error_m"] < 1e-5
     # Far above what the untrained gray lattice reaches on these images (about 15 dB).
@@ -73,6 +74,15 @@ def test_demo(tmp_path, monkeypatch):
             "the viewport looks beside the head"
         )
         assert region.view_distance < 1, "the head is a dot on Blender's grid"
+    bpy.ops.wm.open_mainfile(filepath=str(demo / "shot.blend"))
+    scene = bpy.context.scene
+    assert shows_set(scene)
+    head = next(each for each in scene.objects if each.get("stga_kind") == "head")
+    turned = []
+    for frame in (scene.frame_start, scene.frame_end):
+        scene.frame_set(frame)
+        turned.append(head.matrix_world.to_quaternion())
+    assert turned[0].rotation_difference(turned[1]).angle > 0.4, "the head stays as the body turns"
 
 
 @pytest.mark.parametrize(
@@ -87,7 +97,7 @@ def test_the_demos_budget_is_iterations(given, budget, monkeypatch, tmp_path):
     """Catches a demo that is worse on a busy machine, and options that footage ignores."""
     budgets = []
     requests = []
-    monkeypatch.setattr(run, "run_demo", lambda out, own, device: budgets.append(own))
+    monkeypatch.setattr(run, "run_demo", lambda out, own, **_: budgets.append(own))
     command = replace(COMMANDS["avatar"], run=lambda options, head: requests.append(options))
     monkeypatch.setitem(COMMANDS, "avatar", command)
     assert main(["demo", "--out", str(tmp_path), "--device", "cpu", "--footage", *given]) == 0
