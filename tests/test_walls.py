@@ -19,7 +19,13 @@ SOURCES = tuple(
 MODULE_NAME = re.compile(r"(?:(\.+)|stga_addon\.)([a-z_]\w*(?:\.[a-z_]\w*)*)", re.ASCII)
 """A string that may name a module, relative or absolute."""
 BLENDER = {"bpy", "bmesh", "gpu", "mathutils", "bl_ext"}
-BLENDERS = ("stga_addon/scene/", "stga_addon/development/demo/studio.py", "operators/", "ui/")
+BLENDERS = (
+    "stga_addon/scene/",
+    "stga_addon/development/demo/studio.py",
+    "stga_addon/development/demo/shot.py",
+    "operators/",
+    "ui/",
+)
 """Where Blender's modules are imported."""
 HEAVY = {"torch", "numba", "wgpu"}
 TRAININGS = ("stga_addon/raster/", "stga_addon/training/", "stga_addon/development/benchmark/")

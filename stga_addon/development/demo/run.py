@@ -63,7 +63,9 @@ def run_demo(
     avatar = _train(capture, out, budget, selection, device)
     error = _show(capture, avatar, head, out / "demo.blend")
     if with_shot:
-        _make_shot(out / "shot.blend")
+        from .shot import make_shot  # needs Blender
+
+        make_shot(out / "shot.blend")
     _picture(capture, avatar, selection, out)
     _page(capture, avatar, selection, out / "avatar.html")
     metrics = {
@@ -155,17 +157,6 @@ def _show(capture: Capture, avatar: Avatar, head: object, path: Path) -> float:
             f"more than {MAX_POSITION_ERROR_M:g} m"
         )
     return worst
-
-
-def _make_shot(path: Path) -> None:
-    """Build the shot in the open file."""
-    import bpy
-
-    from ...scene import tags
-    from .shot import make_shot
-
-    heads = [each for each in bpy.context.scene.objects if each.get(tags.KIND) == tags.HEAD]
-    make_shot(heads[0], path)
 
 
 def _picture(capture: Capture, avatar: Avatar, selection: dict[int, np.ndarray], out: Path) -> None:

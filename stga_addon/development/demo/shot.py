@@ -65,10 +65,12 @@ TURN_DEG = {1: -14.0, 40: 6.0, 96: 16.0}
 """Frame -> turn of the body about its spine."""
 
 
-def make_shot(head: Any, path: Path) -> None:
-    """Build the shot around a head with splats in the open file, and save it. Raises StgaError."""
+def make_shot(path: Path) -> None:
+    """Build the shot around the head with splats in the open file, and save it. Raises
+    StgaError."""
+    heads = [each for each in bpy.context.scene.objects if each.get(tags.KIND) == tags.HEAD]
     with _registered():
-        _build(head)
+        _build(heads[0])
         save_file(path)
 
 
@@ -160,9 +162,11 @@ def _body(neck: Vector) -> Any:
     bpy.ops.object.mode_set(mode="EDIT")
     bones = armature.data.edit_bones
     spine = bones.new("spine")
-    spine.head, spine.tail = (0, 0, RINGS[0][0]), (0, 0, -0.2)
+    spine.head = 0, 0, RINGS[0][0]
+    spine.tail = 0, 0, -0.2
     chest = bones.new("chest")
-    chest.head, chest.tail = spine.tail, (0, 0, 0)
+    chest.head = spine.tail
+    chest.tail = 0, 0, 0
     chest.parent = spine
     bpy.ops.object.mode_set(mode="OBJECT")
     torso = _painted(_placed("Torso", _lathe("Torso", RINGS)), (0.02, 0.07, 0.075), 0.9)
