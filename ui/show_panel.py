@@ -224,7 +224,7 @@ class RenderPanel(bpy.types.Panel):
         shown = "Shown" if shows_set(context.scene) else "Left Out"
         layout.operator_menu_enum("stga.choose_set", "shown", text=f"Set: {shown}")
         if lens.is_blurred(context.scene):
-            layout.prop(context.scene.eevee, "taa_render_samples", text="Samples of Blur")
+            layout.prop(context.scene.eevee, "taa_render_samples", text="Samples")
         layout.prop(context.scene.render, "film_transparent", text="Transparent Film")
         layout.prop(context.view_layer, "use_pass_z", text="Depth Pass")
         if missing_packages() and not has_gpu_context():
