@@ -23,7 +23,7 @@ from ..stga_addon.scene.display.splat_object import (
     hide_object,
     replace_native_splats,
 )
-from ..stga_addon.scene.objects import layers_with, mover_of, remove
+from ..stga_addon.scene.objects import layers_with, mover_of, own_collections, remove
 from ..stga_addon.scene.record import owner_of, rebase, rebase_file, store_path, stored_path
 from ..stga_addon.scene.render.viewport_display import is_shown_as_trained
 from ..stga_addon.scene.rig.head import bone_shapes
@@ -207,7 +207,7 @@ def _after_update(scene: Any, *_: Any) -> None:
     _follow_active(scene)
     for name in ("head", "splats", *HEADS.values()):
         thing = getattr(scene.stga, name)
-        if thing is not None and thing.name not in scene.objects and not thing.users_collection:
+        if thing is not None and thing.name not in scene.objects and not own_collections(thing):
             setattr(scene.stga, name, None)
 
 

@@ -22,7 +22,7 @@ from ..stga_addon.scene.arrays import triangle_mesh
 from ..stga_addon.scene.avatar_scene import place_tracked, show_world
 from ..stga_addon.scene.display import splat_nodes, splat_object
 from ..stga_addon.scene.display.splat_attributes import SplatAttributes, avatar_attributes
-from ..stga_addon.scene.objects import Identity, mover_of
+from ..stga_addon.scene.objects import Identity, mover_of, own_collections
 from ..stga_addon.scene.record import (
     capture_of,
     displayed_path,
@@ -97,7 +97,7 @@ def request_head(scene: Any, state: RequestState) -> Any:
     head = _head_in_session(scene, state.kind)
     if head is None and state.kind in HEADS:
         stored = getattr(scene.stga, HEADS[state.kind])
-        head = stored if stored is not None and stored.users_collection else None
+        head = stored if stored is not None and own_collections(stored) else None
         if head is None:
             with suppress(StgaError):  # has not begun
                 head = _head_of_capture(scene, read_run(state.run).capture)

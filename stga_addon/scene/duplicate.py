@@ -13,7 +13,7 @@ from . import tags
 from .avatar_scene import place_beside
 from .compat import assign_action, slot_of
 from .display.splat_object import splat_modifier
-from .objects import COLLECTIONS, layers_of, mover_of
+from .objects import COLLECTIONS, layers_of, mover_of, own_collections
 
 COPIED = (tags.HEAD, tags.RIG, tags.SPLATS)
 """Kinds of object below the Empty that a copy of an avatar has: no cameras."""
@@ -93,7 +93,7 @@ def _collect(family: list[Any], copies: list[Any]) -> None:
     # which cannot be copied
     made = {scene.collection: scene.collection for scene in bpy.data.scenes}
     for original, copy in zip(family, copies, strict=True):
-        for collection in original.users_collection:
+        for collection in own_collections(original):
             if collection not in made:
                 kind = collection.get(tags.KIND)
                 name = f"{new_root.name} {COLLECTIONS[kind]}" if kind else new_root.name

@@ -57,9 +57,14 @@ COLLECTIONS = {tags.RIG: "bones", tags.CAMERA: "cameras"}
 """Kinds of object that have a collection of their own, so that they can be hidden together."""
 
 
+def own_collections(thing: Any) -> list[Any]:
+    """The collections that an object is in, without those of sets, which follow their scenes."""
+    return [each for each in thing.users_collection if each.get(tags.KIND) != tags.SET]
+
+
 def collection_of(root: Any, kind: str) -> Any:
     """The collection of the root's objects of this kind; None where none was placed yet."""
-    collection = root.users_collection[0]
+    collection = own_collections(root)[0]
     if kind not in COLLECTIONS:
         return collection
     return next((child for child in collection.children if child.get(tags.KIND) == kind), None)
@@ -98,7 +103,7 @@ def place(root: Any, kind: str, name: str, data: Any, existing: Any = None) -> A
         if collection is None:
             collection = bpy.data.collections.new(f"{root.name} {COLLECTIONS[kind]}")
             collection[tags.KIND] = kind
-            root.users_collection[0].children.link(collection)
+            own_collections(root)[0].children.link(collection)
         collection.objects.link(obj)
         obj.parent = root
         if kind != tags.CAMERA:
@@ -235,7 +240,7 @@ class Identity:
         if found is None or found.session_uid != self.uid:
             found = next((each for each in blocks if each.session_uid == self.uid), None)
         # A deleted object stays in the file as long as a panel's property points to it.
-        if found is None or not (self._is_scene or found.users_collection):
+        if found is None or not (self._is_scene or own_collections(found)):
             return None
         self.name = found.name
         return found

@@ -8,6 +8,7 @@ from numpy.testing import assert_allclose
 from stga_addon.scene import compat, tags
 from stga_addon.scene.compat import enable_nodes
 from stga_addon.scene.display.splat_object import show_world_splats
+from stga_addon.scene.objects import Identity
 from stga_addon.scene.render import film_set
 
 from .session import placed
@@ -99,11 +100,15 @@ def test_sets_are_combined_with_splats_by_depth(shot, tmp_path):
         covered[:, : half + 1] = False
         assert_allclose(found[covered], values[covered], rtol=1e-5, atol=TOLERANCE)
     image.id_data.links.new(combined["Image"], image)
+    shot[tags.SET].collection.objects.link(alone_in_set := placed("lamp", None))
     behind.hide_render = True
+    found = Identity(before)
     shot.collection.objects.unlink(before)
+    assert found.find() is None  # though the set has it until the next image
     without = render(tmp_path)
     for channel in "RGBA":
         assert_allclose(without[channel], alone[channel], atol=TOLERANCE)
+    assert alone_in_set.name in shot[tags.SET].objects
 
 
 def test_sets_keep_what_the_compositor_does(shot, tmp_path):

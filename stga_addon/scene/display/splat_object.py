@@ -18,7 +18,7 @@ from .. import compat, tags
 from ..arrays import has_triangles, mesh_triangles, mesh_vertices, triangle_mesh
 from ..compat import animation_curves, modifier_input, set_modifier_input
 from ..layers import DisplaySettings
-from ..objects import lock, remove
+from ..objects import lock, own_collections, remove
 from . import splat_attributes as stored
 from . import splat_nodes
 from .frame_nodes import SIGNALS
@@ -69,7 +69,7 @@ def show_avatar(
     splat_object = replaced
     if splat_object is None:
         scene = scene or bpy.context.scene
-        local = [each for each in head.users_collection if each.library is None]
+        local = [each for each in own_collections(head) if each.library is None]
         splat_object = _splat_object(title, [*local, scene.collection][0], _tree_options(avatar))
         # A sibling of the head: both have the same object space.
         splat_object.parent = head.parent

@@ -36,13 +36,18 @@ def show_set(scene: Any) -> None:
     their shadows. Nodes that follow the splats' Render Layers follow the combination."""
     if shows_set(scene):
         return
+    leave_out_set(scene)  # what is left of one
     scene.render.use_compositing = True
     tree = compat.compositor_tree(scene) or compat.new_compositor_tree(scene)
     own = next((node for node in tree.nodes if _renders(node, scene)), None)
     if own is None:
         own = tree.nodes.new("CompositorNodeRLayers")
         own.scene = scene
-    scene[tags.SET] = bpy.data.scenes.new(f"{scene.name} Set")
+    title = f"{scene.name} Set"
+    scene[tags.SET] = bpy.data.scenes.new(title)
+    mirrored = bpy.data.collections.new(title)
+    mirrored[tags.KIND] = tags.SET
+    scene[tags.SET].collection.children.link(mirrored)
     update_set(scene)
     layers = tree.nodes.new("CompositorNodeRLayers")
     layers.name = layers.label = LAYERS
@@ -79,21 +84,25 @@ def leave_out_set(scene: Any) -> None:
                 tree.nodes.remove(node)
     other = scene.pop(tags.SET, None)
     if other is not None:
+        mirrored = other.collection.children[:1]
         bpy.data.scenes.remove(other)
+        bpy.data.batch_remove(mirrored)
 
 
 def update_set(scene: Any) -> None:
     """Let the second scene show what the scene shows now: its objects without splats, camera, world
-    and film."""
+    and film; what an artist has put into the second scene alone stays."""
     other = scene.get(tags.SET)
-    if other is None:
+    if other is None or not other.collection.children:
         return
-    wanted = {each for each in _rendered(scene.view_layers[0].layer_collection) if _is_set(each)}
-    present = set(other.collection.objects)
+    shown = _rendered(scene.view_layers[0].layer_collection)
+    wanted = {each for each in shown if each.get(tags.KIND) != tags.SPLATS}
+    mirrored = other.collection.children[0].objects
+    present = set(mirrored)
     for each in present - wanted:
-        other.collection.objects.unlink(each)
+        mirrored.unlink(each)
     for each in wanted - present:
-        other.collection.objects.link(each)
+        mirrored.link(each)
     if wanted != present:
         other.view_layers[0].update()  # else Blender 5.3 crashes as it renders the scene
     if compat.EEVEE != other.render.engine != "CYCLES":
@@ -118,11 +127,6 @@ def _camera(scene: Any) -> Any:
 
 def _renders(node: Any, scene: Any) -> bool:
     return node.bl_idname == "CompositorNodeRLayers" and node.scene == scene
-
-
-def _is_set(thing: Any) -> bool:
-    """Whether an object belongs to the set: all but splats, and heads that are hidden in images."""
-    return thing.get(tags.KIND) != tags.SPLATS
 
 
 def _splats_of(scene: Any) -> list[Any]:
