@@ -148,25 +148,26 @@ class SplatsEngine(bpy.types.RenderEngine):  # type: ignore[misc]
         offset = 0.0
         color = share = distance = np.zeros(1)
         samples = lens.samples(scene, view_camera(scene, view_name))
-        for taken, sample in enumerate(samples):
-            if sample.offset != offset:
-                offset = sample.offset
-                self._go_to(frame + offset)
-                cache.frame_changed()
-            layers = all_layers(depsgraph, cache)
-            view = self._view(depsgraph, border, view_name, sample)
-            image, hidden = self._layers_image(layers, view, renderers)
-            assert image.depth is not None
-            color = color + combined(image.rgb, image.alpha, background, inverse, hidden)
-            seen = image.alpha - hidden
-            share = share + seen
-            distance = distance + seen * image.depth
-            self.update_stats("", f"{sum(len(layer.splats) for layer in layers)} splats")
-            self.update_progress((taken + 1) / len(samples))
-            if self.test_break():
-                break
-        if offset:
-            self._go_to(frame)
+        try:
+            for taken, sample in enumerate(samples):
+                if sample.offset != offset:
+                    offset = sample.offset
+                    self._go_to(frame + offset)
+                    cache.frame_changed()
+                layers = all_layers(depsgraph, cache)
+                view = self._view(depsgraph, border, view_name, sample)
+                image, hidden = self._layers_image(layers, view, renderers)
+                color = color + combined(image.rgb, image.alpha, background, inverse, hidden)
+                seen = image.alpha - hidden
+                share = share + seen
+                distance = distance + np.where(seen > 0, seen * image.depth, 0)
+                self.update_stats("", f"{sum(len(layer.splats) for layer in layers)} splats")
+                self.update_progress((taken + 1) / len(samples))
+                if self.test_break():
+                    break
+        finally:
+            if offset:
+                self._go_to(frame)
         count = taken + 1
         chosen = 0.0 if with_set else depsgraph.view_layer.pass_alpha_threshold
         covered = share / count >= max(chosen, MIN_ALPHA)
