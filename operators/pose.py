@@ -15,6 +15,7 @@ from ..stga_addon.scene.compat import select_bones
 from ..stga_addon.scene.objects import Identity, leave_edit_mode, show_kind
 from ..stga_addon.scene.rig import keyframes
 from ..stga_addon.scene.rig.head import usable_rig
+from ..stga_addon.scene.rig.motion import mirror_pose
 from . import common, timers
 from .common import AtEnd, Edit, head_of, need, needs_bones, needs_rig, rig_or_none
 from .windows import push_undo, redraw
@@ -74,6 +75,19 @@ class TurnJaw(bpy.types.Operator):
 def is_posing(context: Any, rig: Any) -> bool:
     """Whether this rig is in Pose mode."""
     return context.view_layer.objects.active is rig and rig.mode == "POSE"
+
+
+class MirrorPose(Edit, bpy.types.Operator):
+    """Swap left and right of the pose: bones, and sliders named as ARKit's blend shapes"""
+
+    needs = (needs_rig,)
+
+    def run(self, context: Any) -> None:
+        head = head_of(context)
+        if not mirror_pose(head, usable_rig(head)):
+            self.warn(
+                f"{head.name}: has no sliders of a left and a right; only bones were mirrored"
+            )
 
 
 # Sliders

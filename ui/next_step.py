@@ -145,6 +145,7 @@ def _draw_what_to_try(layout: Any, context: Any, settings: Any) -> None:
             mouth = settings.head.data.shape_keys.key_blocks.get("jawOpen")
             if mouth is not None:
                 column.prop(mouth, "value", text="Open Mouth", slider=True)
+            column.operator("stga.mirror_pose", icon="MOD_MIRROR")
             hint = "R turns the selected bone; I keeps the pose as a keyframe"
             draw_text(column, context, hint, "INFO")
     if is_head(settings.head) and has_selection(settings.head):

@@ -242,6 +242,30 @@ class LivePose:
         rig.update_tag()
 
 
+MIRROR = {"left_eye": "right_eye", "right_eye": "left_eye"}
+"""Joint -> its counterpart, of those that have one."""
+
+
+def mirror_pose(head: Any, rig: Any) -> bool:
+    """Swap left and right of a head's pose, in its model's axes, x to the left; whether it has
+    sliders of both sides."""
+    turns = {joint: tuple(rig.pose.bones[joint].rotation_quaternion) for joint in JOINTS}
+    for joint in JOINTS:
+        w, x, y, z = turns[MIRROR.get(joint, joint)]
+        rig.pose.bones[joint].rotation_quaternion = w, x, -y, -z
+    rig.pose.bones[JOINTS[0]].location.x *= -1
+    blocks = head.data.shape_keys.key_blocks
+    names = [name for name in blocks.keys() if "Left" in name]  # noqa: SIM118
+    pairs = [(blocks[name], blocks.get(name.replace("Left", "Right"))) for name in names]
+    pairs = [pair for pair in pairs if pair[1] is not None]
+    for left, right in pairs:
+        value = left.value
+        left.value = right.value
+        right.value = value
+    rig.update_tag()
+    return bool(pairs)
+
+
 TRAINED = "stga_trained"  # property of the head: the arrays of a `TrainedRange`, by field and part
 FIELDS = ("middle", "width", "quiet", "first")
 
