@@ -11,7 +11,7 @@ import numpy as np
 
 from ..errors import StgaError, shorten
 from ..files import read_json, read_table, read_text
-from .clocks import DEFAULT_FPS, MAX_FPS, MIN_FPS, evened, find_times, numbers
+from .clocks import DEFAULT_FPS, MAX_FPS, MIN_FPS, OTHER_RATE, Guess, evened, find_times, numbers
 from .frame_forms import (
     face_cap_frames,
     is_face_cap,
@@ -276,19 +276,20 @@ def _performance(
     if head is None:
         head, notes = find_head(where, others)
         guesses += notes
-    times, notes = find_times(where, others, fps)
+    times, notes, guess = find_times(where, others, fps)
     if times is None:
         if fps is None:
             without = f" ({'; '.join(notes)})" if notes else ""
             taken = f"its rows are taken as {DEFAULT_FPS:g} a second"
-            notes = [f"says no times{without}; {taken}"]
+            notes = []
+            guess = Guess(f"says no times{without}; {taken}; {OTHER_RATE}", DEFAULT_FPS)
         rate = DEFAULT_FPS if fps is None else fps
         rate = rate if MIN_FPS <= rate <= MAX_FPS else np.nan
         times = np.arange(len(weights)) / rate
     if not np.isfinite(times).all():
         expected = f"expected {MIN_FPS:g} to {MAX_FPS:g} a second"
         raise StgaError(f"{path}: its times or its rate are not usable; {expected}")
-    guesses += notes
+    guesses += [*notes, *([guess.text] if guess else [])]
     times, first = np.unique(times - times.min(), return_index=True)
     times, rate = evened(times)
     rate = fps or rate
@@ -297,4 +298,4 @@ def _performance(
         raise StgaError(f"{path}: has {rate:.3g} rows a second over {times[-1]:.0f} s, {expected}")
     head = np.zeros((len(first), 3)) if head is None else head[first]
     warnings = tuple(f"{path}: {text}" for text in guesses)
-    return Performance(times, weights[first], head, rate, warnings)
+    return Performance(times, weights[first], head, rate, warnings, guess.fps if guess else None)

@@ -71,7 +71,30 @@ CLOCKS = {
         None,
     ),
     "the micro sign": ("Time [\N{MICRO SIGN}s]", lambda n: n * 40_000, 25, None),
-    "beside durations": ("frame_time,host ts", lambda n: f".03,{n / 25}", 25, None),
+    "beside durations": (
+        "frame_time,host ts",
+        lambda n: f".03,{n / 25}",
+        25,
+        "frame_time repeats its values; host ts is used",
+    ),
+    "beside words": (
+        "time,unix_time",
+        lambda n: f"{'soon' if n == 4 else n},{n / 25}",
+        25,
+        "time is not readable (row 5: 'time' is 'soon', expected a number); unix_time is used",
+    ),
+    "frames within a second": (
+        "Timecode",
+        lambda n: f"10:59:59:{n:02d}",
+        60,
+        "how many frames a second has; they are taken as 60 a second; --recorded-fps",
+    ),
+    "frames at a second's end": (
+        "Timecode",
+        lambda n: f"10:59:{58 + n // 59}:{n % 59 + 1 - n // 59:02d}",
+        60,
+        None,
+    ),
     "two clocks": ("time,unix_time", lambda n: f"{n / 25},{n / 30}", 25, "unix_time lasts 1.967 s"),
     "durations alone": ("frame_time", lambda n: 0.03, 60, "frame_time repeats its values"),
     "falling": ("delta ms", lambda n: 90 - n * n % 19, 60, "delta ms repeats"),
@@ -127,6 +150,47 @@ def test_a_row_lost_between_frame_numbers(tmp_path):
     times = np.cumsum(rng.uniform(0.025, 0.042, COUNT)).round(4)
     found = read_performance(write_rows(tmp_path / "b.csv", "time", lambda n: times[n]))
     assert_allclose(found.times, times - times[0], atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("column", "code", "guessed"),
+    [
+        ("Timecode", lambda n: f"10:59:59:{n:02d}", 60),
+        ("Timecode", lambda n: ("10:59:59:10", "10:59:59:22", "10:59:59:23.5")[n], 60),
+        ("Timecode", lambda n: ("10:59:58:10", "10:59:59:05", "10:59:59:05.5")[n // 2 * 2], 60),
+        ("Timecode", lambda n: 2 * n, 60),
+        (None, None, 60),
+    ],
+)
+def test_a_rate_that_the_file_does_not_tell(tmp_path, capsys, column, code, guessed):
+    """Catches a rate that is guessed in silence or cannot be set, and one that is set against the
+    times of the file."""
+    count = 3 if column else COUNT
+    path = write_rows(tmp_path / "a.csv", column, code, WEIGHTS[:count])
+    found = read_performance(path)
+    assert f"taken as {guessed} a second; --recorded-fps, in Blender Recorded At" in str(
+        found.warnings[-1]
+    )
+    told = read_performance(path, recorded_fps=24)
+    assert not [text for text in told.warnings if "recorded-fps" in text]
+    assert_allclose(told.times * 24, found.times * guessed, atol=1e-9)
+    assert told.fps == pytest.approx(found.fps * 24 / guessed)
+    for name in ("b.csv", "b.npz"):
+        assert stga("drive", path, "--recorded-fps 24 --out", tmp_path / name) == 0
+        told = capsys.readouterr()
+        assert "recorded-fps" not in told.out + told.err
+    timed = write_rows(tmp_path / "timed.csv", "time", lambda n: n / 30)
+    assert stga("drive", timed, "--recorded-fps 24 --out", tmp_path / "c.csv") == 2
+    assert f"{timed}: tells its times, so that no rate is taken" in capsys.readouterr().err
+    assert stga("drive", tmp_path / "b.npz", "--recorded-fps 24 --out", tmp_path / "c.csv") == 2
+    assert "--recorded-fps: has no effect" in capsys.readouterr().err
+
+
+def test_a_base_at_midnight(tmp_path):
+    """Catches 50 frames a second instead of 60 in a take of two seconds that passes midnight."""
+    codes = [f"{code}:{n:02d}" for code in ("23:59:59", "00:00:00") for n in range(0, 60, 12)]
+    found = read_performance(write_csv(tmp_path / "take.csv", codes, WEIGHTS[:10]))
+    assert_allclose(found.times, np.arange(10) / 5, atol=1e-9)
 
 
 @pytest.mark.parametrize(("before", "after"), [("00:09", "00:10"), ("23:59", "00:00")])
