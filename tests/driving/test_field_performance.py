@@ -25,8 +25,9 @@ def write_rows(path, column, times, weights=WEIGHTS, head=(0.1, 0.2, 0.3)):
     """A table of shapes by their plain names; without a column of times where that is None."""
     header = [*([column] if column else []), *ARKIT_SHAPES, *HEAD]
     lines = [",".join(header)]
+    heads = np.broadcast_to(head, (len(weights), 3)).tolist()
     for number, row in enumerate(weights):
-        cells = [*([times(number)] if column else []), *row.tolist(), *head]
+        cells = [*([times(number)] if column else []), *row.tolist(), *heads[number]]
         lines.append(",".join(map(str, cells)))
     path.write_text("\n".join(lines) + "\n")
     return path
@@ -231,9 +232,17 @@ def test_degrees_and_percent(tmp_path):
     ]
 
 
+def swing(amplitude, hertz):
+    """Yaw of a sine, at 30 rows a second."""
+    return np.outer(amplitude * np.sin(2 * np.pi * hertz * np.arange(COUNT) / 30), [1, 0, 0])
+
+
 @pytest.mark.parametrize(
     ("head", "unit", "sentence"),
     [
+        (swing(0.8, 0.5), 1, "reach 0.8; they are read as radians, 46°; if they are degrees"),
+        (swing(0.8, 5), np.pi / 180, "as degrees, because no neck turns as fast in radians"),
+        (swing(0.3, 1), 1, None),
         ((5.5, 0, 0), 1, "reach 5.5; they are read as radians"),
         ((2.5, 2, 1), np.pi / 180, "reach 2.5; they are read as degrees"),
         ((0.1, 0.2, 3), 1, "reach 3; they are read as radians, though no neck turns so far"),
@@ -241,12 +250,16 @@ def test_degrees_and_percent(tmp_path):
     ],
 )
 def test_angles_that_no_neck_has(tmp_path, head, unit, sentence):
-    """Catches a neck that turns by 131° for small angles in degrees, and a phone upside down read
-    as degrees."""
+    """Catches a neck that turns by 131° for small angles in degrees, or by 46° without a word, and
+    a phone upside down read as degrees."""
     path = write_rows(tmp_path / "b.csv", "time", lambda n: n / 30, head=head)
     found = read_performance(path)
-    assert_allclose(found.head, np.tile(head, (COUNT, 1)) * unit)
-    assert sentence in found.warnings[0]
+    assert_allclose(found.head, np.broadcast_to(head, (COUNT, 3)) * unit)
+    assert len(found.warnings) == (sentence is not None)
+    assert sentence is None or sentence in found.warnings[0]
+    told = path.with_name("told.csv")
+    told.write_text(re.sub("(Yaw|Pitch|Roll)", r"\1_deg", path.read_text()))
+    assert_allclose(read_performance(told).head, np.radians(np.broadcast_to(head, (COUNT, 3))))
 
 
 ANGLES = (0.1, 0.2, 0.3)
@@ -264,6 +277,11 @@ TURN = Rotation.from_euler("YXZ", ANGLES).as_quat().tolist()
         ({"headYaw": 0.1, "headPitch": 0.2, "headRoll": 0.3}, None),
         (dict(zip(("yaw_deg", "Pitch (deg)", "roll degrees"), DEGREES, strict=True)), None),
         ({"blendShapes": {"jawOpen": 0.1, "headRotation": [0.2, 0.1, 0.3]}}, "angles about x"),
+        (
+            {"a": {"b": {"c": {"d": {"e": {"headRotation": [0.2, 0.1, 0.3]}}}}}},
+            "angles about x, y, z",
+        ),
+        ({"bones": [{"n": "x"}, {"headMatrix": [1.0]}]}, "bones.1.headMatrix: not read"),
         ({"headMatrix": [1.0] * 16, "leftEye": {"yaw": 1}}, "headMatrix: not read"),
     ],
 )
@@ -273,7 +291,7 @@ def test_head_rotations_in_json(tmp_path, entry, sentence):
     frames = [{"blendShapes": {"jawOpen": 0.1}, **entry} for _ in range(COUNT)]
     (tmp_path / "a.json").write_text(json.dumps({"fps": 30, "frames": frames}))
     found = read_performance(tmp_path / "a.json")
-    is_read = "headMatrix" not in entry
+    is_read = "headMatrix" not in str(entry)
     assert_allclose(found.head, np.tile(ANGLES, (COUNT, 1)) * is_read, atol=1e-12)
     assert [text for text in found.warnings if "lacks" not in text] == [
         text for text in found.warnings if sentence and sentence in text
