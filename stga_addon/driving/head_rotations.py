@@ -122,7 +122,7 @@ def _in_radians(
         if not is_beyond and turn <= WHOLE_TURN_RAD:
             guess += ", because no neck turns as fast in radians"
         return np.radians(head), [*notes, guess]
-    taken = f"the head's angles reach {{:.4g}}; they are read as radians"
+    taken = "the head's angles reach {:.4g}; they are read as radians"
     advice = "" if is_told else f"; {IF_DEGREES}"
     if turn > HALF_TURN_RAD:
         return head, [*notes, taken.format(turn)]
