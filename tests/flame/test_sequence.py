@@ -9,6 +9,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from refusal import refusal
 from scipy.spatial.transform import Rotation
 
+from stga_addon import files
 from stga_addon.flame.forward import (
     change_between,
     changed_by,
@@ -132,6 +133,27 @@ def test_a_motion_is_its_frames(tmp_path, tiny_flame):
     named = read_motion(path, tiny_flame)
     assert named.timesteps == (2, 3, 7)
     assert_array_equal(sequence_mesh(named, 7), sequence_mesh(motion, 2))
+
+
+@pytest.mark.parametrize(
+    ("name", "shape", "is_read"),
+    [
+        ("dynamic_offset", (4000, 40, 3), True),
+        ("dynamic_offset", (4000, 400, 3), False),
+        ("unused", (4000, 40, 3), False),
+    ],
+)
+def test_offsets_that_pack_to_nothing(tmp_path, tiny_flame, monkeypatch, name, shape, is_read):
+    """Catches a long motion without offsets refused for how small its file is, and other arrays of
+    a small file unpacked because of it."""
+    monkeypatch.setattr(files, "MIN_ARRAYS_BYTES", 1 << 18)
+    path = tmp_path / "long.npz"
+    np.savez_compressed(path, expr=np.zeros((4000, 2)), **{name: np.zeros(shape)})
+    if is_read:
+        assert len(read_motion(path, tiny_flame).timesteps) == 4000
+        return
+    with refusal("long.npz: unpacks to"):
+        read_motion(path, tiny_flame)
 
 
 def test_plain_expression_and_pose_files(tmp_path, tiny_flame):
