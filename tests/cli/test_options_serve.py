@@ -1,6 +1,7 @@
 """Every option of every command: for what it serves, and that it is refused elsewhere."""
 
 from dataclasses import is_dataclass
+from pathlib import Path
 
 import pytest
 from refusal import refusal
@@ -52,7 +53,8 @@ drive v.mp4 --out o.npz --avatar r | m.npz --out o.csv          | --smooth --mir
 drive m.npz --out o.csv         | m.csv --out o.csv             | --recorded-fps
 drive v.mp4 --out o.npz         | m.csv --out o.npz             | --recorded-fps
 drive m.csv --out o.npz         |                               | --stay-trained
-info a.npz                      | .                             | --flame --principal-point --effect --device --repair
+info a.npz                      | c                             | --flame --principal-point --effect --device --repair
+info HEAD                       | c                             | --flame --principal-point --effect --device --repair
 batch plan.toml                 | .                             | --out --preset --budget --iterations --seed --flame --principal-point --device
 batch . --dry-run               | .                             | --commands
 batch . --commands              | .                             | --engine
@@ -61,7 +63,11 @@ refine r --resume               | r                             | --out --growth
 extend r --resume               | r c                           | --out --growth --budget --iterations --seed
 """  # noqa: E501
 """Command without the effect, with it (nothing: nowhere), and the options that this is about."""
-ROWS = [[part.strip() for part in row.split("|")] for row in SERVES.strip().splitlines()]
+HEAD = Path(__file__).parents[2] / "docs/ten-splats.glb"
+ROWS = [
+    [part.strip().replace("HEAD", str(HEAD)) for part in row.split("|")]
+    for row in SERVES.strip().splitlines()
+]
 
 
 def refuse_useless(words):
