@@ -14,6 +14,7 @@ from ..errors import StgaError, shorten
 from ..files import CHANGED_LINE_ENDS, converted, line_ends_changed
 
 MAX_HEADER_BYTES = 1 << 16
+
 MAX_LINES = 1 << 23
 """Lines of an ASCII file, each of which becomes a Python object."""
 MAX_UNEVEN_ROWS = 1 << 23

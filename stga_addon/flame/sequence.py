@@ -70,6 +70,7 @@ BODY_POSE_SIZE = 165
 BODY_POSE_PARTS = {"neck_pose": (45, 48), "jaw_pose": (66, 69), "eyes_pose": (69, 75)}
 """Field -> its columns there; the neck is moved as SMPL-X's head."""
 MIN_JOINT_ANGLE_DEG = 0.5  # of a joint that moves
+
 MAX_OFFSET_BYTES = 256 << 20
 """Offsets of a motion, above which they are left out where they are zero."""
 MAX_ZERO_BYTES = 16 << 30

@@ -20,6 +20,7 @@ DEVICES = ("auto", "cpu", "gpu")
 """Choices of `choose_device`, beside "gpu:NAME"."""
 EXPECTED_DEVICE = "auto, cpu, gpu or gpu:NAME"
 MAX_DEVICE_LENGTH = 255
+
 MIN_ADDRESS_SPACE_GB = 4.0
 """Addresses below which WebGPU's library was seen to wait for ever, at 0.7, for a thread that could
 not be started."""
