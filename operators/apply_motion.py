@@ -151,7 +151,7 @@ class ApplyMotion(Edit, bpy.types.Operator, FileImport, MotionProperties):
     fps: options.number(
         "Recorded At",
         "Frames per second of the recording; 0: one timestep for each frame of the "
-        "scene. A face performance has its own times",
+        "scene. Of a face performance: where its file does not tell its times",
         min=0.0,
         max=1000.0,
         options=ONCE,
@@ -279,7 +279,7 @@ class ApplyMotion(Edit, bpy.types.Operator, FileImport, MotionProperties):
     ) -> tuple[str, int]:
         """Apply a face performance to expressions and bones, or to shape keys of its names. Returns
         its name and the number of frames."""
-        performance = read_performance(path)
+        performance = read_performance(path, recorded_fps=self.fps or None)
         options = self._options()
         name = path.stem
         rate = context.scene.render.fps / context.scene.render.fps_base / self.speed

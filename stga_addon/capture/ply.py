@@ -2,9 +2,9 @@
 
 import re
 import struct
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from array import array
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from itertools import repeat
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +14,13 @@ from ..errors import StgaError, shorten
 from ..files import CHANGED_LINE_ENDS, converted, line_ends_changed
 
 MAX_HEADER_BYTES = 1 << 16
+
+MAX_LINES = 1 << 23
+"""Lines of an ASCII file, each of which becomes a Python object."""
+MAX_UNEVEN_ROWS = 1 << 23
+"""Rows of lists of different lengths, which are walked through one by one."""
+GATHERED_ROWS = 1 << 16
+"""Rows of such an element that are unpacked at once."""
 _TYPES = {
     "char": "i1",
     "uchar": "u1",
@@ -33,9 +40,6 @@ _TYPES = {
     "float64": "f8",
 }
 _BYTE_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": "="}
-
-Take = Callable[[str, int], Sequence[float]]
-"""Type of numpy, count -> so many numbers of a row, behind those that were taken before."""
 
 
 @dataclass(frozen=True)
@@ -98,7 +102,9 @@ def ply_header(path: Path, data: bytes) -> tuple[list[Element], str, int]:
                 case ["property", kind, name] if own is not None and name not in own.order:
                     own.scalars[name] = order + _TYPES[kind]
                     own.order.append(name)
-                case ["property", "list", length, kind, name] if own and name not in own.order:
+                case ["property", "list", length, kind, name] if (
+                    own and name not in own.order and _TYPES[length][0] in "iu"
+                ):
                     own.lists[name] = order + _TYPES[length], order + _TYPES[kind]
                     own.order.append(name)
                 case ["ply"] | ["comment" | "obj_info", *_] | []:
@@ -121,6 +127,8 @@ def ply_rows(path: Path, data: bytes, names: Sequence[str]) -> dict[str, Rows]:
     elements, order, position = ply_header(path, data)
     lines: list[bytes] = []
     if order == "=":
+        if data.count(b"\n") + data.count(b"\r") > MAX_LINES:
+            raise StgaError(f"{path}: has more than {MAX_LINES} lines; expected a binary PLY")
         lines = [line for line in re.split(rb"[\r\n]+", data[position:]) if line.strip()]
         position = 0
     last = max((n for n, element in enumerate(elements) if element.name in names), default=-1)
@@ -133,7 +141,7 @@ def ply_rows(path: Path, data: bytes, names: Sequence[str]) -> dict[str, Rows]:
                 rows = _ascii_rows(element, lines[position:end])
             else:
                 _require(path, element, (len(data) - position) // max(element.row_bytes, 1))
-                rows, end = _binary_rows(element, order, data, position)
+                rows, end = _binary_rows(element, data, position)
             if element.name in names:
                 found[element.name] = rows
             position = end
@@ -152,20 +160,83 @@ def _require(path: Path, element: Element, most: int) -> None:
         )
 
 
-def _binary_rows(element: Element, order: str, data: bytes, position: int) -> tuple[Rows, int]:
+def _binary_rows(element: Element, data: bytes, position: int) -> tuple[Rows, int]:
     """The rows that begin at a position, and where they end. Raises ValueError, struct.error."""
     even = _even_rows(element, data, position)
     if even is not None:
         return even
+    if element.count > MAX_UNEVEN_ROWS:
+        name = shorten(element.name)
+        expected = f"expected at most {MAX_UNEVEN_ROWS}, or lists of one length"
+        raise ValueError(
+            f"{element.count} rows of {name} hold lists of different lengths; {expected}"
+        )
+    lengths, end = _lengths(element, data, position)
+    return _gathered_rows(element, data, position, lengths), end
 
-    def take(kind: str, count: int) -> Sequence[float]:
-        nonlocal position
-        layout = f"{order}{count}{np.dtype(kind).char}"
-        start = position
-        position += struct.calcsize(layout)
-        return struct.unpack_from(layout, data, start)
 
-    return _uneven_rows(element, repeat(take, element.count)), position
+def _lengths(element: Element, data: bytes, position: int) -> tuple[dict[str, np.ndarray], int]:
+    """Lengths (N,) by list property, and where the rows end. Raises ValueError, struct.error."""
+    steps = []
+    gap = 0
+    for name in element.order:
+        if name in element.scalars:
+            gap += np.dtype(element.scalars[name]).itemsize
+            continue
+        length, kind = (np.dtype(each) for each in element.lists[name])
+        layout = struct.Struct(f"{length.str[0].replace('|', '=')}{length.char}")
+        numbers = array("q")
+        steps.append((gap, layout.unpack_from, layout.size, kind.itemsize, numbers))
+        gap = 0
+    end = position
+    for _ in range(element.count):
+        for before, unpack, size, item, numbers in steps:
+            end += before
+            (number,) = unpack(data, end)
+            end += size + number * item
+            numbers.append(number)
+        end += gap
+    found = (np.frombuffer(numbers, np.int64) for *_, numbers in steps)
+    lengths = dict(zip(element.lists, found, strict=True))
+    if any((each < 0).any() for each in lengths.values()):
+        raise ValueError("a list of negative length")
+    if end > len(data):
+        raise ValueError(f"the last row of {shorten(element.name)} is cut off")
+    return lengths, end
+
+
+def _gathered_rows(
+    element: Element, data: bytes, position: int, lengths: Mapping[str, np.ndarray]
+) -> Rows:
+    """The rows that begin at a position, with lists of these lengths (N,)."""
+    table = np.empty(element.count, list(element.scalars.items()))
+    values = {name: [np.empty(0, kind)] for name, (_, kind) in element.lists.items()}
+    for first in range(0, element.count, GATHERED_ROWS):
+        rows = slice(first, first + GATHERED_ROWS)
+        sizes = np.full(len(table[rows]), element.row_bytes)
+        for name, each in lengths.items():
+            sizes += each[rows] * values[name][0].itemsize
+        raw = np.frombuffer(data, np.uint8, sizes.sum(), position)
+        place = np.cumsum(sizes) - sizes  # of the next property in each row
+        for name in element.order:
+            if name in element.scalars:
+                kind = np.dtype(element.scalars[name])
+                own = raw[place[:, None] + np.arange(kind.itemsize)]
+                table[name][rows] = own.view(kind)[:, 0]
+                place += kind.itemsize
+                continue
+            place += np.dtype(element.lists[name][0]).itemsize
+            end = place + lengths[name][rows] * values[name][0].itemsize
+            is_filled = end > place
+            change = np.zeros(len(raw) + 1, np.int8)
+            change[place[is_filled]] = 1
+            change[end[is_filled]] = -1
+            is_inside = np.cumsum(change, out=change)[:-1].view(bool)
+            values[name].append(raw[is_inside].view(values[name][0].dtype))
+            place = end
+        position += len(raw)
+    lists = {name: Lists(each, np.concatenate(values[name])) for name, each in lengths.items()}
+    return Rows(table, lists)
 
 
 def _even_rows(element: Element, data: bytes, position: int) -> tuple[Rows, int] | None:
@@ -180,22 +251,25 @@ def _even_rows(element: Element, data: bytes, position: int) -> tuple[Rows, int]
             continue
         length, kind = element.lists[name]
         start = np.frombuffer(data[row : row + np.dtype(length).itemsize], length)
-        if not len(start) or not 0 < start[0] <= len(data):
+        if not len(start) or not 0 <= start[0] <= len(data):
             return None
         dtype += [(f"{name} length", length, 1), (name, kind, int(start[0]))]
         row += np.dtype(length).itemsize + int(start[0]) * np.dtype(kind).itemsize
     whole = np.dtype([(n, k) if size == 1 else (n, k, (size,)) for n, k, size in dtype])
     end = position + element.count * whole.itemsize
-    if end > len(data) or not whole.itemsize:
+    if end > len(data):
         return None
-    table = np.frombuffer(data, whole, element.count, position)
+    table = np.zeros(element.count, whole)
+    if whole.itemsize:
+        table = np.frombuffer(data, whole, element.count, position)
     lists = {}
     for name in element.lists:
         lengths = table[f"{name} length"]
         if (lengths != lengths[:1]).any():
             return None
         lists[name] = Lists(lengths.astype(np.int64), table[name].reshape(-1))
-    return Rows(table[list(element.scalars)], lists), end
+    scalars = table[list(element.scalars)] if element.scalars else np.zeros(element.count, [])
+    return Rows(scalars, lists), end
 
 
 def _ascii_rows(element: Element, lines: Sequence[bytes]) -> Rows:
@@ -206,11 +280,11 @@ def _ascii_rows(element: Element, lines: Sequence[bytes]) -> Rows:
             raise ValueError(f"has {table.shape[1]} numbers a row, expected {len(element.scalars)}")
         return _as_rows(element, list(table.T), [[]] * len(element.order))
 
-    def rows() -> Iterator[Take]:
+    def rows() -> Iterator[Callable[[int], Sequence[float]]]:
         words: list[bytes] = []
         place = 0
 
-        def take(kind: str, count: int) -> Sequence[float]:
+        def take(count: int) -> Sequence[float]:
             nonlocal place
             start = place
             place += count
@@ -225,23 +299,17 @@ def _ascii_rows(element: Element, lines: Sequence[bytes]) -> Rows:
                     f"a row of {shorten(element.name)} has {len(words)} numbers, expected {place}"
                 )
 
-    return _uneven_rows(element, rows())
-
-
-def _uneven_rows(element: Element, rows: Iterable[Take]) -> Rows:
-    """The rows whose lists are of any length. Raises ValueError, and what taking them raises."""
     values = [list[float]() for _ in element.order]
     lengths = [list[int]() for _ in element.order]
-    for take in rows:
+    for take in rows():
         for column, name in enumerate(element.order):
             if name in element.scalars:
-                values[column] += take(element.scalars[name], 1)
+                values[column] += take(1)
                 continue
-            kinds = element.lists[name]
-            length = int(sum(take(kinds[0], 1)))
+            length = int(sum(take(1)))
             if length < 0:
                 raise ValueError("a list of negative length")
-            values[column] += take(kinds[1], length)
+            values[column] += take(length)
             lengths[column].append(length)
     return _as_rows(element, values, lengths)
 

@@ -24,6 +24,10 @@ from .commands import COMMANDS
 MIN_ADDRESS_SPACE_GB = 4.0
 """Below, a small training was seen to abort at 0.8; threads and libraries reserve what they never
 use."""
+MIN_LIBRARIES_GB = 1.2
+"""Below, libraries that train and draw were seen to crash or to wait for ever, at 0.45 to 1.0."""
+NUMPY_COMMANDS = ("drive",)
+"""Commands that were seen to work within less."""
 LIBRARY_FAILURES = (
     MemoryError,
     ImportError,
@@ -69,7 +73,7 @@ def _run(arguments: list[str] | None, head: OpenHead | None) -> int:
             head = read_head(Path(folder))
         options = make_parser(head).parse_args(arguments)
         command = options.command
-        _warn_of_a_tight_limit()
+        _check_address_space(command)
         with telling_refusals(), _passing_on_interrupts():
             COMMANDS[command].carry_out(options, head)
     except StgaError as error:
@@ -107,13 +111,17 @@ def _memory_refusal(command: str, error: Exception) -> str:
     return f"'{command}' failed within {limit}; {expected}: {cause}"
 
 
-def _warn_of_a_tight_limit() -> None:
-    """LLVM and other C++ code ends a process that gets no memory, and says std::bad_alloc."""
+def _check_address_space(command: str) -> None:
+    """Warn of a tight limit: LLVM and other C++ code ends a process that gets no memory, and says
+    std::bad_alloc. Raises StgaError for one in which it may not even end."""
     given = address_space_gb()
-    if given < MIN_ADDRESS_SPACE_GB:
-        limit = f"this process may have {given:.1f} GB of addresses (ulimit -v)"
-        expected = f"expected {MIN_ADDRESS_SPACE_GB:g} GB or no limit: a library may abort it"
-        print(f"stga: warning: {limit}; {expected}", file=sys.stderr)
+    if given >= MIN_ADDRESS_SPACE_GB:
+        return
+    limit = f"this process may have {given:.1f} GB of addresses (ulimit -v)"
+    expected = f"expected {MIN_ADDRESS_SPACE_GB:g} GB or no limit"
+    if given < MIN_LIBRARIES_GB and command not in NUMPY_COMMANDS:
+        raise StgaError(f"'{command}' is not started, because {limit}; {expected}")
+    print(f"stga: warning: {limit}; {expected}: a library may abort it", file=sys.stderr)
 
 
 @contextmanager

@@ -18,7 +18,11 @@ TIMECODE = re.compile(
 BASES = (24, 25, 30, 48, 50, 60, 100, 120, 240)
 """Frames per second that timecodes count."""
 TYPICAL_BASE = 60
-"""Base of a take of less than a second, whose frame numbers do not tell it."""
+"""Base of a take whose frame numbers do not tell it, as within one second."""
+EVEN_TOLERANCE_S = 1e-6
+"""Difference of unevenness within which bases explain the frame numbers equally well."""
+OTHER_RATE = "--recorded-fps, in Blender Recorded At, sets another rate"
+"""What a guess of the rate ends with."""
 DAY_S = 86_400.0
 
 DROP_DAY_S = (30 * DAY_S - 2 * 1296) * 1001 / 30_000
@@ -83,11 +87,22 @@ class _Column:
     rank: int
 
 
+@dataclass(frozen=True)
+class Guess:
+    """A sentence about what was guessed of times.
+
+    fps  rate that frame numbers were taken to count; None: their unit was guessed
+    """
+
+    text: str
+    fps: float | None = None
+
+
 def find_times(
     where: str, columns: Mapping[str, Sequence[object]], fps: float | None = None
-) -> tuple[np.ndarray | None, list[str]]:
-    """(T,) seconds of rows, None where nothing says them; and a sentence each for what was guessed,
-    and for columns of times that are not used.
+) -> tuple[np.ndarray | None, list[str], Guess | None]:
+    """(T,) seconds of rows, None where nothing says them; a sentence each for columns of times that
+    are not used; and what was guessed of the used one.
 
     columns  name -> texts or numbers (T,) of what is no shape. Used is the first that ascends at a
              plausible rate; names with a unit and without other words go first
@@ -95,15 +110,17 @@ def find_times(
     Raises StgaError, beginning with `where`, where none is used and a plain one cannot be read.
     """
     used = None
+    guess = None
     notes = []
     left_out = []
     error = None
     for column in _time_columns(columns):
         try:
-            times, guess = _seconds(where, column, columns[column.name], fps)
+            times, guessed = _seconds(where, column, columns[column.name], fps)
         except StgaError as unreadable:
             error = error or (unreadable if column.is_plain else None)
-            left_out.append(f"{column.name} is not readable")
+            detail = str(unreadable).removeprefix(f"{where}: ")
+            left_out.append(f"{column.name} is not readable ({detail})")
             continue
         problem = _implausible(times)
         if problem:
@@ -111,17 +128,18 @@ def find_times(
         elif used is None:
             used = times
             name = column.name
-            notes += [guess] if guess else []
+            guess = guessed
         elif abs(np.ptp(times) / np.ptp(used) - 1) > MAX_DIFFERENCE:
             seconds = f"{np.ptp(times):.4g} s, not {np.ptp(used):.4g}"
             notes.append(f"column {column.name} lasts {seconds}; it is not used, {name} is")
     if used is not None:
-        return used, notes
+        notes += [f"column {text}; {name} is used" for text in left_out]
+        return used, notes, guess
     if error is not None:
         raise error
     if not left_out and fps is None:
         left_out = [f"{name} ascends, but is not called a time" for name in _ascending(columns)]
-    return None, [f"column {'; column '.join(left_out)}"] if left_out else []
+    return None, [f"column {'; column '.join(left_out)}"] if left_out else [], None
 
 
 def _time_columns(columns: Mapping[str, Sequence[object]]) -> list[_Column]:
@@ -165,10 +183,15 @@ def _words(name: str) -> list[str]:
 
 def _seconds(
     where: str, column: _Column, cells: Sequence[object], fps: float | None
-) -> tuple[np.ndarray, str | None]:
+) -> tuple[np.ndarray, Guess | None]:
     """(T,) seconds of a column's timecodes or numbers, and what was guessed."""
     if any(":" in str(cell) for cell in cells):
-        return seconds_of(where, [str(cell) for cell in cells]), None
+        times, base = seconds_of(where, [str(cell) for cell in cells], fps)
+        if base is None:
+            return times, None
+        why = "timecodes do not tell how many frames a second has"
+        taken = f"they are taken as {base:g} a second"
+        return times, Guess(f"column {column.name}: {why}; {taken}; {OTHER_RATE}", base)
     values = numbers(where, column.name, cells)
     return seconds_of_numbers(f"column {column.name}", values, column.unit, fps)
 
@@ -209,7 +232,7 @@ def _implausible(times: np.ndarray) -> str:
 
 def seconds_of_numbers(
     column: str, values: np.ndarray, unit: float | None, fps: float | None = None
-) -> tuple[np.ndarray, str | None]:
+) -> tuple[np.ndarray, Guess | None]:
     """(T,) seconds of a column of numbers, and a sentence where its unit is guessed: it is the one
     that gives a plausible rate. Small whole numbers are of frames, `fps` a second."""
     steps = np.diff(np.unique(values[np.isfinite(values)]))
@@ -219,19 +242,22 @@ def seconds_of_numbers(
     for unit in (1.0, *UNIT_NAMES):
         if 1 / MAX_ROWS_PER_S <= step * unit <= 1 / MIN_ROWS_PER_S:
             guess = f"{column} holds {UNIT_NAMES.get(unit)}, by its steps of {step:g}"
-            return values * unit, guess if unit in UNIT_NAMES else None
+            return values * unit, Guess(guess) if unit in UNIT_NAMES else None
     if step <= MAX_FRAME_STEP and np.isfinite(values).all() and (values % 1 == 0).all():
         rate = fps or DEFAULT_FPS
         counts = f"{column} counts frames; they are taken as {rate:g} a second"
-        return values / rate, counts
+        return values / rate, Guess(counts) if fps else Guess(f"{counts}; {OTHER_RATE}", rate)
     return values, None
 
 
-def seconds_of(where: str, texts: list[str]) -> np.ndarray:
+def seconds_of(
+    where: str, texts: list[str], fps: float | None = None
+) -> tuple[np.ndarray, float | None]:
     """(T,) seconds from the first of timecodes `HH:MM:SS:FF.sub`, over midnight too; the rate of FF
-    is found from the numbers. A fraction behind a point is of the second where it has three digits
-    or more, or where that of all rows agrees with FF; so are thousandths behind a colon. Raises
-    StgaError, beginning with `where`, for other text."""
+    is found from the numbers, and returned where these do not tell it and `fps` is not given. A
+    fraction behind a point is of the second where it has three digits or more, or where that of all
+    rows agrees with FF; so are thousandths behind a colon. Raises StgaError, beginning with
+    `where`, for other text."""
     fields = []
     digits = []
     marks = set()
@@ -255,13 +281,20 @@ def seconds_of(where: str, texts: list[str]) -> np.ndarray:
     if fraction is None and _are_of_clock(frames, parts):
         fraction = parts
     day = DAY_S
+    guess = None
     if fraction is not None:
         elapsed = second + fraction
     else:
         day = DROP_DAY_S if ";" in marks else DAY_S
-        elapsed = _seconds_of_frames(second, frames, parts, ";" in marks)
-    days = np.concatenate([[0], np.cumsum(np.diff(elapsed) < -DAY_S / 2)])
-    return elapsed + day * days - elapsed[0]
+        base, is_known = _base_of(second, frames + parts, fps)
+        guess = None if is_known else base
+        elapsed = _seconds_of_frames(second, frames + parts, base, ";" in marks)
+    return elapsed + day * _days(elapsed) - elapsed[0], guess
+
+
+def _days(times: np.ndarray) -> np.ndarray:
+    """How often midnight has passed in each row."""
+    return np.concatenate([[0], np.cumsum(np.diff(times) < -DAY_S / 2)])
 
 
 def _fractions(second: np.ndarray, digits: list[str], is_decimal: bool) -> np.ndarray | None:
@@ -300,21 +333,29 @@ def _are_of_clock(frames: np.ndarray, parts: np.ndarray) -> bool:
     return any(((off > early) & (off < length + late)).all() for off, length in within)
 
 
-def _seconds_of_frames(
-    second: np.ndarray, frames: np.ndarray, parts: np.ndarray, is_dropping: bool
-) -> np.ndarray:
-    """Seconds of frame numbers, at the frame rate for which the rows come most evenly."""
-    possible = [base for base in BASES if base > (frames + parts).max()] or [
-        10 ** len(str(int(frames.max())))
-    ]
-    base = TYPICAL_BASE if TYPICAL_BASE in possible else possible[0]
+def _base_of(second: np.ndarray, frames: np.ndarray, fps: float | None) -> tuple[int, bool]:
+    """The frames a second for which rows come most evenly, and whether that or `fps` tells it, or
+    it makes no difference."""
+    bases = [base for base in BASES if base > frames.max()] or [10 ** len(str(int(frames.max())))]
     if len(np.unique(second)) > 1:
-        base = min(possible, key=lambda base: _unevenness(second + (frames + parts) / base))
+        second = second + DAY_S * _days(second)
+        off = {base: _unevenness(second + frames / base) for base in bases}
+        bases = [base for base in bases if off[base] <= min(off.values()) + EVEN_TOLERANCE_S]
+    if fps is not None and round(fps) in bases:
+        return round(fps), True
+    base = TYPICAL_BASE if TYPICAL_BASE in bases else bases[0]
+    return base, len(bases) == 1 or not np.ptp(frames)
+
+
+def _seconds_of_frames(
+    second: np.ndarray, frames: np.ndarray, base: int, is_dropping: bool
+) -> np.ndarray:
+    """Seconds of frame numbers with their parts, `base` a second."""
     if not is_dropping:
-        return second + (frames + parts) / base
+        return second + frames / base
     minute = second // 60
     left_out = round(base / 15) * (minute - np.floor(minute / 10))
-    return (second * base + frames + parts - left_out) / (base * DROP_RATIO)
+    return (second * base + frames - left_out) / (base * DROP_RATIO)
 
 
 def _unevenness(times: np.ndarray) -> float:

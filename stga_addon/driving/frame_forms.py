@@ -1,7 +1,6 @@
 """Other forms in which programs write frames of named weights: keyed by time, a row a shape, lines
 of JSON, Face Cap's text."""
 
-import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -81,7 +80,7 @@ def face_cap_frames(path: Path, text: str) -> list[Any]:
             except ValueError as error:
                 raise StgaError(f"{path}: line {number}: {error}") from error
             shapes = dict(zip(names, values[before - 1 :], strict=True))
-            turn = dict(zip("xyz", map(math.radians, values[4:7]), strict=True))
+            turn = dict(zip(("xDeg", "yDeg", "zDeg"), values[4:7], strict=True))
             frames.append({"time_ms": values[0], "headRotation": turn, "blendShapes": shapes})
     return frames
 

@@ -25,19 +25,28 @@ STRAINED_RAD = np.radians([80.0, 60.0, 50.0])
 """Yaw, pitch and roll that few necks reach, in radians; tiny angles in degrees may seem to."""
 MAX_OUTLIERS = 0.01
 """Fraction of rows beyond `NECK_RAD` that tracking errors explain."""
+MAX_TURN_RAD_S = 12.0
+"""Speed of yaw and pitch that no neck reaches, in radians a second."""
+TURN_S = 0.1
+"""Seconds over which this speed is measured."""
+QUESTIONED_RAD = 0.5
+"""Angle that, where nothing tells the unit, is large in radians and small in degrees."""
+IF_DEGREES = "if they are degrees, --gain head=0.01745, in Blender Head Gain, scales them"
+"""What a guess of radians ends with."""
 HALF_TURN_RAD = math.pi + 0.01
 WHOLE_TURN_RAD = 2 * math.pi + 0.01
 WHOLE_TURN_DEG = 360.0
 
 
 def find_head(
-    where: str, columns: Mapping[str, Sequence[object]]
+    where: str, columns: Mapping[str, Sequence[object]], times: np.ndarray
 ) -> tuple[np.ndarray | None, list[str]]:
     """(T, 3) yaw, pitch and roll in radians, None without any; and a sentence each for what was
     guessed, and for what is called a head's and is not used.
 
     columns  name -> texts or numbers (T,) of what is no shape. Angles about x, y and z are pitch,
              yaw and roll; with w they are a quaternion of a right-handed system with y up, z ahead
+    times    (T,) seconds
     Raises StgaError, beginning with `where`, for texts that are no numbers, and for angles beyond a
     turn in degrees.
     """
@@ -65,11 +74,11 @@ def find_head(
     for name in used:
         values[:, AXES[name]] = numbers(where, axes[name], columns[axes[name]])
     if named:
-        return _in_radians(where, values[:, :3], units, notes)
+        return _in_radians(where, values[:, :3], times, (units, notes))
     origin = axes["x"].rpartition(".")[0] or axes["x"]
     if "w" not in axes:
         notes.append(f"{origin}: angles about x, y, z are read as pitch, yaw, roll")
-        return _in_radians(where, values[:, :3], units, notes)
+        return _in_radians(where, values[:, :3], times, (units, notes))
     notes.append(f"{origin}: is read as a quaternion x, y, z, w, with y up")
     return _of_quaternions(values), notes
 
@@ -88,32 +97,48 @@ def _of_quaternions(values: np.ndarray) -> np.ndarray:
 
 
 def _in_radians(
-    where: str, head: np.ndarray, units: Set[str], notes: list[str]
+    where: str, head: np.ndarray, times: np.ndarray, said: tuple[Set[str], list[str]]
 ) -> tuple[np.ndarray, list[str]]:
     """The angles (T, 3) in radians, and the notes with a sentence where their unit is guessed, or
     where no neck turns so far. Raises StgaError, beginning with `where`, for angles beyond a turn
     in degrees.
 
-    units: which of "deg" and "rad" the columns' names hold; "" of names without
+    said: which of "deg" and "rad" the columns' names hold, "" of names without; and the notes
     """
+    units, notes = said
     turn = float(np.abs(head).max())
     if not turn <= WHOLE_TURN_DEG:
         problem = "head rotation is beyond a turn, or not finite; expected radians"
         raise StgaError(f"{where}: {problem}")
     if units == {"deg"}:
         return np.radians(head), notes
+    is_told = units == {"rad"}
     reached = np.abs(np.remainder(head + math.pi, 2 * math.pi) - math.pi)
     # a camera on its side or upside down turns the roll alone
     is_beyond = (reached > NECK_RAD)[:, :2].any(axis=1).mean() > MAX_OUTLIERS
-    if turn > WHOLE_TURN_RAD or (is_beyond and units != {"rad"}):
+    is_fast = _fraction_too_fast(head[:, :2], times) > MAX_OUTLIERS
+    if turn > WHOLE_TURN_RAD or ((is_beyond or is_fast) and not is_told):
         guess = f"the head's angles reach {turn:.4g}; they are read as degrees"
+        if not is_beyond and turn <= WHOLE_TURN_RAD:
+            guess += ", because no neck turns as fast in radians"
         return np.radians(head), [*notes, guess]
+    taken = "the head's angles reach {:.4g}; they are read as radians"
+    advice = "" if is_told else f"; {IF_DEGREES}"
     if turn > HALF_TURN_RAD:
-        return head, [*notes, f"the head's angles reach {turn:.4g}; they are read as radians"]
+        return head, [*notes, taken.format(turn)]
     strained = reached > STRAINED_RAD
     if strained.any(axis=1).mean() > MAX_OUTLIERS or (reached > NECK_RAD).any():
         far = float(np.abs(head[strained]).max())
         necks = "no neck turns" if (reached > NECK_RAD).any() else "few necks turn"
-        guess = f"they are read as radians, though {necks} so far"
-        notes = [*notes, f"the head's angles reach {far:.4g}; {guess}"]
+        notes = [*notes, f"{taken.format(far)}, though {necks} so far{advice}"]
+    elif not is_told and (reached > QUESTIONED_RAD).any(axis=1).mean() > MAX_OUTLIERS:
+        notes = [*notes, f"{taken.format(turn)}, {math.degrees(turn):.0f}°{advice}"]
     return head, notes
+
+
+def _fraction_too_fast(angles: np.ndarray, times: np.ndarray) -> float:
+    """Fraction of the rows in which angles (T, n) turn faster than `MAX_TURN_RAD_S`."""
+    order = np.argsort(times)
+    at = times[order]
+    turned = [np.interp(at + TURN_S, at, each) - each for each in angles[order].T]
+    return float((np.abs(turned) > MAX_TURN_RAD_S * TURN_S).any(axis=0).mean())

@@ -186,8 +186,16 @@ def _moves_shapes(value: Any) -> bool:
     return getattr(value, "avatar", None) is None or value.output.suffix.lower() != ".npz"
 
 
+def _reads_file(value: Any) -> bool:
+    """Whether a command's motion is a file of a performance."""
+    if hasattr(value, "motion"):
+        return is_performance(value.motion)
+    return value.avatar is None and is_performance(value.source)
+
+
 ON_AVATAR = When(lambda value: hasattr(value, "motion"), "here, where there is no avatar")
 SHAPES = When(_moves_shapes, "on FLAME parameters, only on a face performance")
+FILE = When(_reads_file, "but on a file of a face performance")
 
 
 @dataclass(frozen=True)
@@ -195,6 +203,8 @@ class MotionOptions:
     """What is done to a motion on its way to a head; smoothing (seconds), mirror, gains and
     exchange to performances alone. stay_trained None: how far the motion is outside that range is
     not asked for."""
+
+    LATER_FIELDS = ("recorded_fps",)
 
     strength: float = option(
         "of the motion; 1: as recorded, above 1: exaggerated; the head's is scaled about its first "
@@ -243,6 +253,13 @@ class MotionOptions:
         (),
         choices=EXCHANGEABLE,
         needs=(SHAPES,),
+    )
+    recorded_fps: float | None = option(
+        "frames per second of a face performance whose file does not tell its times",
+        None,
+        MIN_FPS,
+        MAX_FPS,
+        needs=(FILE,),
     )
 
 
@@ -305,7 +322,8 @@ def open_motion(
         check_faces(path, model.faces, faces)
         person = person_of(model, neutral)
         name = str(flame or path)
-        return performed(read_performance(path), person, name, options, trained, fps)
+        performance = read_performance(path, recorded_fps=options.recorded_fps)
+        return performed(performance, person, name, options, trained, fps)
     capture = open_capture(path, flame)
     recorded = capture.flame_motion()
     check_faces(path, recorded.model.faces, faces)

@@ -102,6 +102,8 @@ class Performance:
     head     (T, 3) yaw, pitch, roll in radians; zero where the source has none, or None is given
     fps      rows per second where none is lost
     warnings  one sentence each: what was guessed
+    guessed_fps  rate that frame numbers or rows without times were taken to count, as the last of
+             the warnings says; None: the file tells its times
     """
 
     times: np.ndarray
@@ -109,6 +111,7 @@ class Performance:
     head: np.ndarray
     fps: float
     warnings: tuple[str, ...] = ()
+    guessed_fps: float | None = None
 
     def __post_init__(self) -> None:
         head = 0.0 if self.head is None else self.head
@@ -119,6 +122,17 @@ class Performance:
         """Number of rows that are missing between the first and the last."""
         steps = np.diff(self.times) * self.fps
         return int(np.round(steps[steps > GAP] - 1).sum())
+
+
+def recorded_at(performance: Performance, fps: float) -> Performance:
+    """The performance at this rate in place of the guessed one."""
+    if performance.guessed_fps is None:
+        return performance
+    ratio = fps / performance.guessed_fps
+    times = performance.times / ratio
+    rate = performance.fps * ratio
+    warnings = performance.warnings[:-1]
+    return replace(performance, times=times, fps=rate, warnings=warnings, guessed_fps=None)
 
 
 def resampled(performance: Performance, fps: float | None = None) -> Performance:

@@ -2,6 +2,7 @@
 
 import math
 import re
+from collections import deque
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -11,7 +12,7 @@ import numpy as np
 
 from ..errors import StgaError, shorten
 from ..files import read_json, read_table, read_text
-from .clocks import DEFAULT_FPS, MAX_FPS, MIN_FPS, evened, find_times, numbers
+from .clocks import DEFAULT_FPS, MAX_FPS, MIN_FPS, OTHER_RATE, Guess, evened, find_times, numbers
 from .frame_forms import (
     face_cap_frames,
     is_face_cap,
@@ -64,8 +65,10 @@ COUNT_COLUMN = "blendshapecount"
 
 MAX_OTHERS = 256
 """Columns of JSON frames, besides shapes, that are examined."""
-MAX_DEPTH = 4
-"""Levels of dictionaries in a JSON frame that are looked at."""
+MAX_PARTS = 6
+"""Keys of nested dictionaries that the name of a value in a JSON frame has."""
+MAX_LISTED = 16
+"""Dictionaries of a list in a JSON frame that are examined."""
 MAX_PERCENT = 110.0  # Of weights, of which some are a little above the whole
 FRAME_KEYS = ("frames", "weightMat", "weights", "blendShapeWeights", "data")
 RATE_KEYS = ("exportFps", "fps", "FPS", "frameRate", "frame_rate", "framerate", "FrameRate")
@@ -205,19 +208,25 @@ def _json_weights(where: str, frame: Any, names: list[Any] | None) -> dict[str, 
     return found
 
 
-def _flat(values: dict[str, Any], prefix: str = "", depth: int = 0) -> dict[str, object]:
-    """Dotted name -> text or number of nested dictionaries; of lists of three or four numbers those
-    with x, y, z, w, of others the word "list"."""
-    found = {}
-    for key, value in values.items():
-        name = f"{prefix}{key}"
+def _flat(values: dict[str, Any]) -> dict[str, object]:
+    """Dotted name, of the last `MAX_PARTS` keys -> text or number of nested dictionaries, shallow
+    ones first; of lists of three or four numbers those with x, y, z, w, of the first dictionaries
+    of a list those with their number, of other lists the word "list"."""
+    found: dict[str, object] = {}
+    waiting = deque[tuple[tuple[str, ...], Any]]([((), values)])
+    while waiting:
+        keys, value = waiting.popleft()
         if isinstance(value, list):
-            is_vector = len(value) in (3, 4) and all(map(_is_number, value))
-            value = dict(zip("xyzw", value, strict=False)) if is_vector else "list"
-        if not isinstance(value, dict):
-            found[name] = value
-        elif depth < MAX_DEPTH:
-            found |= _flat(value, f"{name}.", depth + 1)
+            if len(value) in (3, 4) and all(map(_is_number, value)):
+                value = dict(zip("xyzw", value, strict=False))
+            elif value and all(isinstance(entry, dict) for entry in value):
+                value = dict(enumerate(value[:MAX_LISTED]))
+            else:
+                value = "list"
+        if isinstance(value, dict):
+            waiting += (((*keys, str(key))[-MAX_PARTS:], inner) for key, inner in value.items())
+        else:
+            found.setdefault(".".join(keys), value)
     return found
 
 
@@ -273,22 +282,23 @@ def _performance(
     if not (np.abs(weights) <= MAX_WEIGHT).all():
         problem = f"holds weights beyond {MAX_WEIGHT:g}, or not finite; expected 0 to 1"
         raise StgaError(f"{path}: {problem}")
-    if head is None:
-        head, notes = find_head(where, others)
-        guesses += notes
-    times, notes = find_times(where, others, fps)
+    times, notes, guess = find_times(where, others, fps)
     if times is None:
         if fps is None:
             without = f" ({'; '.join(notes)})" if notes else ""
             taken = f"its rows are taken as {DEFAULT_FPS:g} a second"
-            notes = [f"says no times{without}; {taken}"]
+            notes = []
+            guess = Guess(f"says no times{without}; {taken}; {OTHER_RATE}", DEFAULT_FPS)
         rate = DEFAULT_FPS if fps is None else fps
         rate = rate if MIN_FPS <= rate <= MAX_FPS else np.nan
         times = np.arange(len(weights)) / rate
     if not np.isfinite(times).all():
         expected = f"expected {MIN_FPS:g} to {MAX_FPS:g} a second"
         raise StgaError(f"{path}: its times or its rate are not usable; {expected}")
-    guesses += notes
+    if head is None:
+        head, turns = find_head(where, others, times)
+        guesses += turns
+    guesses += [*notes, *([guess.text] if guess else [])]
     times, first = np.unique(times - times.min(), return_index=True)
     times, rate = evened(times)
     rate = fps or rate
@@ -297,4 +307,4 @@ def _performance(
         raise StgaError(f"{path}: has {rate:.3g} rows a second over {times[-1]:.0f} s, {expected}")
     head = np.zeros((len(first), 3)) if head is None else head[first]
     warnings = tuple(f"{path}: {text}" for text in guesses)
-    return Performance(times, weights[first], head, rate, warnings)
+    return Performance(times, weights[first], head, rate, warnings, guess.fps if guess else None)

@@ -8,7 +8,7 @@ from ..capture.transforms import VIDEO_SUFFIXES
 from ..errors import StgaError
 from ..files import is_file, is_folder, matching
 from ..progress import Report, ignore
-from .performance import Performance
+from .performance import Performance, recorded_at
 from .performance_files import (
     csv_performance,
     json_performance,
@@ -74,13 +74,17 @@ def is_performance(path: Path) -> bool:
     return performer is not None and performer.at_once
 
 
-def read_performance(path: Path, report: Report = ignore) -> Performance:
+def read_performance(
+    path: Path, report: Report = ignore, recorded_fps: float | None = None
+) -> Performance:
     """Read a performance by its suffix and content.
 
     CSV of Live Link Face (or the take's folder) and of Audio2Face; JSON of Audio2Face and
     LAM-Audio2Expression, of MediaPipe's blend shapes, or of any named weights per frame;
-    iFacialMocap's packets as lines of text; a video of a face. Columns are found by name. Raises
-    StgaError naming the file, the row, and the shapes that are missing.
+    iFacialMocap's packets as lines of text; a video of a face. Columns are found by name.
+
+    recorded_fps: the rate of a file that does not tell its times. Raises StgaError naming the file,
+    the row, and the shapes that are missing, and for the rate of a file that tells its times.
     """
     if is_folder(path):
         files = _tables(path)
@@ -95,7 +99,11 @@ def read_performance(path: Path, report: Report = ignore) -> Performance:
             f"{path}: is no performance; expected {', '.join(READ_SUFFIXES)} or the folder of "
             "a take"
         )
-    return performer.read(path, report)
+    performance = performer.read(path, report)
+    if recorded_fps is not None and performance.guessed_fps is None:
+        problem = f"{path}: tells its times, so that no rate is taken"
+        raise StgaError(f"{problem} (--recorded-fps, in Blender Recorded At)")
+    return performance if recorded_fps is None else recorded_at(performance, recorded_fps)
 
 
 def _tables(folder: Path) -> list[Path]:

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import DTypeLike
 
 from ..errors import StgaError
-from ..files import converted, read_npz
+from ..files import converted, open_npz, read_npz
 from .forward import (
     RIGID_SIZE,
     FlameFrame,
@@ -70,6 +70,11 @@ BODY_POSE_SIZE = 165
 BODY_POSE_PARTS = {"neck_pose": (45, 48), "jaw_pose": (66, 69), "eyes_pose": (69, 75)}
 """Field -> its columns there; the neck is moved as SMPL-X's head."""
 MIN_JOINT_ANGLE_DEG = 0.5  # of a joint that moves
+
+MAX_OFFSET_BYTES = 256 << 20
+"""Offsets of a motion, above which they are left out where they are zero."""
+MAX_ZERO_BYTES = 16 << 30
+"""Most that is looked through for that, in a minute."""
 TORSO_SHIFT = "torso_shift"
 SHIFT_SIZE = 3
 MAX_PARAMETER = 1e6  # of coefficients, radians and meters; beyond it, vertices would overflow
@@ -202,7 +207,18 @@ def read_motion(path: Path, model: FlameModel) -> FlameSequence:
     Timesteps count from 0, unless `timesteps` (T,) names them. Raises StgaError naming the file
     and the field.
     """
-    return motion_of(path, read_npz(path), model)
+    with open_npz(path) as file:
+        names = set(file.entries)
+        offsets = file.outlines().get("dynamic_offset")
+        expected = 0
+        if offsets is not None and offsets.ndim == 3 and offsets.shape[2] == 3:
+            fits = _rows_fit(offsets.shape[1], len(model.v_template))
+            expected = offsets.nbytes if fits else 0
+        if MAX_OFFSET_BYTES < expected < MAX_ZERO_BYTES and file.is_zero("dynamic_offset"):
+            names.remove("dynamic_offset")
+            expected = 0
+        arrays = file.arrays(names, expected=expected)
+    return motion_of(path, arrays, model)
 
 
 def motion_of(path: Path, arrays: Arrays, model: FlameModel) -> FlameSequence:
@@ -357,14 +373,20 @@ def _vector(path: Path, arrays: Arrays, name: str, size: int) -> np.ndarray:
     return vector
 
 
+def _rows_fit(rows: int, vertices: int) -> bool:
+    """Whether offsets have a row for each vertex, with or without those of the parts."""
+    return rows - vertices in [
+        mine - theirs for mine in ADDED_VERTICES for theirs in ADDED_VERTICES
+    ]
+
+
 def _offset(path: Path, arrays: Arrays, name: str, vertices: int) -> np.ndarray | None:
     """(V, 3) float64, None where absent or all zero; the parts' rows are added or dropped."""
     if name not in arrays:
         return None
     array = arrays[name]
     rows = array.shape[-2] if array.ndim >= 2 else 0
-    accepted = [mine - theirs for mine in ADDED_VERTICES for theirs in ADDED_VERTICES]
-    if array.ndim not in (2, 3) or rows - vertices not in accepted or array.size != rows * 3:
+    if array.ndim not in (2, 3) or not _rows_fit(rows, vertices) or array.size != rows * 3:
         expected = f"({vertices}, 3) or (1, {vertices}, 3)"
         raise StgaError(f"{path}: {name} has shape {array.shape}, expected {expected}")
     offset = np.zeros((vertices, 3))

@@ -6,7 +6,8 @@ from functools import partial
 from pathlib import Path
 from time import monotonic
 
-from ..capture.open import open_capture, repair_capture
+from ..capture.open import is_capture, open_capture, repair_capture
+from ..capture.other_input import other_input
 from ..capture.repairs import REPAIR_OPTION
 from ..format import format_duration
 from ..options import When, like
@@ -33,8 +34,12 @@ def holds_avatar(path: Path) -> bool:
     return (path / RUN).exists() or path.suffix == ".npz"
 
 
+def _may_be_capture(path: Path) -> bool:
+    return not holds_avatar(path) and (is_capture(path) or other_input(path) is None)
+
+
 CAPTURED = When(
-    lambda value: value.capture is None or not holds_avatar(value.capture),
+    lambda value: value.capture is None or _may_be_capture(value.capture),
     "on {capture}, which is no capture",
 )
 

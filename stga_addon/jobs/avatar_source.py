@@ -10,6 +10,7 @@ import numpy as np
 from ..avatar.file import Avatar, read_avatar
 from ..capture.model import Capture
 from ..capture.open import open_capture, sequence_capture
+from ..capture.other_input import SPLAT_SUFFIXES
 from ..capture.transforms import PRINCIPAL_POINTS
 from ..driving.open_motion import Motion, MotionOptions, check_faces, open_motion, trained_range
 from ..errors import StgaError
@@ -118,6 +119,9 @@ def timesteps_between(capture: Capture, span: tuple[int, int] | None, say: Say) 
 def avatar_path(source: Path) -> Path:
     """The avatar file that a run folder or an avatar file names. Raises StgaError for a file of
     another kind."""
+    if source.is_file() and source.suffix.lower() in SPLAT_SUFFIXES:
+        alone = "holds splats, which render alone takes"
+        raise StgaError(f"{source}: {alone}; expected the folder of a run, or an avatar (.npz)")
     if source.is_file() and source.suffix.lower() != ".npz":
         raise StgaError(f"{source}: is no avatar; expected {READ_FILES}")
     return source / AVATAR if source.is_dir() else source

@@ -118,7 +118,7 @@ def convert_motion(request: ConvertMotion, report: Report, say: Say) -> Written:
     if tracked is not None:
         performance = _performance_of_head(tracked)
     elif performer_of(request.source) is not None:
-        performance = read_performance(request.source, report)
+        performance = read_performance(request.source, report, options.recorded_fps)
     else:
         check_motion(request.source)
         performance = _shapes_of_motion(request)

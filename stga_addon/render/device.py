@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 from ..capture.camera import Camera
 from ..errors import DeviceError, StgaError, one_line
 from ..raster.posed_splats import ComposedImage, PosedSplats
+from ..worker.machine import address_space_gb
 
 if TYPE_CHECKING:  # without a GPU, choosing needs numpy only
     from ..raster.gpu.trial import Trial
@@ -19,6 +20,10 @@ DEVICES = ("auto", "cpu", "gpu")
 """Choices of `choose_device`, beside "gpu:NAME"."""
 EXPECTED_DEVICE = "auto, cpu, gpu or gpu:NAME"
 MAX_DEVICE_LENGTH = 255
+
+MIN_ADDRESS_SPACE_GB = 4.0
+"""Addresses below which WebGPU's library was seen to wait for ever, at 0.7, for a thread that could
+not be started."""
 
 
 def is_device(value: Any) -> bool:
@@ -53,6 +58,12 @@ def adapter_names(software: bool = True) -> list[str]:
     """The adapters of `choose_device`, real GPUs first. Raises StgaError if there is none."""
     if find_spec("wgpu") is None:
         raise StgaError("--device gpu: the package wgpu (WebGPU) is not installed")
+    given = address_space_gb()
+    if given < MIN_ADDRESS_SPACE_GB:
+        limit = f"{given:.1f} GB of addresses (ulimit -v)"
+        raise StgaError(
+            f"--device gpu: expected {MIN_ADDRESS_SPACE_GB:g} GB or no limit, not {limit}"
+        )
     from ..raster.gpu.adapters import adapters, is_software
 
     names = [name for name, adapter in adapters().items() if software or not is_software(adapter)]

@@ -57,6 +57,8 @@ def test_apply_a_performance(scene):
     assert bpy.context.scene.frame_end >= 16
     ops.apply_motion(filepath=scene.take, start=10, speed=0.5, place="strip")
     assert_allclose(mesh_at(16), expected(scene, 3), atol=TOLERANCE_M)
+    ops.apply_motion(filepath=scene.take, start=10, fps=30)  # timecodes that were taken as 60
+    assert_allclose(mesh_at(22), expected(scene, 6), atol=TOLERANCE_M)
 
 
 def test_sliders(scene):

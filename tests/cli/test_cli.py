@@ -300,7 +300,8 @@ def test_commands_need_few_packages(root, trained, tmp_path):
 
 def test_interruption_and_mistakes_have_their_codes(root, monkeypatch, capsys):
     """Catches a traceback after Ctrl-C, and a bug reported as the user's mistake; and
-    the traceback of a library that cannot be loaded in little memory."""
+    the traceback of a library that cannot be loaded in little memory, or its crash or endless wait
+    in less."""
 
     def fails_with(error):
         def run(options, head):
@@ -321,13 +322,17 @@ def test_interruption_and_mistakes_have_their_codes(root, monkeypatch, capsys):
     fails_with(RuntimeError("a bug"))
     with pytest.raises(RuntimeError, match="a bug"):
         stga("info", root)
-    monkeypatch.setattr("stga_addon.cli.main.address_space_gb", lambda: 0.8)
+    monkeypatch.setattr("stga_addon.cli.main.address_space_gb", lambda: 1.2)
     for kind in (ImportError, OSError, RuntimeError, SystemError, AttributeError):
         fails_with(kind("failed to map\nsegment"))
         assert stga("info", root) == 2
         sentence = capsys.readouterr().err.splitlines()[-1]
-        assert "'info' failed within the 0.8 GB of addresses" in sentence
+        assert "'info' failed within the 1.2 GB of addresses" in sentence
         assert sentence.endswith("(ulimit -v); expected 4 GB or no limit: 'failed to map segment'")
+    monkeypatch.setattr("stga_addon.cli.main.address_space_gb", lambda: 0.9)
+    assert "'info' is not started, because this process may have 0.9 GB" in refused(
+        capsys, "info", root
+    )
 
 
 # In a process of its own

@@ -1,6 +1,7 @@
 """Every option of every command: for what it serves, and that it is refused elsewhere."""
 
 from dataclasses import is_dataclass
+from pathlib import Path
 
 import pytest
 from refusal import refusal
@@ -23,7 +24,7 @@ VALUES = """
 --address x:1 --budget 9 --camera 1 --capture c --device cpu --effect jaw=on --engine local
 --exchange jaw --flame f.npz --fps 9 --frames 1:2 --gain jaw=2 --growth 0.1 --head c --iterations 9
 --light l.hdr --light-turn 9 --motion m.csv --neutral quiet --out o --preset draft
---principal-point opencv --region mouth --seconds 9 --seed 1 --smooth 1
+--principal-point opencv --recorded-fps 24 --region mouth --seconds 9 --seed 1 --smooth 1
 --strength 2 --timestep 1
 """
 GIVEN = {flag: f"{flag} {value}" for flag, value in zip(*[iter(VALUES.split())] * 2, strict=True)}
@@ -37,7 +38,7 @@ render a.ply --out o            | a.npz --out o                 | --capture --fl
 render a.npz --out o --motion m.csv --cameras t.json | a.npz --video v.mp4 --motion m.csv | --capture
 render a.npz --video v.mp4      | a.npz --out o --cameras t.json | --principal-point
 render a.npz --out o            | a.npz --out o --motion m.npz  | --strength --neutral --stay-trained
-render a.npz --out o --motion m.npz | a.npz --out o --motion m.csv | --smooth --mirror --gain --exchange
+render a.npz --out o --motion m.npz | a.npz --out o --motion m.csv | --smooth --mirror --gain --exchange --recorded-fps
 render a.npz --video v.mp4      | a.npz --video v.mp4 --light l.hdr | --light-turn
 render a.npz --out o --light l.hdr | a.npz --video v.mp4 --light l.hdr | --light-turn
 export a.npz --out o --format ply | . --out o --format ply      | --capture --flame
@@ -46,11 +47,14 @@ export a.npz --out o --format usd | a.npz --out o --format ply  | --timestep
 export a.npz --out o --format ply | a.npz --out o --format usd  | --frames --fps
 export a.npz --out o --format usd | a.npz --out o --format web  | --motion-only
 export a.npz --out o --format web | a.npz --out o --format web --motion m.npz | --strength --neutral --stay-trained
-export a.npz --out o --format web --motion m.npz | a.npz --out o --format web --motion m.csv | --smooth --mirror --gain --exchange
+export a.npz --out o --format web --motion m.npz | a.npz --out o --format web --motion m.csv | --smooth --mirror --gain --exchange --recorded-fps
 drive m.csv --out o.csv         | m.csv --out o.npz             | --flame --head
 drive v.mp4 --out o.npz --avatar r | m.npz --out o.csv          | --smooth --mirror --gain --exchange --flame
+drive m.npz --out o.csv         | m.csv --out o.csv             | --recorded-fps
+drive v.mp4 --out o.npz         | m.csv --out o.npz             | --recorded-fps
 drive m.csv --out o.npz         |                               | --stay-trained
-info a.npz                      | .                             | --flame --principal-point --effect --device --repair
+info a.npz                      | c                             | --flame --principal-point --effect --device --repair
+info HEAD                       | c                             | --flame --principal-point --effect --device --repair
 batch plan.toml                 | .                             | --out --preset --budget --iterations --seed --flame --principal-point --device
 batch . --dry-run               | .                             | --commands
 batch . --commands              | .                             | --engine
@@ -59,7 +63,11 @@ refine r --resume               | r                             | --out --growth
 extend r --resume               | r c                           | --out --growth --budget --iterations --seed
 """  # noqa: E501
 """Command without the effect, with it (nothing: nowhere), and the options that this is about."""
-ROWS = [[part.strip() for part in row.split("|")] for row in SERVES.strip().splitlines()]
+HEAD = Path(__file__).parents[2] / "docs/ten-splats.glb"
+ROWS = [
+    [part.strip().replace("HEAD", str(HEAD)) for part in row.split("|")]
+    for row in SERVES.strip().splitlines()
+]
 
 
 def refuse_useless(words):

@@ -25,8 +25,9 @@ def write_rows(path, column, times, weights=WEIGHTS, head=(0.1, 0.2, 0.3)):
     """A table of shapes by their plain names; without a column of times where that is None."""
     header = [*([column] if column else []), *ARKIT_SHAPES, *HEAD]
     lines = [",".join(header)]
+    heads = np.broadcast_to(head, (len(weights), 3)).tolist()
     for number, row in enumerate(weights):
-        cells = [*([times(number)] if column else []), *row.tolist(), *head]
+        cells = [*([times(number)] if column else []), *row.tolist(), *heads[number]]
         lines.append(",".join(map(str, cells)))
     path.write_text("\n".join(lines) + "\n")
     return path
@@ -71,7 +72,30 @@ CLOCKS = {
         None,
     ),
     "the micro sign": ("Time [\N{MICRO SIGN}s]", lambda n: n * 40_000, 25, None),
-    "beside durations": ("frame_time,host ts", lambda n: f".03,{n / 25}", 25, None),
+    "beside durations": (
+        "frame_time,host ts",
+        lambda n: f".03,{n / 25}",
+        25,
+        "frame_time repeats its values; host ts is used",
+    ),
+    "beside words": (
+        "time,unix_time",
+        lambda n: f"{'soon' if n == 4 else n},{n / 25}",
+        25,
+        "time is not readable (row 5: 'time' is 'soon', expected a number); unix_time is used",
+    ),
+    "frames within a second": (
+        "Timecode",
+        lambda n: f"10:59:59:{n:02d}",
+        60,
+        "how many frames a second has; they are taken as 60 a second; --recorded-fps",
+    ),
+    "frames at a second's end": (
+        "Timecode",
+        lambda n: f"10:59:{58 + n // 59}:{n % 59 + 1 - n // 59:02d}",
+        60,
+        None,
+    ),
     "two clocks": ("time,unix_time", lambda n: f"{n / 25},{n / 30}", 25, "unix_time lasts 1.967 s"),
     "durations alone": ("frame_time", lambda n: 0.03, 60, "frame_time repeats its values"),
     "falling": ("delta ms", lambda n: 90 - n * n % 19, 60, "delta ms repeats"),
@@ -129,6 +153,47 @@ def test_a_row_lost_between_frame_numbers(tmp_path):
     assert_allclose(found.times, times - times[0], atol=1e-9)
 
 
+@pytest.mark.parametrize(
+    ("column", "code", "guessed"),
+    [
+        ("Timecode", lambda n: f"10:59:59:{n:02d}", 60),
+        ("Timecode", lambda n: ("10:59:59:10", "10:59:59:22", "10:59:59:23.5")[n], 60),
+        ("Timecode", lambda n: ("10:59:58:10", "10:59:59:05", "10:59:59:05.5")[n // 2 * 2], 60),
+        ("Timecode", lambda n: 2 * n, 60),
+        (None, None, 60),
+    ],
+)
+def test_a_rate_that_the_file_does_not_tell(tmp_path, capsys, column, code, guessed):
+    """Catches a rate that is guessed in silence or cannot be set, and one that is set against the
+    times of the file."""
+    count = 3 if column else COUNT
+    path = write_rows(tmp_path / "a.csv", column, code, WEIGHTS[:count])
+    found = read_performance(path)
+    assert f"taken as {guessed} a second; --recorded-fps, in Blender Recorded At" in str(
+        found.warnings[-1]
+    )
+    told = read_performance(path, recorded_fps=24)
+    assert not [text for text in told.warnings if "recorded-fps" in text]
+    assert_allclose(told.times * 24, found.times * guessed, atol=1e-9)
+    assert told.fps == pytest.approx(found.fps * 24 / guessed)
+    for name in ("b.csv", "b.npz"):
+        assert stga("drive", path, "--recorded-fps 24 --out", tmp_path / name) == 0
+        told = capsys.readouterr()
+        assert "recorded-fps" not in told.out + told.err
+    timed = write_rows(tmp_path / "timed.csv", "time", lambda n: n / 30)
+    assert stga("drive", timed, "--recorded-fps 24 --out", tmp_path / "c.csv") == 2
+    assert f"{timed}: tells its times, so that no rate is taken" in capsys.readouterr().err
+    assert stga("drive", tmp_path / "b.npz", "--recorded-fps 24 --out", tmp_path / "c.csv") == 2
+    assert "--recorded-fps: has no effect" in capsys.readouterr().err
+
+
+def test_a_base_at_midnight(tmp_path):
+    """Catches 50 frames a second instead of 60 in a take of two seconds that passes midnight."""
+    codes = [f"{code}:{n:02d}" for code in ("23:59:59", "00:00:00") for n in range(0, 60, 12)]
+    found = read_performance(write_csv(tmp_path / "take.csv", codes, WEIGHTS[:10]))
+    assert_allclose(found.times, np.arange(10) / 5, atol=1e-9)
+
+
 @pytest.mark.parametrize(("before", "after"), [("00:09", "00:10"), ("23:59", "00:00")])
 def test_drop_frame_numbers_over_ten_minutes(tmp_path, before, after):
     """Catches numbers 0 and 1 taken as left out in every tenth minute too, which has them, and a
@@ -167,9 +232,17 @@ def test_degrees_and_percent(tmp_path):
     ]
 
 
+def swing(amplitude, hertz):
+    """Yaw of a sine, at 30 rows a second."""
+    return np.outer(amplitude * np.sin(2 * np.pi * hertz * np.arange(COUNT) / 30), [1, 0, 0])
+
+
 @pytest.mark.parametrize(
     ("head", "unit", "sentence"),
     [
+        (swing(0.8, 0.5), 1, "reach 0.8; they are read as radians, 46°; if they are degrees"),
+        (swing(0.8, 5), np.pi / 180, "as degrees, because no neck turns as fast in radians"),
+        (swing(0.3, 1), 1, None),
         ((5.5, 0, 0), 1, "reach 5.5; they are read as radians"),
         ((2.5, 2, 1), np.pi / 180, "reach 2.5; they are read as degrees"),
         ((0.1, 0.2, 3), 1, "reach 3; they are read as radians, though no neck turns so far"),
@@ -177,12 +250,16 @@ def test_degrees_and_percent(tmp_path):
     ],
 )
 def test_angles_that_no_neck_has(tmp_path, head, unit, sentence):
-    """Catches a neck that turns by 131° for small angles in degrees, and a phone upside down read
-    as degrees."""
+    """Catches a neck that turns by 131° for small angles in degrees, or by 46° without a word, and
+    a phone upside down read as degrees."""
     path = write_rows(tmp_path / "b.csv", "time", lambda n: n / 30, head=head)
     found = read_performance(path)
-    assert_allclose(found.head, np.tile(head, (COUNT, 1)) * unit)
-    assert sentence in found.warnings[0]
+    assert_allclose(found.head, np.broadcast_to(head, (COUNT, 3)) * unit)
+    assert len(found.warnings) == (sentence is not None)
+    assert sentence is None or sentence in found.warnings[0]
+    told = path.with_name("told.csv")
+    told.write_text(re.sub("(Yaw|Pitch|Roll)", r"\1_deg", path.read_text()))
+    assert_allclose(read_performance(told).head, np.radians(np.broadcast_to(head, (COUNT, 3))))
 
 
 ANGLES = (0.1, 0.2, 0.3)
@@ -200,6 +277,11 @@ TURN = Rotation.from_euler("YXZ", ANGLES).as_quat().tolist()
         ({"headYaw": 0.1, "headPitch": 0.2, "headRoll": 0.3}, None),
         (dict(zip(("yaw_deg", "Pitch (deg)", "roll degrees"), DEGREES, strict=True)), None),
         ({"blendShapes": {"jawOpen": 0.1, "headRotation": [0.2, 0.1, 0.3]}}, "angles about x"),
+        (
+            {"a": {"b": {"c": {"d": {"e": {"headRotation": [0.2, 0.1, 0.3]}}}}}},
+            "angles about x, y, z",
+        ),
+        ({"bones": [{"n": "x"}, {"headMatrix": [1.0]}]}, "bones.1.headMatrix: not read"),
         ({"headMatrix": [1.0] * 16, "leftEye": {"yaw": 1}}, "headMatrix: not read"),
     ],
 )
@@ -209,7 +291,7 @@ def test_head_rotations_in_json(tmp_path, entry, sentence):
     frames = [{"blendShapes": {"jawOpen": 0.1}, **entry} for _ in range(COUNT)]
     (tmp_path / "a.json").write_text(json.dumps({"fps": 30, "frames": frames}))
     found = read_performance(tmp_path / "a.json")
-    is_read = "headMatrix" not in entry
+    is_read = "headMatrix" not in str(entry)
     assert_allclose(found.head, np.tile(ANGLES, (COUNT, 1)) * is_read, atol=1e-12)
     assert [text for text in found.warnings if "lacks" not in text] == [
         text for text in found.warnings if sentence and sentence in text

@@ -1,5 +1,6 @@
 """3DGS PLY files: what other programs wrote, what they will read, and what is broken."""
 
+import struct
 from dataclasses import replace
 
 import numpy as np
@@ -9,6 +10,7 @@ from avatar.conftest import random_splats
 from numpy.testing import assert_array_equal
 from refusal import refusal
 
+from stga_addon.capture import ply
 from stga_addon.export.ply import read_ply, write_ply
 from stga_addon.export.splat_files import read_splats
 
@@ -129,6 +131,40 @@ def test_elements_before_and_after_the_vertices_and_windows_line_ends(tmp_path):
         begin = (head + mark).replace(b"\n", ending)
         (tmp_path / "a.ply").write_bytes(begin + b"\xff" * 10 + body + b"\x03" + bytes(12))
         assert read_ply(tmp_path / "a.ply").xyz.tolist() == [[0, 1, 2], [100, 101, 102]]
+
+
+@pytest.mark.parametrize("order", "<>")
+def test_lists_of_different_lengths(tmp_path, monkeypatch, order):
+    """Catches lists that are taken for those of another row, also empty ones and behind a block of
+    rows, and minutes of work for millions of them."""
+    monkeypatch.setattr(ply, "GATHERED_ROWS", 64)
+    rng = np.random.default_rng(0)
+    faces = [(n, rng.random(n % 4), rng.integers(0, 9, n % 5)) for n in rng.integers(0, 99, 300)]
+    kinds = "property uchar n\nproperty list uchar double a\nproperty list int short b\n"
+    endian = {"<": "little", ">": "big"}[order]
+    start = (
+        f"ply\nformat binary_{endian}_endian 1.0\nelement face 300\n{kinds}end_header\n".encode()
+    )
+    body = b"".join(
+        struct.pack(f"{order}BB{len(a)}di{len(b)}h", n, len(a), *a, len(b), *b) for n, a, b in faces
+    )
+    rows = ply.ply_rows(tmp_path, start + body, ["face"])["face"]
+    for name, column in (("a", 1), ("b", 2)):
+        assert rows.lists[name].lengths.tolist() == [len(face[column]) for face in faces]
+        assert_array_equal(
+            rows.lists[name].values, np.concatenate([face[column] for face in faces])
+        )
+    assert rows.scalars["n"].tolist() == [n for n, _, _ in faces]
+    with refusal("not a readable PLY"):
+        ply.ply_rows(tmp_path, start + body[:-1], ["face"])
+    monkeypatch.setattr(ply, "MAX_UNEVEN_ROWS", 299)
+    with refusal("300 rows of 'face' hold lists of different lengths; expected at most 299"):
+        ply.ply_rows(tmp_path, start + body, ["face"])
+    empty = start.replace(b"300", b"20000000") + bytes(6 * 20_000_000)
+    assert len(ply.ply_rows(tmp_path, empty, ["face"])["face"].scalars) == 20_000_000
+    monkeypatch.setattr(ply, "MAX_LINES", 5)
+    with refusal("has more than 5 lines"):
+        ply.ply_rows(tmp_path, ascii_head("element vertex 0\n" + GOOD), ["vertex"])
 
 
 def head(body):

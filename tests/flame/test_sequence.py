@@ -9,6 +9,8 @@ from numpy.testing import assert_allclose, assert_array_equal
 from refusal import refusal
 from scipy.spatial.transform import Rotation
 
+from stga_addon import files
+from stga_addon.flame import sequence
 from stga_addon.flame.forward import (
     change_between,
     changed_by,
@@ -132,6 +134,29 @@ def test_a_motion_is_its_frames(tmp_path, tiny_flame):
     named = read_motion(path, tiny_flame)
     assert named.timesteps == (2, 3, 7)
     assert_array_equal(sequence_mesh(named, 7), sequence_mesh(motion, 2))
+
+
+@pytest.mark.parametrize(
+    ("name", "vertices", "most"),
+    [
+        ("dynamic_offset", 40, 1 << 28),
+        ("dynamic_offset", 40, 1),
+        ("dynamic_offset", 400, 1),
+        ("unused", 40, 1),
+    ],
+)
+def test_offsets_that_pack_to_nothing(tmp_path, tiny_flame, monkeypatch, name, vertices, most):
+    """Catches a long motion without offsets refused for how small its file is, and other arrays of
+    a small file unpacked because of it."""
+    monkeypatch.setattr(files, "MIN_ARRAYS_BYTES", 1 << 18)
+    monkeypatch.setattr(sequence, "MAX_OFFSET_BYTES", most)
+    path = tmp_path / "long.npz"
+    np.savez_compressed(path, expr=np.zeros((4000, 2)), **{name: np.zeros((4000, vertices, 3))})
+    if name == "dynamic_offset" and vertices == len(tiny_flame.v_template):
+        assert len(read_motion(path, tiny_flame).timesteps) == 4000
+        return
+    with refusal("long.npz: unpacks to"):
+        read_motion(path, tiny_flame)
 
 
 def test_plain_expression_and_pose_files(tmp_path, tiny_flame):

@@ -65,6 +65,15 @@ def test_software_is_only_taken_by_name(trials, monkeypatch):
     assert adapter_names() == [SOFTWARE]
 
 
+def test_no_gpu_within_few_addresses(trials, monkeypatch):
+    """Catches WebGPU's library, which waits for ever there, loaded under a limit of addresses."""
+    monkeypatch.setattr(device_module, "address_space_gb", lambda: 1.2)
+    chosen, why = choose_device("auto")
+    assert (chosen, "not 1.2 GB of addresses (ulimit -v)" in why) == ("cpu", True)
+    with refusal("not 1.2 GB of addresses"):
+        choose_device("gpu")
+
+
 @pytest.mark.parametrize("error", [0.02, float("nan")])
 def test_wrong_gradients_are_refused(trials, error):
     """Catches training on a driver that computes something else."""
