@@ -24,7 +24,16 @@ from ...flame.sequence import MIN_JOINT_ANGLE_DEG, FlameSequence, joint_angles
 from .. import arrays, tags
 from ..arrays import Z_UP_TO_Y_UP, add_driver, flat_floats, key_points
 from ..compat import KeptAnimation, give_animation, keep_animation
-from ..objects import Warn, capture_root, leave_edit_mode, log_warning, place, remove, reset
+from ..objects import (
+    Warn,
+    capture_root,
+    leave_edit_mode,
+    log_warning,
+    mover_of,
+    place,
+    remove,
+    reset,
+)
 from . import keyframes
 from .keyframes import MAX_SLIDER, key_value_path, location_path, property_path, rotation_path
 
@@ -44,6 +53,9 @@ def import_head(capture: Capture, warn: Warn = log_warning, correctives: str = "
     if sequence is None:
         meshes = [flat_floats(capture.mesh(timestep)) for timestep in capture.timesteps]
     before = next(iter(tags.find(tags.HEAD, capture.root)), None)
+    if before is not None:
+        check_own(before)
+        _check_parent(before)
     kept_keys = keep_animation(before.data.shape_keys if before is not None else None)
     kept_bones = keep_animation(next(iter(_rigs(before)), None) if before is not None else None)
     others = _other_keys(before, capture)
@@ -105,8 +117,6 @@ def _add_keys(head: Any, keys: Mapping[str, tuple[np.ndarray, float]]) -> None:
 def _place_head(capture: Capture) -> Any:
     root = capture_root(capture.root)
     head = next(iter(tags.find(tags.HEAD, capture.root)), None)
-    if head is not None and head.parent is None:
-        raise StgaError(f"{head.name}: {PARENTLESS}, or delete it")
     if head is not None and arrays.has_triangles(head.data, capture.faces):
         # Into the same mesh, which keeps materials, vertex groups and painted attributes.
         reset(head)
@@ -275,6 +285,23 @@ def rig_of(head: Any) -> Any:
 LINKED = "is linked from another file: open that file, or make the head local"
 
 
+def check_own(head: Any) -> None:
+    """Raise StgaError where a head is linked or overridden: shape keys, vertex groups and
+    properties that are added to a library override are gone after reopening."""
+    blocks = (head, head.data)
+    if any(block.library is not None for block in blocks):
+        raise StgaError(f"{head.name}: {LINKED}")
+    if any(block.override_library is not None for block in blocks):
+        problem = "is overridden, and Blender would not save what this adds"
+        raise StgaError(f"{head.name}: {problem}; open its file, or make the head local")
+
+
+def _check_parent(part: Any) -> None:
+    if mover_of(part) is part:
+        problem = "has no parent" if part.parent is None else f"has the parent {part.parent.name}"
+        raise StgaError(f"{part.name}: {problem}; parent it again to the Empty of its capture")
+
+
 def usable_rig(head: Any, with_sliders: bool = True) -> Any:
     """The armature object of a head that can be posed here. with_sliders: and its shape keys, which
     a library override cannot change. Raises StgaError that says why not."""
@@ -286,8 +313,10 @@ def usable_rig(head: Any, with_sliders: bool = True) -> Any:
     override = rig.override_library
     if rig.library is not None or (override is not None and override.is_system_override):
         raise StgaError(f"{rig.name}: {LINKED}")
-    if head.parent is None:
-        raise StgaError(f"{head.name}: {PARENTLESS}")
+    for part in (head, rig):
+        _check_parent(part)
+    if rig.data.pose_position == "REST":
+        raise StgaError(f"{rig.name}: is in Rest Position; choose Pose Position")
     for name in JOINTS:
         if rig.pose.bones[name].rotation_mode != "QUATERNION":
             raise StgaError(f"{rig.name}: the rotation mode of bone {name} must be Quaternion")
@@ -295,7 +324,6 @@ def usable_rig(head: Any, with_sliders: bool = True) -> Any:
 
 
 OWN = "open that file, or make the head's mesh local"
-PARENTLESS = "has no parent; parent it again to the Empty of its capture"
 
 
 def _remove_bone_groups(head: Any, rigs: Sequence[Any]) -> None:

@@ -77,6 +77,26 @@ def expression_keys(head: Any) -> dict[int, str]:
     return {k: numbered_key(k) for k in components if numbered_key(k) in names}
 
 
+def check_sliders(head: Any, values: np.ndarray) -> None:
+    """Raise StgaError where a head lacks a slider that expressions (T, C) move."""
+    sliders = expression_keys(head)
+    for component in np.flatnonzero(values.any(axis=0)).tolist():
+        if component not in sliders:
+            name = expression_key(head, component)
+            raise StgaError(f"{head.name}: has no slider {name}; import the head again to get all")
+
+
+def check_ranges(head: Any, values: np.ndarray) -> None:
+    """Raise StgaError where expressions (T, C) need wider sliders of a mesh that is overridden:
+    Blender does not save these."""
+    for component, name in expression_keys(head).items():
+        key = head.data.shape_keys.key_blocks[name]
+        wanted = values[:, component]
+        if not np.array_equal(wanted, np.clip(wanted, key.slider_min, key.slider_max)):
+            problem = f"{name} needs a wider range, which Blender would not save with an override"
+            raise StgaError(f"{head.name}: {problem}; make the head's mesh local")
+
+
 def slider_components(model: FlameModel) -> dict[str, int]:
     """Shape key -> component of `model.shapedirs`: expressions, and the first of identity."""
     numbered = map(numbered_key, range(model.n_expression))

@@ -12,7 +12,6 @@ from mathutils import Matrix
 from ...driving.head_map import features
 from ...driving.open_motion import PART_FIELDS, TrainedRange, outside
 from ...driving.performance import ARKIT_SHAPES, COLUMN
-from ...errors import StgaError
 from ...flame.forward import FlameFrame, flame_forward
 from ...flame.model import JOINTS, FlameModel
 from ...flame.quaternions import from_axis_angle, multiply, to_axis_angle
@@ -44,18 +43,18 @@ def apply_motion(
     rig = usable_rig(head)
     keyframes.check_keyable(rig)
     keyframes.check_keyable(head.data.shape_keys)
-    used = np.any([frame.expr != 0 for frame in frames], axis=0)
-    sliders = keyframes.expression_keys(head)
-    for component in np.flatnonzero(used).tolist() if "expression" in parts else ():
-        if component not in sliders:
-            key = keyframes.expression_key(head, component)
-            raise StgaError(f"{head.name}: has no slider {key}; import the head again to get all")
+    expr = np.stack([frame.expr for frame in frames])
+    if "expression" in parts:
+        keyframes.check_sliders(head, expr)
     # Coefficients of the sliders that the motion lacks are zero.
-    count = max(len(used), 1 + max(sliders, default=-1))
-    frames = [replace(each, expr=np.pad(each.expr, (0, count - len(each.expr)))) for each in frames]
+    count = max(expr.shape[1], 1 + max(keyframes.expression_keys(head), default=-1))
+    expr = np.pad(expr, ((0, 0), (0, count - expr.shape[1])))
+    frames = [replace(each, expr=row) for each, row in zip(frames, expr, strict=True)]
     keys = head.data.shape_keys
 
     has_expression = "expression" in parts
+    if has_expression and head.data.override_library is not None:
+        keyframes.check_ranges(head, expr)
     offsets = keyframes.offset_keys(head) if has_expression else []
     owners = [rig] if offsets or set(parts) & set(keyframes.PART_JOINTS) else []
     owners += [keys] if has_expression else []
