@@ -49,6 +49,7 @@ from ..stga_addon.scene.objects import (
 )
 from ..stga_addon.scene.record import capture_of, store_path
 from ..stga_addon.scene.rig.head import import_head
+from ..stga_addon.scene.rig.keyframes import has_shapes
 from ..stga_addon.tracking.folder import describe_focal_length, is_tracked
 from ..stga_addon.training.run.folder import has_run, next_folder
 from . import options
@@ -101,6 +102,8 @@ class HeadImport(Edit):
         heads = [thing for thing in scene.objects if is_head(thing)]
         others = [each for each in heads if capture_of(each) != capture.root.resolve()]
         is_new = len(heads) == len(others)
+        had_sliders = any(has_shapes(each) for each in heads if each not in others)
+        used = {action.session_uid for action in bpy.data.actions if _is_used(action)}
         head = import_head(capture, warn=warn, correctives=correctives)
         if others and is_new:
             place_beside(head, others)
@@ -131,6 +134,13 @@ class HeadImport(Edit):
             configure_scene(scene, capture, middle, warn=warn)
         for sentence in filter(self.is_told, capture.warnings):
             warn(sentence)
+        left = [each for each in bpy.data.actions if each.session_uid in used]
+        left = [each.name for each in left if each.use_fake_user and not _is_used(each)]
+        if left:
+            instead = "stay in the file as actions, and the capture's motion plays instead"
+            warn(f"{head.name}: keyframes made by hand {instead}: {', '.join(left)}")
+        if had_sliders:
+            call(bpy.ops.stga.add_arkit_controls)
         counted = {"timesteps": capture.timesteps, "triangles": capture.faces, "cameras": cameras}
         self.inform(", ".join(f"{len(all_)} {name}" for name, all_ in counted.items()))
         begin_sliders(head)
@@ -139,6 +149,11 @@ class HeadImport(Edit):
 
     def is_told(self, warning: str) -> bool:
         return not self.ignored_warning or self.ignored_warning not in warning
+
+
+def _is_used(action: Any) -> bool:
+    """Whether an action animates something."""
+    return bool(action.users > action.use_fake_user)
 
 
 def _store_filmed(head: Any, found: Filmed) -> None:

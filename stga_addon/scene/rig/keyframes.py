@@ -215,7 +215,9 @@ def push_down_own(owner: Any) -> None:
     elif not animation.nla_tracks and any(is_of_parts(each.data_path, ["head"]) for each in curves):
         action = animation.action
         slot = slot_of(animation)
+        is_kept = action.use_fake_user
         held = copy_action(owner, f"{owner.name} place")
+        action.use_fake_user = is_kept
         for curve in [each for each in held if not is_of_parts(each.data_path, ["head"])]:
             held.remove(curve)
         animation.action[tags.HELD] = True
@@ -325,6 +327,18 @@ def has_shapes(head: Any) -> bool:
     return ARKIT_MAP in head
 
 
+def added_shapes(head: Any) -> set[str]:
+    """Names of the shape keys that `add_shapes` may have given a head."""
+    if not has_shapes(head):
+        return set()
+    return {*ARKIT_SHAPES, *(product_key(column) for column in PRODUCTS.tolist())}
+
+
+def product_key(column: int) -> str:
+    """The shape key of what a shape adds to an open jaw."""
+    return f"{ARKIT_SHAPES[column]} * jawOpen"
+
+
 def head_shapes(sequence: FlameSequence, found: HeadMap) -> tuple[np.ndarray, np.ndarray]:
     """Displacements (52, V, 3) of a person's neutral mesh by each shape at 1, and (PRODUCTS, V, 3)
     by what each of PRODUCTS at 1 adds to jawOpen at 1, or takes from it; meters."""
@@ -348,7 +362,7 @@ def add_shapes(head: Any, found: HeadMap, alone: np.ndarray, pairs: np.ndarray) 
     basis = key_points(keys.reference_key)
     named = list(zip(ARKIT_SHAPES, alone, strict=True))
     named += [
-        (f"{ARKIT_SHAPES[column]} * jawOpen", displacement)
+        (product_key(column), displacement)
         for column, displacement in zip(PRODUCTS.tolist(), pairs, strict=True)
         if np.abs(displacement).max() > NEGLIGIBLE_M
     ]
