@@ -50,7 +50,7 @@ MIN_UNPACKED_BYTES = 32 << 20
 MAX_UNPACKED_RATIO = 16
 """How many times its size a larger one may unpack to; splats reach 3, without harmonics 10."""
 MIN_ARRAYS_BYTES = 384 << 20
-"""Bytes to which any npz may unpack besides: a motion of 6000 frames whose offsets are zero."""
+"""Bytes to which any npz may unpack besides."""
 MIN_NUMBER_BYTES = 4
 """What a number of an npz counts for at least, as readers make floats of small ones."""
 MAX_NAME_BYTES = 255
@@ -615,13 +615,18 @@ class NpzFile:
     entries: Mapping[str, zipfile.ZipInfo]
 
     def arrays(
-        self, names: Collection[str] | None = None, limit: int = MAX_ARRAYS_BYTES
+        self,
+        names: Collection[str] | None = None,
+        limit: int = MAX_ARRAYS_BYTES,
+        expected: int = 0,
     ) -> dict[str, np.ndarray]:
-        """The arrays that are among `names`, by default every one, of at most `limit` bytes."""
+        """The arrays that are among `names`, by default every one, of at most `limit` bytes;
+        `expected` of them are as many as they must be, however well they are packed."""
         wanted = {n: each for n, each in self.entries.items() if names is None or n in names}
         unpacked = sum(entry.file_size for entry in wanted.values())
         if unpacked > MIN_ARRAYS_BYTES // MIN_NUMBER_BYTES:
-            limit = min(limit, MIN_ARRAYS_BYTES + MAX_UNPACKED_RATIO * file_size(self.path))
+            packed = MAX_UNPACKED_RATIO * file_size(self.path)
+            limit = min(limit, MIN_ARRAYS_BYTES + expected + packed)
             for _, (shape, dtype) in self._each(wanted, _read_outline):
                 small = MIN_NUMBER_BYTES - dtype.itemsize if dtype.kind in "iuf" else 0
                 unpacked += max(small, 0) * math.prod(shape)

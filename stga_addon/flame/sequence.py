@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import DTypeLike
 
 from ..errors import StgaError
-from ..files import converted, read_npz
+from ..files import converted, open_npz, read_npz
 from .forward import (
     RIGID_SIZE,
     FlameFrame,
@@ -202,7 +202,14 @@ def read_motion(path: Path, model: FlameModel) -> FlameSequence:
     Timesteps count from 0, unless `timesteps` (T,) names them. Raises StgaError naming the file
     and the field.
     """
-    return motion_of(path, read_npz(path), model)
+    with open_npz(path) as file:
+        offsets = file.outlines().get("dynamic_offset")
+        expected = 0
+        if offsets is not None and offsets.ndim == 3 and offsets.shape[2] == 3:
+            fits = _rows_fit(offsets.shape[1], len(model.v_template))
+            expected = offsets.nbytes if fits else 0
+        arrays = file.arrays(expected=expected)
+    return motion_of(path, arrays, model)
 
 
 def motion_of(path: Path, arrays: Arrays, model: FlameModel) -> FlameSequence:
@@ -357,14 +364,20 @@ def _vector(path: Path, arrays: Arrays, name: str, size: int) -> np.ndarray:
     return vector
 
 
+def _rows_fit(rows: int, vertices: int) -> bool:
+    """Whether offsets have a row for each vertex, with or without those of the parts."""
+    return rows - vertices in [
+        mine - theirs for mine in ADDED_VERTICES for theirs in ADDED_VERTICES
+    ]
+
+
 def _offset(path: Path, arrays: Arrays, name: str, vertices: int) -> np.ndarray | None:
     """(V, 3) float64, None where absent or all zero; the parts' rows are added or dropped."""
     if name not in arrays:
         return None
     array = arrays[name]
     rows = array.shape[-2] if array.ndim >= 2 else 0
-    accepted = [mine - theirs for mine in ADDED_VERTICES for theirs in ADDED_VERTICES]
-    if array.ndim not in (2, 3) or rows - vertices not in accepted or array.size != rows * 3:
+    if array.ndim not in (2, 3) or not _rows_fit(rows, vertices) or array.size != rows * 3:
         expected = f"({vertices}, 3) or (1, {vertices}, 3)"
         raise StgaError(f"{path}: {name} has shape {array.shape}, expected {expected}")
     offset = np.zeros((vertices, 3))
