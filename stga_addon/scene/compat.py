@@ -157,7 +157,9 @@ STRIP_FIELDS = (
 
 
 TRACK_FIELDS = ("name", "mute", "is_solo", "lock")
+"""What is kept of an NLA track."""
 ACTION_FIELDS = ("action_blend_type", "action_extrapolation", "action_influence")
+"""What is kept of how an owner's action acts on the strips below."""
 STRIP_CURVES = ("influence", "strip_time")
 """Values of a strip that may have keyframes of their own."""
 

@@ -99,7 +99,9 @@ def _add_timesteps(head: Any, timesteps: Sequence[int], meshes: Sequence[np.ndar
 
 
 TIMESTEP_KEY = re.compile(r"t\d{5,}")
+"""Name of a shape key that the import of a mesh capture makes."""
 FLAME_KEY = re.compile(r"(expr_|identity_|offset_t)\d+|pose_\w+_\d\d")
+"""Name of a shape key that the import of a FLAME capture makes."""
 KEY_FIELDS = ("slider_min", "slider_max", "value", "mute", "vertex_group")
 """What is kept of a shape key beside its shape, in an order in which it can be set."""
 OtherKey = tuple[np.ndarray, dict[str, Any]]
