@@ -53,6 +53,8 @@ MIN_ARRAYS_BYTES = 384 << 20
 """Bytes to which any npz may unpack besides."""
 MIN_NUMBER_BYTES = 4
 """What a number of an npz counts for at least, as readers make floats of small ones."""
+BLOCK_BYTES = 1 << 20
+"""Bytes of an array that are looked at together."""
 MAX_NAME_BYTES = 255
 """Longest name of a file or folder on the file systems of Linux, macOS and Windows."""
 PARTIAL_NAME = re.compile(
@@ -642,6 +644,14 @@ class NpzFile:
         for name, (shape, dtype) in self._each(self.entries, _read_outline):
             outlines[name] = np.broadcast_to(np.zeros((), dtype), shape)
         return outlines
+
+    def is_zero(self, name: str) -> bool:
+        """Whether an array is all zero, found without unpacking it to memory."""
+        entry = self.entries[name]
+        with _reading(self.path, "npz"), self.archive.open(entry) as stream:
+            _read_outline(stream, entry.file_size)
+            blocks = iter(lambda: stream.read(BLOCK_BYTES), b"")
+            return all(block.count(0) == len(block) for block in blocks)
 
     def digest(self) -> str:
         """SHA-256 of the whole file."""

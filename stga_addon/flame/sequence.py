@@ -70,6 +70,10 @@ BODY_POSE_SIZE = 165
 BODY_POSE_PARTS = {"neck_pose": (45, 48), "jaw_pose": (66, 69), "eyes_pose": (69, 75)}
 """Field -> its columns there; the neck is moved as SMPL-X's head."""
 MIN_JOINT_ANGLE_DEG = 0.5  # of a joint that moves
+MAX_OFFSET_BYTES = 256 << 20
+"""Offsets of a motion, above which they are left out where they are zero."""
+MAX_ZERO_BYTES = 16 << 30
+"""Most that is looked through for that, in a minute."""
 TORSO_SHIFT = "torso_shift"
 SHIFT_SIZE = 3
 MAX_PARAMETER = 1e6  # of coefficients, radians and meters; beyond it, vertices would overflow
@@ -203,12 +207,16 @@ def read_motion(path: Path, model: FlameModel) -> FlameSequence:
     and the field.
     """
     with open_npz(path) as file:
+        names = set(file.entries)
         offsets = file.outlines().get("dynamic_offset")
         expected = 0
         if offsets is not None and offsets.ndim == 3 and offsets.shape[2] == 3:
             fits = _rows_fit(offsets.shape[1], len(model.v_template))
             expected = offsets.nbytes if fits else 0
-        arrays = file.arrays(expected=expected)
+        if MAX_OFFSET_BYTES < expected < MAX_ZERO_BYTES and file.is_zero("dynamic_offset"):
+            names.remove("dynamic_offset")
+            expected = 0
+        arrays = file.arrays(names, expected=expected)
     return motion_of(path, arrays, model)
 
 

@@ -17,7 +17,14 @@ from ...flame.model import JOINTS, FlameModel
 from ...flame.quaternions import continuous, from_axis_angle
 from ...flame.sequence import PARTS, FlameSequence
 from .. import tags
-from ..arrays import add_driver, flat_floats, key_points, write_curves, write_triangle_curves
+from ..arrays import (
+    add_driver,
+    flat_floats,
+    key_points,
+    read_values,
+    write_curves,
+    write_triangle_curves,
+)
 from ..compat import (
     action_curves,
     assign_action,
@@ -172,6 +179,21 @@ def key_motion(
     if "head" in parts:
         translations = np.stack([frame.translation for frame in frames])
         write_curves(rig, location_path("root"), at, translations)
+
+
+def choose_signs(rig: Any, below: Mapping[str, np.ndarray]) -> None:
+    """Give keyframed quaternions the sign that is nearer to what is below a strip at its two ends,
+    bone -> (2, 4): Blender blends the four numbers, and between q and -q the bone would spin."""
+    curves = action_curves(rig)
+    for bone, ends in below.items():
+        four = [curves.find(rotation_path(bone), index=index) for index in range(4)]
+        points = np.stack([read_values(curve.keyframe_points, "co", 2) for curve in four])
+        if (points[:, [0, -1], 1].T * ends).sum() >= 0:
+            continue
+        points[:, :, 1] *= -1
+        for curve, places in zip(four, points, strict=True):
+            curve.keyframe_points.foreach_set("co", places.ravel())
+            curve.update()
 
 
 def key_values(owner: Any, paths: dict[int, str], at: np.ndarray, values: np.ndarray) -> None:

@@ -59,8 +59,11 @@ def apply_motion(
     owners = [rig] if offsets or set(parts) & set(keyframes.PART_JOINTS) else []
     owners += [keys] if has_expression else []
     at = placement.start + np.arange(len(frames))
+    bones = keyframes.bones_of(parts)
+    below = _turns_below(rig, bones, at[[0, -1]]) if placement.as_strip and bones else {}
     with keyframes.new_actions(owners, placement, lambda p: keyframes.is_of_parts(p, parts)):
         keyframes.key_motion(head, rig, at, frames, parts, warn)
+        keyframes.choose_signs(rig, below)
         if has_expression and keyframes.has_shapes(head):
             shapes = np.zeros((1, len(ARKIT_SHAPES))) if weights is None else weights
             paths = {column: keyframes.key_value_path(key) for key, column in COLUMN.items()}
@@ -75,6 +78,15 @@ def apply_motion(
                 if offset in rig:
                     path = keyframes.property_path(offset)
                     write_curves(rig, path, [placement.start], np.zeros((1, 3)))
+
+
+def _turns_below(rig: Any, bones: Sequence[str], ends: Iterable[int]) -> dict[str, np.ndarray]:
+    """Quaternions (2, 4) of bones, as they are animated at the two ends of a strip to come."""
+    found: list[list[tuple[float, ...]]] = []
+    for _ in iterate_frames(ends, [rig]):
+        posed = evaluated(rig, bpy.context.evaluated_depsgraph_get()).pose.bones
+        found.append([tuple(posed[bone].rotation_quaternion) for bone in bones])
+    return dict(zip(bones, np.swapaxes(np.array(found), 0, 1), strict=True))
 
 
 def sample_motion(
