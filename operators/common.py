@@ -4,6 +4,7 @@ import os
 import re
 import traceback
 from collections.abc import Callable, Generator, Iterable
+from functools import partial
 from pathlib import Path
 from types import NoneType
 from typing import Any
@@ -20,7 +21,7 @@ from ..stga_addon.progress import Cancelled
 from ..stga_addon.scene import tags
 from ..stga_addon.scene.objects import mover_of
 from ..stga_addon.scene.record import capture_of, stored_path
-from ..stga_addon.scene.rig.head import LINKED, find_rig, usable_rig
+from ..stga_addon.scene.rig.head import LINKED, check_own, find_rig, usable_rig
 from ..stga_addon.scene.rig.keyframes import shape_key_names
 from ..stga_addon.schema import alternatives, type_hints
 from . import options
@@ -316,30 +317,36 @@ needs_head = need(lambda context: is_head(context.scene.stga.head), "Import a ca
 
 def needs_own_head(operator: Any, context: Any) -> bool:
     """Poll: whether there is a head that can be changed here."""
+    return _needs(operator, context, check_own)
+
+
+def needs_local_head(operator: Any, context: Any) -> bool:
+    """Poll: whether there is a head that is not linked, but may be overridden."""
     if not needs_head(operator, context):
         return False
     head = context.scene.stga.head
-    is_own = head.library is None and head.data.library is None
-    return polled(operator, is_own, f"The head {LINKED}")
+    return polled(operator, head.library is None, f"{head.name}: {LINKED}")
 
 
 def needs_rig(operator: Any, context: Any) -> bool:
     """Poll: whether there is a head with a FLAME rig that can be animated."""
-    return _needs_rig(operator, context, with_sliders=True)
+    return _needs(operator, context, usable_rig)
 
 
 def needs_bones(operator: Any, context: Any) -> bool:
     """Poll: whether there is a head whose bones can be posed."""
-    return _needs_rig(operator, context, with_sliders=False)
+    return _needs(operator, context, partial(usable_rig, with_sliders=False))
 
 
-def _needs_rig(operator: Any, context: Any, with_sliders: bool) -> bool:
+def _needs(operator: Any, context: Any, check: Callable[[Any], Any]) -> bool:
+    """Poll: whether there is a head on which `check` raises no StgaError."""
     if not needs_head(operator, context):
         return False
     try:
-        return usable_rig(context.scene.stga.head, with_sliders) is not None
+        check(context.scene.stga.head)
     except StgaError as error:
         return polled(operator, False, str(error))
+    return True
 
 
 def needs_rig_or_shapes(operator: Any, context: Any) -> bool:

@@ -28,6 +28,7 @@ from ..stga_addon.jobs.table import Kind
 from ..stga_addon.scene import tags
 from ..stga_addon.scene.objects import Identity, show_progress
 from ..stga_addon.scene.record import capture_of, stored_path
+from ..stga_addon.scene.rig.keyframes import check_sliders
 from ..stga_addon.scene.rig.motion import LivePose, stored_range
 from ..stga_addon.training.run.folder import has_run, read_run
 from . import common, options, timers
@@ -340,6 +341,7 @@ class DriveLive(Action, bpy.types.Operator):
             own = own_motion(head)
             show_progress(0.1)
             found = head_map(own, head.name)
+            check_sliders(head, found.expressions)
             show_progress(0.9)
             trained = stored_range(head) or own_range(head, own)
         receiver = sources.Receiver(source, settings.address, settings.port, settings.phone)

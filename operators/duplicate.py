@@ -9,7 +9,7 @@ from ..stga_addon.scene.display.splat_object import splats_of
 from ..stga_addon.scene.duplicate import attach_to_bone, duplicate_avatar
 from ..stga_addon.scene.objects import leave_edit_mode
 from . import options
-from .common import Edit, head_of, needs_own_head
+from .common import Edit, head_of, needs_local_head, needs_own_head
 from .options import ONCE
 
 
@@ -36,7 +36,7 @@ class AttachToBone(Edit, bpy.types.Operator):
     """Let the avatar follow a bone of another armature, such as a body's neck, from where it is
     now; its own bones stay"""
 
-    needs = (needs_own_head,)
+    needs = (needs_local_head,)
 
     armature: options.text("Armature", "Name of the armature; empty: detach", options=ONCE)
     bone: options.text("Bone", "Name of the bone", options=ONCE)

@@ -39,6 +39,7 @@ from ..stga_addon.scene.avatar_scene import frame_head, hide_default_cube, place
 from ..stga_addon.scene.cameras import central, configure_scene, import_cameras
 from ..stga_addon.scene.objects import (
     COLLECTIONS,
+    Warn,
     capture_root,
     leave_edit_mode,
     mover_of,
@@ -49,6 +50,7 @@ from ..stga_addon.scene.objects import (
 )
 from ..stga_addon.scene.record import capture_of, store_path
 from ..stga_addon.scene.rig.head import import_head
+from ..stga_addon.scene.rig.keyframes import has_shapes
 from ..stga_addon.tracking.folder import describe_focal_length, is_tracked
 from ..stga_addon.training.run.folder import has_run, next_folder
 from . import options
@@ -101,6 +103,8 @@ class HeadImport(Edit):
         heads = [thing for thing in scene.objects if is_head(thing)]
         others = [each for each in heads if capture_of(each) != capture.root.resolve()]
         is_new = len(heads) == len(others)
+        had_sliders = any(has_shapes(each) for each in heads if each not in others)
+        used = _used_actions()
         head = import_head(capture, warn=warn, correctives=correctives)
         if others and is_new:
             place_beside(head, others)
@@ -131,6 +135,7 @@ class HeadImport(Edit):
             configure_scene(scene, capture, middle, warn=warn)
         for sentence in filter(self.is_told, capture.warnings):
             warn(sentence)
+        _finish_replacing(head, used, had_sliders, warn)
         counted = {"timesteps": capture.timesteps, "triangles": capture.faces, "cameras": cameras}
         self.inform(", ".join(f"{len(all_)} {name}" for name, all_ in counted.items()))
         begin_sliders(head)
@@ -139,6 +144,22 @@ class HeadImport(Edit):
 
     def is_told(self, warning: str) -> bool:
         return not self.ignored_warning or self.ignored_warning not in warning
+
+
+def _used_actions() -> set[int]:
+    """Session ids of the actions that animate something."""
+    return {each.session_uid for each in bpy.data.actions if each.users > each.use_fake_user}
+
+
+def _finish_replacing(head: Any, used: set[int], had_sliders: bool, warn: Warn) -> None:
+    """Give a head back its face sliders, and name the actions, of those that were used before the
+    import, that no longer play."""
+    if had_sliders:
+        call(bpy.ops.stga.add_arkit_controls)
+    left = [each for each in bpy.data.actions if each.session_uid in used - _used_actions()]
+    if names := ", ".join(each.name for each in left if each.use_fake_user):
+        instead = "stay in the file as actions, and the capture's motion plays instead"
+        warn(f"{head.name}: keyframes made by hand {instead}: {names}")
 
 
 def _store_filmed(head: Any, found: Filmed) -> None:

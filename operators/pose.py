@@ -17,7 +17,7 @@ from ..stga_addon.scene.rig import keyframes
 from ..stga_addon.scene.rig.head import usable_rig
 from ..stga_addon.scene.rig.motion import mirror_pose
 from . import common, timers
-from .common import AtEnd, Edit, head_of, need, needs_bones, needs_rig, rig_or_none
+from .common import AtEnd, Edit, head_of, need, needs_bones, needs_own_head, needs_rig, rig_or_none
 from .windows import push_undo, redraw
 
 POLL_INTERVAL_S = 0.3
@@ -100,6 +100,7 @@ class AddArkitControls(Edit, bpy.types.Operator):
 
     needs = (
         needs_rig,
+        needs_own_head,
         need(
             lambda context: keyframes.EXPRESSION_NAMES not in context.scene.stga.head,
             "The head has its sliders",
@@ -121,7 +122,7 @@ def _compute_shapes(source: tuple[Any, ...], name: str) -> tuple[Any, ...]:
 
 def needs_sliders(head: Any) -> bool:
     """Whether a head has neither expressions with ARKit's names nor the sliders."""
-    if rig_or_none(head) is None:
+    if rig_or_none(head) is None or head.data.override_library is not None:
         return False
     return keyframes.EXPRESSION_NAMES not in head and not keyframes.has_shapes(head)
 

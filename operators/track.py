@@ -139,6 +139,7 @@ class MarkKey(Edit, bpy.types.Operator):
     bl_label = "Mark as Key"
     needs = (
         needs_rig,
+        common.needs_own_head,
         need(
             lambda context: context.scene.frame_current in context.scene.stga.head[tags.TIMESTEPS],
             "The capture has no timestep at this frame",

@@ -15,6 +15,7 @@ from ..errors import StgaError
 from ..files import write_json
 from ..flame.quaternions import continuous, from_matrices
 from . import arrays, tags
+from .compat import mark_imported
 from .objects import Warn, log_warning, place, remove, set_frames_per_second
 
 UP = (0.0, 0.0, 1.0)  # Blender's scenes are z-up
@@ -101,6 +102,22 @@ INTRINSICS = ("width", "height", "fl_x", "fl_y", "cx", "cy")
 INTRINSICS_TOLERANCE = 1e-6  # pixels
 
 
+def _camera_data(title: str, before: Any) -> Any:
+    """Data of a camera, with what an artist has set in that of an earlier import, such as depth of
+    field; without its images and keyframes."""
+    if before is None:
+        data = bpy.data.cameras.new(title)
+        data.clip_start = CLIP_START
+        data.display_size = DISPLAY_SIZE
+        return data
+    data = before.data.copy()
+    for background in data.background_images:
+        background.image = None  # which clearing alone leaves with a user
+    data.background_images.clear()
+    data.animation_data_clear()
+    return data
+
+
 def import_cameras(capture: Capture, root: Any, warn: Warn = log_warning) -> list[Any]:
     """A camera object for each of the capture's cameras, ascending by index, under `root` (from
     `capture_root`); one that moves is keyframed. The images are background images, each visible on
@@ -116,11 +133,10 @@ def import_cameras(capture: Capture, root: Any, warn: Warn = log_warning) -> lis
         views = [by_timestep[timestep] for timestep in sorted(by_timestep)]
         first = views[0].camera
         title = f"{root.name} camera {index:02d}"
-        data = bpy.data.cameras.new(title)
+        before = old.pop(index, None)
+        data = _camera_data(title, before)
         set_intrinsics(data, first)
-        data.clip_start = CLIP_START
-        data.display_size = DISPLAY_SIZE
-        camera = place(root, tags.CAMERA, title, data, old.pop(index, None))
+        camera = place(root, tags.CAMERA, title, data, before)
         camera[tags.CAMERA_INDEX] = index
         camera[tags.IMAGE_SIZE] = [first.width, first.height]
         camera[tags.PIXEL_ASPECT] = first.fl_x / first.fl_y
@@ -153,6 +169,8 @@ def import_cameras(capture: Capture, root: Any, warn: Warn = log_warning) -> lis
             timesteps = [view.timestep for view in found]
             arrays.write_triangle_curves(data, paths, timesteps, "CONSTANT")
             data.show_background_images = True
+        for owner in (camera, data):
+            mark_imported(owner)
         cameras.append(camera)
     remove(old.values())
     return cameras

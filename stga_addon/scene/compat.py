@@ -1,5 +1,6 @@
 """Differences between Blender 4.2 and 5.3: every version switch of the add-on."""
 
+import hashlib
 from collections.abc import Mapping
 from contextlib import suppress
 from typing import Any, NamedTuple
@@ -54,6 +55,36 @@ def strip_curves(strip: Any) -> Any:
     if not SLOTTED_ACTIONS:
         return strip.action.fcurves
     return strip.action.layers[0].strips[0].channelbag(strip.action_slot, ensure=True).fcurves
+
+
+def all_curves(action: Any) -> list[Any]:
+    """The f-curves of an action, of all slots."""
+    if not SLOTTED_ACTIONS:
+        return list(action.fcurves)
+    bags = (bag for layer in action.layers for strip in layer.strips for bag in strip.channelbags)
+    return [curve for bag in bags for curve in bag.fcurves]
+
+
+def mark_imported(owner: Any) -> None:
+    """Mark the action of `owner` as what an import has made."""
+    animation = owner.animation_data
+    if animation is not None and animation.action is not None:
+        animation.action[tags.IMPORTED] = _digest(animation.action)
+
+
+def is_made_by_hand(action: Any) -> bool:
+    """Whether an action has other keyframes than an import gave it, and other work is in them."""
+    is_ours = tags.HELD in action or tags.PERFORMANCE in action
+    return not is_ours and action.get(tags.IMPORTED) != _digest(action)
+
+
+def _digest(action: Any) -> str:
+    digest = hashlib.blake2b(digest_size=8)
+    for curve in all_curves(action):
+        places = np.empty(2 * len(curve.keyframe_points), np.float32)
+        curve.keyframe_points.foreach_get("co", places)
+        digest.update(f"{curve.data_path} {curve.array_index}".encode() + places.tobytes())
+    return digest.hexdigest()
 
 
 def animation_curves(owner: Any) -> list[Any]:
@@ -125,13 +156,22 @@ STRIP_FIELDS = (
 """What `keep_animation` keeps of an NLA strip, in an order in which it can be set."""
 
 
-class KeptAnimation(NamedTuple):
-    """What performances gave an owner: NLA tracks, as name, whether muted and strips; values that
-    shape keys have beside them, by data path; and the action in place of its own, with the slot's
-    identifier, None for its own."""
+TRACK_FIELDS = ("name", "mute", "is_solo", "lock")
+"""What is kept of an NLA track."""
+ACTION_FIELDS = ("action_blend_type", "action_extrapolation", "action_influence")
+"""What is kept of how an owner's action acts on the strips below."""
+STRIP_CURVES = ("influence", "strip_time")
+"""Values of a strip that may have keyframes of their own."""
 
-    tracks: list[tuple[str, bool, list[tuple[Any, ...]]]]
+
+class KeptAnimation(NamedTuple):
+    """What performances, and keyframes made by hand, gave an owner: NLA tracks, as fields and
+    strips; values that shape keys have beside them, by data path; how its action acts; and the
+    action in place of its own, with the slot's identifier, None for its own."""
+
+    tracks: list[tuple[dict[str, Any], list[tuple[Any, ...]]]]
     held: Mapping[str, float]
+    fields: Mapping[str, Any]
     action: Any = None
     slot: str | None = None
 
@@ -143,8 +183,9 @@ def slot_of(user: Any) -> str | None:
 
 
 def keep_animation(owner: Any) -> KeptAnimation:
-    """The animation of performances, not the strips at the bottom, which that of the last import
-    was pushed down to; nothing of None."""
+    """The animation of performances and made by hand, not the strips at the bottom, which that of
+    the last import was pushed down to; nothing of None. An action of that import that was changed
+    by hand stays in the file."""
     animation = owner.animation_data if owner is not None else None
     tracks = animation.nla_tracks if animation else ()
     lowest = [strip for strip in tracks[0].strips if strip.action] if tracks else []
@@ -158,36 +199,55 @@ def keep_animation(owner: Any) -> KeptAnimation:
         strips = []
         for strip in track.strips:
             is_own = row < own_rows and strip.action and strip.action.name.startswith(owner.name)
-            if strip.action is None or is_own:
+            if strip.action is None:
                 continue
-            strip.action.use_fake_user = True
+            if not is_own or is_made_by_hand(strip.action):
+                strip.action.use_fake_user = True
+            if is_own:
+                continue
             fields = {name: getattr(strip, name) for name in STRIP_FIELDS}
-            strips.append((strip.name, strip.action, slot_of(strip), fields))
+            found = ((path, strip.fcurves.find(path)) for path in STRIP_CURVES)
+            points = {
+                path: [tuple(each.co) for each in curve.keyframe_points]
+                for path, curve in found
+                if curve is not None
+            }
+            strips.append((strip.name, strip.action, slot_of(strip), fields, points))
         if strips:
-            kept.append((track.name, track.mute, strips))
+            kept.append(({name: getattr(track, name) for name in TRACK_FIELDS}, strips))
+    how = {name: getattr(animation, name) for name in ACTION_FIELDS if animation}
     action = animation.action if animation else None
-    if action is None or tags.PERFORMANCE not in action:
-        return KeptAnimation(kept, held)
+    if action is None:
+        return KeptAnimation(kept, held, how)
+    is_of_import = tags.IMPORTED in action or action.name.startswith(f"{owner.name} action")
+    if tags.PERFORMANCE not in action and is_of_import:
+        return KeptAnimation(kept, held, how)
     action.use_fake_user = True
-    return KeptAnimation(kept, held, action, slot_of(animation))
+    return KeptAnimation(kept, held, how, action, slot_of(animation))
 
 
 def give_animation(owner: Any, kept: KeptAnimation) -> None:
     """Give an owner kept tracks above those that it has, and the kept action in place of its
     own, which stays in the file."""
-    if not kept.tracks and kept.action is None:
+    if not kept.fields:
         return
     animation = owner.animation_data or owner.animation_data_create()
-    for name, is_muted, strips in kept.tracks:
+    for name, value in kept.fields.items():
+        setattr(animation, name, value)
+    for track_fields, strips in kept.tracks:
         track = animation.nla_tracks.new()
-        track.name = name
-        track.mute = is_muted
-        for title, action, slot, fields in strips:
+        for title, action, slot, fields, points in strips:
             strip = track.strips.new(title, int(fields["frame_start_raw"]), action)
             if slot is not None:
                 strip.action_slot = action.slots[slot]
             for field, value in fields.items():
                 setattr(strip, field, value)
+            for path, places in points.items():
+                curve = strip.fcurves.find(path)
+                for place in places if curve is not None else ():
+                    curve.keyframe_points.insert(*place)
+        for field, value in track_fields.items():
+            setattr(track, field, value)
     if kept.action is not None:
         if animation.action is not None:
             animation.action.use_fake_user = True

@@ -13,6 +13,7 @@ import bpy
 from ..errors import StgaError
 from ..format import format_name
 from . import tags
+from .compat import is_made_by_hand
 from .evaluation import kept_evaluated
 from .record import rebase_file
 
@@ -164,7 +165,8 @@ def _action(owner: Any) -> Any:
 
 
 def _purge(datas: Iterable[Any], actions: Iterable[Any]) -> None:
-    """Delete unused data-blocks, and the actions and background images that only they used."""
+    """Delete unused data-blocks, and the actions and background images that only they used; actions
+    made by hand stay in the file."""
     left = list(actions)
     for data in datas:
         if data is None or data.users:
@@ -172,6 +174,9 @@ def _purge(datas: Iterable[Any], actions: Iterable[Any]) -> None:
         left += [_action(data), _action(getattr(data, "shape_keys", None))]
         left += [background.image for background in getattr(data, "background_images", ())]
         bpy.data.batch_remove([data])
+    for block in left:
+        if isinstance(block, bpy.types.Action) and is_made_by_hand(block):
+            block.use_fake_user = True
     bpy.data.batch_remove({block for block in left if block is not None and not block.users})
 
 

@@ -24,9 +24,11 @@ COPIED = "copybuffer.blend"
 
 
 def owner_of(scene: Any, head: Any) -> Any:
-    """What stores the paths of the scene's head: the scene, where that is None or linked."""
-    is_own = head is not None and head.library is None and head.get(tags.KIND) == tags.HEAD
-    return head if is_own else scene
+    """What stores the paths of the scene's head: the scene, where that is None or linked, or a
+    library override, of which Blender saves no new properties."""
+    if head is None or head.get(tags.KIND) != tags.HEAD:
+        return scene
+    return head if head.library is None and head.override_library is None else scene
 
 
 def stored_path(owner: Any, tag: str) -> str:

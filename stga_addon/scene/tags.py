@@ -32,6 +32,7 @@ RUN = "stga_run_folder"  # on the head: folder of its run, which may not have be
 STORED_IN = "stga_stored_in"  # on owners of paths: the .blend file that these were stored in
 WORLD = "stga_world"  # on splats of a run's world: their file
 PERFORMANCE = "stga_performance"  # on an action: keyframes of another motion than the capture's
+IMPORTED = "stga_imported"  # on an action: digest of the keyframes that an import gave it
 HELD = "stga_held"  # on an action: the part of the capture's motion that is held outside of it
 
 SET = "stga_set"  # on a scene: the scene that renders its set, `render.film_set`

@@ -11,7 +11,9 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from stga_addon.capture.open import open_capture
 from stga_addon.flame.forward import FlameFrame, flame_forward
+from stga_addon.scene import tags
 from stga_addon.scene.arrays import key_points
+from stga_addon.scene.compat import strip_curves
 from stga_addon.scene.rig.head import rig_of
 from stga_addon.training.optimize.avatar_tracking import RefinedTracking
 from stga_addon.training.run.folder import with_refined_tracking, write_tracking
@@ -120,6 +122,41 @@ def test_importing_again_keeps_the_shot(scene):
         ops.import_capture(directory=scene.folder, flame=scene.model_file)
         for time, expected in zip(times, before, strict=True):
             assert_allclose(mesh_at(time), expected, atol=TOLERANCE)
+
+
+def test_importing_again_keeps_what_was_made_by_hand(scene):
+    """Catches an action that is deleted, keyframes in the capture's own that go without a word, a
+    shape key on a FLAME head, and a strip's influence or a camera's focus that are reset."""
+    head = panel().head
+    rig = rig_of(head)
+    keys = head.data.shape_keys
+    fix = head.shape_key_add(name="fix", from_mix=False)
+    fix.points[0].co.x += 0.1
+    fix.value = 0.5
+    camera = tags.find(tags.CAMERA, scene.folder)[0]
+    camera.data.dof.use_dof = True
+    ops.apply_motion(filepath=scene.file, start=12, place="strip")
+    strip = rig.animation_data.nla_tracks[-1].strips[0]
+    strip.use_animated_influence = True
+    for place in ((12, 0.2), (16, 0.9)):
+        strip.fcurves.find("influence").keyframe_points.insert(*place)
+    rig.pose.bones["jaw"].rotation_quaternion = (0.9, 0.4, 0, 0)
+    rig.pose.bones["jaw"].keyframe_insert("rotation_quaternion", frame=40)
+    rig.animation_data.action.name = "by hand"
+    rig.animation_data.action_influence = 0.7
+    edited = keys.animation_data.nla_tracks[1].strips[0]
+    strip_curves(edited)[0].keyframe_points.insert(2, 1.5)
+    name = edited.action.name
+    times = (11, 13, 15, 40)
+    before = [mesh_at(time) for time in times]
+    for is_first in (True, False):
+        ops.import_capture(directory=scene.folder, flame=scene.model_file)
+        message = bpy.context.window_manager.stga_message
+        assert ("made by hand" in message and message.endswith(f": {name}")) == is_first
+        for time, expected in zip(times, before, strict=True):
+            assert_allclose(mesh_at(time), expected, atol=TOLERANCE)
+    assert bpy.data.actions[name].use_fake_user
+    assert camera.data.dof.use_dof
 
 
 def test_a_mesh_sequence_keeps_its_performances(tmp_path):

@@ -76,6 +76,14 @@ def assert_shows(live, weights):
     assert_allclose(mesh(), expected, atol=TOLERANCE_M)
 
 
+def test_a_head_without_its_sliders_is_not_driven(live):
+    """Catches Drive Live that is finished, and a face that does not move."""
+    head = panel().head
+    head.shape_key_remove(head.data.shape_keys.key_blocks["expr_003"])
+    with failure("has no slider expr_003"):
+        ops.drive_live()
+
+
 def half(seed):
     return {name: 0.5 * value for name, value in wire.mixed(seed).items()}
 

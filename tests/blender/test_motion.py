@@ -120,6 +120,19 @@ def test_strips_blend_where_they_overlap(head, own, second):
     assert steps.max() < 0.35, steps  # 2 where it snaps
 
 
+def test_strips_blend_heads_that_are_upside_down(head, own):
+    """Catches a spin between two strips in which the head is turned alike, by quaternions of
+    opposite signs."""
+    rig = rig_of(head)
+    for start, angle in ((1, 3.0), (8, 3.1 - 2 * np.pi)):
+        frame = replace(own.frame(1), rotation=np.array((angle, 0.0, 0.0)))
+        apply_motion(head, [frame] * 16, Placement(start, str(start), ("head",), True, 3.0))
+    for time in np.arange(7, 14, 0.25):
+        at_frame(head, time)
+        bone = rig.evaluated_get(bpy.context.evaluated_depsgraph_get()).pose.bones["root"]
+        assert_allclose(bone.matrix_basis.to_3x3()[2][2], -1, atol=0.02)  # cos 3.05
+
+
 def test_a_strip_keeps_the_animation_below_where_it_is(head, own, other):
     """Fails when keyframes between frames, or outside an action's manual range, are moved or lost
     below a strip."""

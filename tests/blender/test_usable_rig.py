@@ -1,13 +1,16 @@
 """Heads whose rig cannot be posed: every operator and panel says why, in the same sentence."""
 
 import bpy
+import numpy as np
 import pytest
 from capture.factory import write_flame_capture
+from numpy.testing import assert_allclose
 
 from stga_addon.scene import tags
 from stga_addon.scene.rig.head import rig_of
 
-from .session import failure, ops, panel, save
+from .captures import mesh_at
+from .session import failure, ops, panel, placed, reopen, save
 from .test_operators import show_ball
 from .test_panel import draw
 
@@ -17,6 +20,9 @@ DEFECTS = {
     "has no parent": lambda head, rig: setattr(head, "parent", None),
     "has no bone jaw": lambda head, rig: setattr(rig.data.bones["jaw"], "name", "Kiefer"),
     "has lost its shape keys": lambda head, rig: head.shape_key_clear(),
+    "has the parent body": lambda head, rig: setattr(head, "parent", placed("body")),
+    "rig: has no parent": lambda head, rig: setattr(rig, "parent", None),
+    "is in Rest Position": lambda head, rig: setattr(rig.data, "pose_position", "REST"),
 }
 
 
@@ -38,7 +44,7 @@ def test_every_operator_says_why_a_rig_cannot_be_posed(extension, flame_head, tm
         with failure(problem):
             getattr(ops, operator)(**{"filepath": motion} if operator == "apply_motion" else {})
     assert any(problem in text for text in [" ".join(draw(extension))])
-    if problem == "has no parent":
+    if problem in ("has no parent", "has the parent body"):
         action = rig.animation_data.action
         with failure(problem):
             ops.import_capture(directory=tmp_path / "capture", flame=flame_head[tags.FLAME_MODEL])
@@ -70,8 +76,10 @@ def test_linked_avatars_are_left_alone(head, tmp_path):
         ops.show_avatar(filepath=tmp_path / "avatar.npz")
 
 
-def test_an_overridden_head_can_be_posed(flame_head, tmp_path):
-    """Catches bones that a library override can pose by hand, and Pose the Head refuses."""
+def test_an_overridden_head_keeps_what_is_done_to_it(flame_head, tmp_path):
+    """Catches bones that a library override can pose by hand, and Pose the Head refuses; and what
+    Blender does not save of an override, accepted: selections, keys for Solve Again, another
+    import, wider sliders and the run's folder."""
     name = flame_head.name
     collection = bring_linked(tmp_path / "a.blend", [flame_head.users_collection[0].name])
     override = collection.override_hierarchy_create(
@@ -82,3 +90,19 @@ def test_an_overridden_head_can_be_posed(flame_head, tmp_path):
     panel().head = head
     ops.pose_head()
     assert rig_of(head).mode == "POSE"
+    bpy.ops.object.mode_set(mode="OBJECT")
+    capture = {"directory": tmp_path / "capture", "flame": tmp_path / "capture" / "model.npz"}
+    for operator, options in (("select", {}), ("mark_key", {}), ("import_capture", capture)):
+        with failure("is overridden, and Blender would not save"):
+            getattr(ops, operator)(**options)
+    wide = tmp_path / "wide.npz"
+    np.savez(wide, expr=np.full((3, 2), 6.0))
+    with failure("expr_000 needs a wider range"):
+        ops.apply_motion(filepath=wide)
+    np.savez(wide, expr=np.full((3, 2), 2.5), jaw_pose=np.full((3, 3), 0.1))
+    ops.apply_motion(filepath=wide)
+    panel().run_folder = str(tmp_path / "run")
+    moved = mesh_at(2)
+    reopen(tmp_path / "shot.blend")
+    assert bpy.path.abspath(panel().run_folder) == str(tmp_path / "run")
+    assert_allclose(mesh_at(2), moved, atol=1e-6)

@@ -23,8 +23,17 @@ from ...flame.model import JOINTS, FlameModel
 from ...flame.sequence import MIN_JOINT_ANGLE_DEG, FlameSequence, joint_angles
 from .. import arrays, tags
 from ..arrays import Z_UP_TO_Y_UP, add_driver, flat_floats, key_points
-from ..compat import KeptAnimation, give_animation, keep_animation
-from ..objects import Warn, capture_root, leave_edit_mode, log_warning, place, remove, reset
+from ..compat import KeptAnimation, give_animation, keep_animation, mark_imported
+from ..objects import (
+    Warn,
+    capture_root,
+    leave_edit_mode,
+    log_warning,
+    mover_of,
+    place,
+    remove,
+    reset,
+)
 from . import keyframes
 from .keyframes import MAX_SLIDER, key_value_path, location_path, property_path, rotation_path
 
@@ -34,8 +43,8 @@ def import_head(capture: Capture, warn: Warn = log_warning, correctives: str = "
     timestep. A FLAME capture becomes a rig (see `add_rig`, also for `correctives`); any other gets
     a shape key per timestep, `t00012`, which is 1 at its own frame. Object coordinates are the
     capture's (meters, y up). Regions become boolean face attributes. Importing the same source
-    again replaces the last import; performances stay, and, if the triangles are the same, vertex
-    groups, materials and other shape keys of a mesh without FLAME.
+    again replaces the last import; performances and actions made by hand stay, and, if the
+    triangles are the same, vertex groups, materials and other shape keys.
     `warn` receives one sentence per problem. Raises StgaError where a timestep cannot be read, and
     leaves the scene."""
     sequence = capture.flame
@@ -44,15 +53,24 @@ def import_head(capture: Capture, warn: Warn = log_warning, correctives: str = "
     if sequence is None:
         meshes = [flat_floats(capture.mesh(timestep)) for timestep in capture.timesteps]
     before = next(iter(tags.find(tags.HEAD, capture.root)), None)
+    if before is not None:
+        check_own(before)
+        _check_parent(before)
+        if not arrays.has_triangles(before.data, capture.faces):
+            gone = "shape keys, vertex groups and materials of before are gone"
+            warn(f"{before.name}: the capture has other triangles, so {gone}")
     kept_keys = keep_animation(before.data.shape_keys if before is not None else None)
     kept_bones = keep_animation(next(iter(_rigs(before)), None) if before is not None else None)
     others = _other_keys(before, capture)
     head = _place_head(capture)
     if sequence is not None:
-        _give_back(add_rig(head, sequence, frames, warn, correctives), kept_bones)
+        rig = add_rig(head, sequence, frames, warn, correctives)
+        mark_imported(rig)
+        _give_back(rig, kept_bones)
     else:
         _add_timesteps(head, capture.timesteps, meshes)
-        _add_keys(head, others)
+    _add_keys(head, others)
+    mark_imported(head.data.shape_keys)
     _give_back(head.data.shape_keys, kept_keys)
     return head
 
@@ -81,32 +99,46 @@ def _add_timesteps(head: Any, timesteps: Sequence[int], meshes: Sequence[np.ndar
 
 
 TIMESTEP_KEY = re.compile(r"t\d{5,}")
+"""Name of a shape key that the import of a mesh capture makes."""
+FLAME_KEY = re.compile(r"(expr_|identity_|offset_t)\d+|pose_\w+_\d\d")
+"""Name of a shape key that the import of a FLAME capture makes."""
+KEY_FIELDS = ("slider_min", "slider_max", "value", "mute", "vertex_group")
+"""What is kept of a shape key beside its shape, in an order in which it can be set."""
+OtherKey = tuple[np.ndarray, dict[str, Any]]
 
 
-def _other_keys(head: Any, capture: Capture) -> dict[str, tuple[np.ndarray, float]]:
-    """Displacements (V, 3) and values of the shape keys of a mesh without FLAME that its import did
-    not make, such as ARKit's; none where the triangles change."""
+def _other_keys(head: Any, capture: Capture) -> dict[str, OtherKey]:
+    """Displacements (V, 3) and `KEY_FIELDS` of the shape keys that no import made, such as ARKit's
+    of a mesh without FLAME; none where the triangles change."""
     keys = head.data.shape_keys if head is not None else None
-    if keys is None or find_rig(head) or not arrays.has_triangles(head.data, capture.faces):
+    if keys is None or not arrays.has_triangles(head.data, capture.faces):
         return {}
-    basis = key_points(keys.reference_key)
-    own = [each for each in keys.key_blocks[1:] if not TIMESTEP_KEY.fullmatch(each.name)]
-    return {each.name: (key_points(each) - basis, each.value) for each in own}
+    pattern = TIMESTEP_KEY if find_rig(head) is None else FLAME_KEY
+    made = set(head.get(keyframes.EXPRESSION_NAMES, "").split(","))
+    made |= keyframes.added_shapes(head)
+    own = [key for key in keys.key_blocks[1:] if not pattern.fullmatch(key.name)]
+    return {
+        each.name: (
+            key_points(each) - key_points(each.relative_key),
+            {field: getattr(each, field) for field in KEY_FIELDS},
+        )
+        for each in own
+        if each.name not in made
+    }
 
 
-def _add_keys(head: Any, keys: Mapping[str, tuple[np.ndarray, float]]) -> None:
+def _add_keys(head: Any, keys: Mapping[str, OtherKey]) -> None:
     basis = key_points(head.data.shape_keys.reference_key)
-    for name, (displacement, value) in keys.items():
+    for name, (displacement, fields) in keys.items():
         key = head.shape_key_add(name=name, from_mix=False)
         key.points.foreach_set("co", flat_floats(basis + displacement))
-        key.value = value
+        for field, value in fields.items():
+            setattr(key, field, value)
 
 
 def _place_head(capture: Capture) -> Any:
     root = capture_root(capture.root)
     head = next(iter(tags.find(tags.HEAD, capture.root)), None)
-    if head is not None and head.parent is None:
-        raise StgaError(f"{head.name}: {PARENTLESS}, or delete it")
     if head is not None and arrays.has_triangles(head.data, capture.faces):
         # Into the same mesh, which keeps materials, vertex groups and painted attributes.
         reset(head)
@@ -275,6 +307,23 @@ def rig_of(head: Any) -> Any:
 LINKED = "is linked from another file: open that file, or make the head local"
 
 
+def check_own(head: Any) -> None:
+    """Raise StgaError where a head is linked or overridden: shape keys, vertex groups and
+    properties that are added to a library override are gone after reopening."""
+    blocks = (head, head.data)
+    if any(block.library is not None for block in blocks):
+        raise StgaError(f"{head.name}: {LINKED}")
+    if any(block.override_library is not None for block in blocks):
+        problem = "is overridden, and Blender would not save what this adds"
+        raise StgaError(f"{head.name}: {problem}; open its file, or make the head local")
+
+
+def _check_parent(part: Any) -> None:
+    if mover_of(part) is part:
+        problem = "has no parent" if part.parent is None else f"has the parent {part.parent.name}"
+        raise StgaError(f"{part.name}: {problem}; parent it again to the Empty of its capture")
+
+
 def usable_rig(head: Any, with_sliders: bool = True) -> Any:
     """The armature object of a head that can be posed here. with_sliders: and its shape keys, which
     a library override cannot change. Raises StgaError that says why not."""
@@ -286,8 +335,10 @@ def usable_rig(head: Any, with_sliders: bool = True) -> Any:
     override = rig.override_library
     if rig.library is not None or (override is not None and override.is_system_override):
         raise StgaError(f"{rig.name}: {LINKED}")
-    if head.parent is None:
-        raise StgaError(f"{head.name}: {PARENTLESS}")
+    for part in (head, rig):
+        _check_parent(part)
+    if rig.data.pose_position == "REST":
+        raise StgaError(f"{rig.name}: is in Rest Position; choose Pose Position")
     for name in JOINTS:
         if rig.pose.bones[name].rotation_mode != "QUATERNION":
             raise StgaError(f"{rig.name}: the rotation mode of bone {name} must be Quaternion")
@@ -295,7 +346,6 @@ def usable_rig(head: Any, with_sliders: bool = True) -> Any:
 
 
 OWN = "open that file, or make the head's mesh local"
-PARENTLESS = "has no parent; parent it again to the Empty of its capture"
 
 
 def _remove_bone_groups(head: Any, rigs: Sequence[Any]) -> None:

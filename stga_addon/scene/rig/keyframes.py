@@ -17,7 +17,14 @@ from ...flame.model import JOINTS, FlameModel
 from ...flame.quaternions import continuous, from_axis_angle
 from ...flame.sequence import PARTS, FlameSequence
 from .. import tags
-from ..arrays import add_driver, flat_floats, key_points, write_curves, write_triangle_curves
+from ..arrays import (
+    add_driver,
+    flat_floats,
+    key_points,
+    read_values,
+    write_curves,
+    write_triangle_curves,
+)
 from ..compat import (
     action_curves,
     assign_action,
@@ -75,6 +82,26 @@ def expression_keys(head: Any) -> dict[int, str]:
     numbers = [name.removeprefix(EXPRESSION_KEY) for name in names]
     components = sorted(int(number) for number in numbers if number.isdecimal())
     return {k: numbered_key(k) for k in components if numbered_key(k) in names}
+
+
+def check_sliders(head: Any, values: np.ndarray) -> None:
+    """Raise StgaError where a head lacks a slider that expressions (T, C) move."""
+    sliders = expression_keys(head)
+    for component in np.flatnonzero(values.any(axis=0)).tolist():
+        if component not in sliders:
+            name = expression_key(head, component)
+            raise StgaError(f"{head.name}: has no slider {name}; import the head again to get all")
+
+
+def check_ranges(head: Any, values: np.ndarray) -> None:
+    """Raise StgaError where expressions (T, C) need wider sliders of a mesh that is overridden:
+    Blender does not save these."""
+    for component, name in expression_keys(head).items():
+        key = head.data.shape_keys.key_blocks[name]
+        wanted = values[:, component]
+        if not np.array_equal(wanted, np.clip(wanted, key.slider_min, key.slider_max)):
+            problem = f"{name} needs a wider range, which Blender would not save with an override"
+            raise StgaError(f"{head.name}: {problem}; make the head's mesh local")
 
 
 def slider_components(model: FlameModel) -> dict[str, int]:
@@ -154,6 +181,21 @@ def key_motion(
         write_curves(rig, location_path("root"), at, translations)
 
 
+def choose_signs(rig: Any, below: Mapping[str, np.ndarray]) -> None:
+    """Give keyframed quaternions the sign that is nearer to what is below a strip at its two ends,
+    bone -> (2, 4): Blender blends the four numbers, and between q and -q the bone would spin."""
+    curves = action_curves(rig)
+    for bone, ends in below.items():
+        four = [curves.find(rotation_path(bone), index=index) for index in range(4)]
+        points = np.stack([read_values(curve.keyframe_points, "co", 2) for curve in four])
+        if (points[:, [0, -1], 1].T * ends).sum() >= 0:
+            continue
+        points[:, :, 1] *= -1
+        for curve, places in zip(four, points, strict=True):
+            curve.keyframe_points.foreach_set("co", places.ravel())
+            curve.update()
+
+
 def key_values(owner: Any, paths: dict[int, str], at: np.ndarray, values: np.ndarray) -> None:
     """Keyframe columns of values (T, C) of shape keys at their paths; one that stays 0 once."""
     keys = {key_value_path(key.name): key for key in owner.key_blocks}
@@ -195,7 +237,9 @@ def push_down_own(owner: Any) -> None:
     elif not animation.nla_tracks and any(is_of_parts(each.data_path, ["head"]) for each in curves):
         action = animation.action
         slot = slot_of(animation)
+        is_kept = action.use_fake_user
         held = copy_action(owner, f"{owner.name} place")
+        action.use_fake_user = is_kept
         for curve in [each for each in held if not is_of_parts(each.data_path, ["head"])]:
             held.remove(curve)
         animation.action[tags.HELD] = True
@@ -305,6 +349,18 @@ def has_shapes(head: Any) -> bool:
     return ARKIT_MAP in head
 
 
+def added_shapes(head: Any) -> set[str]:
+    """Names of the shape keys that `add_shapes` may have given a head."""
+    if not has_shapes(head):
+        return set()
+    return {*ARKIT_SHAPES, *(product_key(column) for column in PRODUCTS.tolist())}
+
+
+def product_key(column: int) -> str:
+    """The shape key of what a shape adds to an open jaw."""
+    return f"{ARKIT_SHAPES[column]} * jawOpen"
+
+
 def head_shapes(sequence: FlameSequence, found: HeadMap) -> tuple[np.ndarray, np.ndarray]:
     """Displacements (52, V, 3) of a person's neutral mesh by each shape at 1, and (PRODUCTS, V, 3)
     by what each of PRODUCTS at 1 adds to jawOpen at 1, or takes from it; meters."""
@@ -328,7 +384,7 @@ def add_shapes(head: Any, found: HeadMap, alone: np.ndarray, pairs: np.ndarray) 
     basis = key_points(keys.reference_key)
     named = list(zip(ARKIT_SHAPES, alone, strict=True))
     named += [
-        (f"{ARKIT_SHAPES[column]} * jawOpen", displacement)
+        (product_key(column), displacement)
         for column, displacement in zip(PRODUCTS.tolist(), pairs, strict=True)
         if np.abs(displacement).max() > NEGLIGIBLE_M
     ]

@@ -12,7 +12,6 @@ from mathutils import Matrix
 from ...driving.head_map import features
 from ...driving.open_motion import PART_FIELDS, TrainedRange, outside
 from ...driving.performance import ARKIT_SHAPES, COLUMN
-from ...errors import StgaError
 from ...flame.forward import FlameFrame, flame_forward
 from ...flame.model import JOINTS, FlameModel
 from ...flame.quaternions import from_axis_angle, multiply, to_axis_angle
@@ -44,24 +43,27 @@ def apply_motion(
     rig = usable_rig(head)
     keyframes.check_keyable(rig)
     keyframes.check_keyable(head.data.shape_keys)
-    used = np.any([frame.expr != 0 for frame in frames], axis=0)
-    sliders = keyframes.expression_keys(head)
-    for component in np.flatnonzero(used).tolist() if "expression" in parts else ():
-        if component not in sliders:
-            key = keyframes.expression_key(head, component)
-            raise StgaError(f"{head.name}: has no slider {key}; import the head again to get all")
+    expr = np.stack([frame.expr for frame in frames])
+    if "expression" in parts:
+        keyframes.check_sliders(head, expr)
     # Coefficients of the sliders that the motion lacks are zero.
-    count = max(len(used), 1 + max(sliders, default=-1))
-    frames = [replace(each, expr=np.pad(each.expr, (0, count - len(each.expr)))) for each in frames]
+    count = max(expr.shape[1], 1 + max(keyframes.expression_keys(head), default=-1))
+    expr = np.pad(expr, ((0, 0), (0, count - expr.shape[1])))
+    frames = [replace(each, expr=row) for each, row in zip(frames, expr, strict=True)]
     keys = head.data.shape_keys
 
     has_expression = "expression" in parts
+    if has_expression and head.data.override_library is not None:
+        keyframes.check_ranges(head, expr)
     offsets = keyframes.offset_keys(head) if has_expression else []
     owners = [rig] if offsets or set(parts) & set(keyframes.PART_JOINTS) else []
     owners += [keys] if has_expression else []
     at = placement.start + np.arange(len(frames))
+    bones = keyframes.bones_of(parts)
+    below = _turns_below(rig, bones, at[[0, -1]]) if placement.as_strip and bones else {}
     with keyframes.new_actions(owners, placement, lambda p: keyframes.is_of_parts(p, parts)):
         keyframes.key_motion(head, rig, at, frames, parts, warn)
+        keyframes.choose_signs(rig, below)
         if has_expression and keyframes.has_shapes(head):
             shapes = np.zeros((1, len(ARKIT_SHAPES))) if weights is None else weights
             paths = {column: keyframes.key_value_path(key) for key, column in COLUMN.items()}
@@ -76,6 +78,15 @@ def apply_motion(
                 if offset in rig:
                     path = keyframes.property_path(offset)
                     write_curves(rig, path, [placement.start], np.zeros((1, 3)))
+
+
+def _turns_below(rig: Any, bones: Sequence[str], ends: Iterable[int]) -> dict[str, np.ndarray]:
+    """Quaternions (2, 4) of bones, as they are animated at the two ends of a strip to come."""
+    found: list[list[tuple[float, ...]]] = []
+    for _ in iterate_frames(ends, [rig]):
+        posed = evaluated(rig, bpy.context.evaluated_depsgraph_get()).pose.bones
+        found.append([tuple(posed[bone].rotation_quaternion) for bone in bones])
+    return dict(zip(bones, np.swapaxes(np.array(found), 0, 1), strict=True))
 
 
 def sample_motion(
