@@ -128,6 +128,7 @@ def test_track_and_train_at_once(archive, demo, tmp_path):
     assert abs(found - expected) < MAX_DIFFERENCE_DB
 
 
+@pytest.mark.nightly
 def test_bundled_wheels_are_unmodified(archive):
     """Catches a wheel that the build changes, and a manifest that names others."""
     with zipfile.ZipFile(archive) as made:
