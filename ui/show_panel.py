@@ -181,7 +181,8 @@ def _before_image(scene: Any, *_: Any) -> None:
 
 def left_out_hint(scene: Any) -> str | None:
     """A sentence where the engine STGA Splats leaves out what the scene's images are to show."""
-    return "STGA Splats leaves out other objects" if leaves_out_set(scene) else None
+    where = "Set: Shown, in the render properties, shows them"
+    return f"STGA Splats leaves out other objects; {where}" if leaves_out_set(scene) else None
 
 
 def draw_left_out(layout: Any, context: Any) -> None:
