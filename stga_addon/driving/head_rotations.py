@@ -112,18 +112,18 @@ def _in_radians(
         raise StgaError(f"{where}: {problem}")
     if units == {"deg"}:
         return np.radians(head), notes
-    is_told = units == {"rad"}
+    is_named = units == {"rad"}
     reached = np.abs(np.remainder(head + math.pi, 2 * math.pi) - math.pi)
     # a camera on its side or upside down turns the roll alone
     is_beyond = (reached > NECK_RAD)[:, :2].any(axis=1).mean() > MAX_OUTLIERS
     is_fast = _fraction_too_fast(head[:, :2], times) > MAX_OUTLIERS
-    if turn > WHOLE_TURN_RAD or ((is_beyond or is_fast) and not is_told):
+    if turn > WHOLE_TURN_RAD or ((is_beyond or is_fast) and not is_named):
         guess = f"the head's angles reach {turn:.4g}; they are read as degrees"
         if not is_beyond and turn <= WHOLE_TURN_RAD:
             guess += ", because no neck turns as fast in radians"
         return np.radians(head), [*notes, guess]
     taken = "the head's angles reach {:.4g}; they are read as radians"
-    advice = "" if is_told else f"; {IF_DEGREES}"
+    advice = "" if is_named else f"; {IF_DEGREES}"
     if turn > HALF_TURN_RAD:
         return head, [*notes, taken.format(turn)]
     strained = reached > STRAINED_RAD
@@ -131,7 +131,7 @@ def _in_radians(
         far = float(np.abs(head[strained]).max())
         necks = "no neck turns" if (reached > NECK_RAD).any() else "few necks turn"
         notes = [*notes, f"{taken.format(far)}, though {necks} so far{advice}"]
-    elif not is_told and (reached > QUESTIONED_RAD).any(axis=1).mean() > MAX_OUTLIERS:
+    elif not is_named and (reached > QUESTIONED_RAD).any(axis=1).mean() > MAX_OUTLIERS:
         notes = [*notes, f"{taken.format(turn)}, {math.degrees(turn):.0f}°{advice}"]
     return head, notes
 

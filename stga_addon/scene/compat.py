@@ -17,6 +17,12 @@ NATIVE_SPLATS = hasattr(bpy.types, "GeometryNodePointsSetType")  # from 5.3 on
 APPENDED: list[Any] = getattr(bpy.app.handlers, "blend_import_post", [])  # from 4.3 on
 SAVE_FAILED: list[Any] = getattr(bpy.app.handlers, "save_post_fail", [])  # from 4.0 on
 
+MOTION_BLUR = tuple(
+    name
+    for name in ("use_motion_blur", "motion_blur_shutter", "motion_blur_position")
+    if name in bpy.types.RenderSettings.bl_rna.properties
+)
+"""Settings of motion blur; the position of the shutter was of Cycles alone in older versions."""
 REC709 = "Linear Rec.709"
 """The scene-linear color space of new files, and of all before Blender 5.0."""
 # Options of a path property whose value may start with "//"; versions before 4.5 refuse this one.
@@ -378,6 +384,11 @@ def alpha_over(nodes: Any, background: Any, foreground: Any) -> Any:
     for socket, image in zip(images, (background, foreground), strict=True):
         nodes.tree.links.new(image, socket)
     return node.outputs[0]
+
+
+def shutter_position(scene: Any) -> str:
+    """Where the shutter opens about the frame: "START", "CENTER" or "END"."""
+    return str(getattr(scene.render, "motion_blur_position", "CENTER"))
 
 
 def working_space() -> str:

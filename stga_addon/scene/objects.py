@@ -63,6 +63,16 @@ def own_collections(thing: Any) -> list[Any]:
     return [each for each in thing.users_collection if each.get(tags.KIND) != tags.SET]
 
 
+def objects_of_images(layer: Any) -> Iterator[Any]:
+    """The objects of a layer collection and its children that final images show, but for those that
+    are hidden themselves; one that is in several comes several times."""
+    if layer.exclude or layer.collection.hide_render:
+        return
+    yield from layer.collection.objects
+    for child in layer.children:
+        yield from objects_of_images(child)
+
+
 def collection_of(root: Any, kind: str) -> Any:
     """The collection of the root's objects of this kind; None where none was placed yet."""
     collection = own_collections(root)[0]

@@ -125,8 +125,8 @@ def test_importing_again_keeps_the_shot(scene):
 
 
 def test_importing_again_keeps_what_was_made_by_hand(scene):
-    """Catches an action that is deleted, keyframes in the capture's own that go without a word, a
-    shape key on a FLAME head, and a strip's influence or a camera's focus that are reset."""
+    """Catches an action or keyframes in the capture's own that are deleted silently, a shape
+    key on a FLAME head, and a strip's influence or a camera's focus that are reset."""
     head = panel().head
     rig = rig_of(head)
     keys = head.data.shape_keys

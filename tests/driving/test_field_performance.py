@@ -172,14 +172,14 @@ def test_a_rate_that_the_file_does_not_tell(tmp_path, capsys, column, code, gues
     assert f"taken as {guessed} a second; --recorded-fps, in Blender Recorded At" in str(
         found.warnings[-1]
     )
-    told = read_performance(path, recorded_fps=24)
-    assert not [text for text in told.warnings if "recorded-fps" in text]
-    assert_allclose(told.times * 24, found.times * guessed, atol=1e-9)
-    assert told.fps == pytest.approx(found.fps * 24 / guessed)
+    given = read_performance(path, recorded_fps=24)
+    assert not [text for text in given.warnings if "recorded-fps" in text]
+    assert_allclose(given.times * 24, found.times * guessed, atol=1e-9)
+    assert given.fps == pytest.approx(found.fps * 24 / guessed)
     for name in ("b.csv", "b.npz"):
         assert stga("drive", path, "--recorded-fps 24 --out", tmp_path / name) == 0
-        told = capsys.readouterr()
-        assert "recorded-fps" not in told.out + told.err
+        given = capsys.readouterr()
+        assert "recorded-fps" not in given.out + given.err
     timed = write_rows(tmp_path / "timed.csv", "time", lambda n: n / 30)
     assert stga("drive", timed, "--recorded-fps 24 --out", tmp_path / "c.csv") == 2
     assert f"{timed}: tells its times, so that no rate is taken" in capsys.readouterr().err
@@ -250,16 +250,16 @@ def swing(amplitude, hertz):
     ],
 )
 def test_angles_that_no_neck_has(tmp_path, head, unit, sentence):
-    """Catches a neck that turns by 131° for small angles in degrees, or by 46° without a word, and
+    """Catches a neck that turns by 131° for small angles in degrees, or silently by 46°, and
     a phone upside down read as degrees."""
     path = write_rows(tmp_path / "b.csv", "time", lambda n: n / 30, head=head)
     found = read_performance(path)
     assert_allclose(found.head, np.broadcast_to(head, (COUNT, 3)) * unit)
     assert len(found.warnings) == (sentence is not None)
     assert sentence is None or sentence in found.warnings[0]
-    told = path.with_name("told.csv")
-    told.write_text(re.sub("(Yaw|Pitch|Roll)", r"\1_deg", path.read_text()))
-    assert_allclose(read_performance(told).head, np.radians(np.broadcast_to(head, (COUNT, 3))))
+    given = path.with_name("given.csv")
+    given.write_text(re.sub("(Yaw|Pitch|Roll)", r"\1_deg", path.read_text()))
+    assert_allclose(read_performance(given).head, np.radians(np.broadcast_to(head, (COUNT, 3))))
 
 
 ANGLES = (0.1, 0.2, 0.3)
@@ -344,8 +344,8 @@ def test_guesses_reach_the_terminal(tmp_path, capsys):
     path = write_rows(tmp_path / "a.csv", "Timecode", lambda n: n + 1)
     for name in ("a.npz", "b.csv"):
         assert stga("drive", path, "--out", tmp_path / name) == 0
-        told = capsys.readouterr()
-        assert f"warning: {path}: column Timecode counts frames" in told.out + told.err
+        given = capsys.readouterr()
+        assert f"warning: {path}: column Timecode counts frames" in given.out + given.err
 
 
 @pytest.mark.parametrize("out", ["o.npz", "o.csv"])

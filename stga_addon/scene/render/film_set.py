@@ -1,7 +1,6 @@
 """The set of a shot: objects that the engine STGA Splats leaves out. EEVEE renders them as a second
 scene in the same press, and nodes of the compositor combine both images by depth."""
 
-from collections.abc import Iterator
 from contextlib import suppress
 from typing import Any
 
@@ -13,6 +12,7 @@ from ..display import splat_nodes
 from ..display.node_builder import Nodes, new_socket
 from ..display.splat_object import get_input
 from ..light import throw_shadow, throws_shadow
+from ..objects import objects_of_images
 
 NODE = "STGA Set"
 """Name of the node that combines both images, and of its group."""
@@ -20,8 +20,7 @@ LAYERS = "STGA Set Layers"
 """Name of the node that renders the second scene."""
 PASSES = "Image", "Depth"
 """Outputs of the splats' Render Layers node that the combined ones replace."""
-
-FILM = "film_transparent", "use_motion_blur", "motion_blur_shutter", "motion_blur_position"
+FILM = "film_transparent", *compat.MOTION_BLUR
 """Settings of images that both scenes have in common."""
 
 
@@ -45,9 +44,9 @@ def show_set(scene: Any) -> None:
         own.scene = scene
     title = f"{scene.name} Set"
     scene[tags.SET] = bpy.data.scenes.new(title)
-    mirrored = bpy.data.collections.new(title)
-    mirrored[tags.KIND] = tags.SET
-    scene[tags.SET].collection.children.link(mirrored)
+    followers = bpy.data.collections.new(title)
+    followers[tags.KIND] = tags.SET
+    scene[tags.SET].collection.children.link(followers)
     update_set(scene)
     layers = tree.nodes.new("CompositorNodeRLayers")
     layers.name = layers.label = LAYERS
@@ -62,7 +61,7 @@ def show_set(scene: Any) -> None:
             tree.links.new(both.outputs[name], link.to_socket)
         tree.links.new(own.outputs[name], both.inputs[f"Splats {name}"])
         tree.links.new(layers.outputs[name], both.inputs[f"Set {name}"])
-    for splats in _splats_of(scene):
+    for splats in (each for each in scene.objects if each.get(tags.KIND) == tags.SPLATS):
         with suppress(StgaError):  # splats of no head
             head = get_input(splats, splat_nodes.HEAD)
             if head is not None and head.library is None and not throws_shadow(splats):
@@ -84,9 +83,9 @@ def leave_out_set(scene: Any) -> None:
                 tree.nodes.remove(node)
     other = scene.pop(tags.SET, None)
     if other is not None:
-        mirrored = other.collection.children[:1]
+        followers = other.collection.children[:1]
         bpy.data.scenes.remove(other)
-        bpy.data.batch_remove(mirrored)
+        bpy.data.batch_remove(followers)
 
 
 def update_set(scene: Any) -> None:
@@ -95,25 +94,24 @@ def update_set(scene: Any) -> None:
     other = scene.get(tags.SET)
     if other is None or not other.collection.children:
         return
-    shown = _rendered(scene.view_layers[0].layer_collection)
+    shown = objects_of_images(scene.view_layers[0].layer_collection)
     wanted = {each for each in shown if each.get(tags.KIND) != tags.SPLATS}
-    mirrored = other.collection.children[0].objects
-    present = set(mirrored)
+    followers = other.collection.children[0].objects
+    present = set(followers)
     for each in present - wanted:
-        mirrored.unlink(each)
+        followers.unlink(each)
     for each in wanted - present:
-        mirrored.link(each)
+        followers.link(each)
     if wanted != present:
         other.view_layers[0].update()  # else Blender 5.3 crashes as it renders the scene
-    if compat.EEVEE != other.render.engine != "CYCLES":
+    if other.render.engine not in (compat.EEVEE, "CYCLES"):
         other.render.engine = compat.EEVEE
     values = {"camera": _camera(scene), "world": scene.world}
     for name, value in values.items():
         if getattr(other, name) != value:
             setattr(other, name, value)
     for name in FILM:
-        if hasattr(scene.render, name):
-            setattr(other.render, name, getattr(scene.render, name))
+        setattr(other.render, name, getattr(scene.render, name))
     for layer in (scene.view_layers[0], other.view_layers[0]):
         layer.use_pass_z = True
 
@@ -127,19 +125,6 @@ def _camera(scene: Any) -> Any:
 
 def _renders(node: Any, scene: Any) -> bool:
     return node.bl_idname == "CompositorNodeRLayers" and node.scene == scene
-
-
-def _splats_of(scene: Any) -> list[Any]:
-    return [each for each in scene.objects if each.get(tags.KIND) == tags.SPLATS]
-
-
-def _rendered(layer_collection: Any) -> Iterator[Any]:
-    """The objects of collections that a view layer shows in images."""
-    if layer_collection.exclude or layer_collection.collection.hide_render:
-        return
-    yield from layer_collection.collection.objects
-    for child in layer_collection.children:
-        yield from _rendered(child)
 
 
 def _depth_combine() -> Any:

@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ..compat import shutter_position
 from ..gpu.packing import View
 
 SHUTTER_START = {"START": 0.0, "CENTER": -0.5, "END": -1.0}
@@ -50,7 +51,7 @@ def samples(scene: Any, camera: Any) -> list[Sample]:
     moment, turn, area = _even(count).T
     offsets = np.zeros(count)
     if moves:
-        start = SHUTTER_START.get(getattr(scene.render, "motion_blur_position", "CENTER"), -0.5)
+        start = SHUTTER_START[shutter_position(scene)]
         offsets = (moment + start) * scene.render.motion_blur_shutter
     points = np.zeros((count, 2))
     if focuses:

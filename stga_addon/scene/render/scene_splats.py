@@ -37,6 +37,7 @@ from ..display.splat_object import (
 from ..evaluation import evaluated, kept_evaluated, require_moved
 from ..layers import SceneLayer
 from ..light import PosedAvatar, SceneLight, lighting_settings
+from ..objects import objects_of_images
 from ..vertex_groups import frame_group, frame_selection
 
 VIEWER = np.array((0.0, -1.0, 0.0))
@@ -333,15 +334,9 @@ def _background_scenes(scene: Any) -> list[Any]:
 
 def _rendered_objects(layer: Any, depsgraph: Any, is_asked: Callable[[Any], bool]) -> list[Any]:
     """The objects of a layer collection and its children that final images show, each once."""
-    if layer.exclude or layer.collection.hide_render:
-        return []
     # By evaluated objects: in animations, keyframes do not reach the originals.
-    asked = filter(is_asked, layer.collection.objects)
-    candidates = [(each, each.evaluated_get(depsgraph)) for each in asked]
-    found = [each for each, evaluated in candidates if not evaluated.hide_render]
-    for child in layer.children:
-        found += _rendered_objects(child, depsgraph, is_asked)
-    return list(dict.fromkeys(found))
+    asked = dict.fromkeys(filter(is_asked, objects_of_images(layer)))
+    return [each for each in asked if not each.evaluated_get(depsgraph).hide_render]
 
 
 def _with_instances(

@@ -72,14 +72,14 @@ def compare(before: np.ndarray, after: np.ndarray) -> Evidence:
 
 @dataclass(frozen=True)
 class CameraColors:
-    """Cameras (C,), their gain (C, 3) and offset (C, 3) in levels, against the mean of some."""
+    """Cameras (C,), their gain (C, 3) and offset (C, 3) in levels, against a mean of cameras."""
 
     camera: np.ndarray
     gain: np.ndarray
     offset: np.ndarray
 
     def undo(self, color: np.ndarray, camera: np.ndarray) -> np.ndarray:
-        """color (S, K, 3) of the cameras (S,), as that mean camera would have seen it."""
+        """color (S, K, 3) of the cameras (S,), as their mean would have seen it."""
         row = np.searchsorted(self.camera, camera)
         return (color - self.offset[row][:, None]) / self.gain[row][:, None]
 
