@@ -114,6 +114,7 @@ def _aperture_points(turn: np.ndarray, area: np.ndarray, blades: int, rotation: 
         return share * np.stack([np.cos(angle), np.sin(angle)], -1)
     corner = np.floor(turn * blades)
     along = (turn * blades - corner)[:, None]
-    angles = rotation + 2 * np.pi * np.stack([corner, corner + 1]) / blades
-    first, second = np.stack([np.cos(angles), np.sin(angles)], -1)
+    # Blender's rotation is that of the first side's middle, counterclockwise as the camera sees it
+    angles = rotation + 2 * np.pi * np.stack([corner - 0.5, corner + 0.5]) / blades
+    first, second = np.stack([np.cos(angles), -np.sin(angles)], -1)
     return share * (first * (1 - along) + second * along)
