@@ -81,9 +81,8 @@ def by_both(shot, folder):
 
 @pytest.mark.parametrize("name", APERTURES)
 def test_depth_of_field_is_that_of_cycles(scene, name, tmp_path):
-    """Catches a blur of another size, shape or orientation than
-    Blender's, a focus at the wrong distance, and a
-    dot that leaves its place."""
+    """Catches a blur of another size, shape or orientation than Blender's, a focus at the wrong
+    distance, and a dot that leaves its place."""
     dof = scene[0].camera.data.dof
     dof.use_dof = True
     dof.aperture_fstop = 0.05
