@@ -39,11 +39,14 @@ class DemoOptions:
     device: str = like(Train, "device")
     shot: bool = option("write shot.blend as well, a film scene around the avatar", False)
     footage: bool = option("make an avatar from the capture's images alone as well", False)
+    phone: bool = option(
+        "make an avatar from two videos of a phone as well: around a still head, and a talk", False
+    )
 
 
 def run_demo_command(options: Namespace, head: object) -> None:
     from ..render.device import choose_device
-    from .demo.run import avatar_from_footage, run_demo
+    from .demo.run import avatar_from_footage, avatar_from_phone, run_demo
 
     given = DemoOptions(**given_options(options, DemoOptions))
     device, why = choose_device(given.device)
@@ -54,6 +57,8 @@ def run_demo_command(options: Namespace, head: object) -> None:
     run_demo(given.out, budget, device=device, with_shot=given.shot)
     if given.footage:
         avatar_from_footage(given.out, budget, given.device)
+    if given.phone:
+        avatar_from_phone(given.out, budget, given.device)
 
 
 @dataclass(frozen=True)

@@ -15,8 +15,8 @@ ALWAYS = """
 --albedo --avatar --background --budget --cameras --capture --device --dry-run --effect
 --filmed-only --flame --focal --footage --format --fps --frames --gray-card --growth --iterations
 --knobs --landmarks --light --mattes --meshes --model --neutral --no-blend --offset --only --out
---preset --principal-point --quick --region --repair --resume --schedule --seed --seeds --shot
---size --split --start --step --stop --stop-when-flat --strategy --strength --sync --take
+--phone --preset --principal-point --quick --region --repair --resume --schedule --seed --seeds
+--shot --size --split --start --step --stop --stop-when-flat --strategy --strength --sync --take
 --target-psnr --threads --threshold --timesteps --turntable --video --world --zero-pose
 """
 """Options that serve wherever their command does not say otherwise (`needs`)."""

@@ -62,6 +62,10 @@ class Act:
     neck: tuple[float, float] = (0.0, 0.0)
     gaze: tuple[float, float] = (0.0, 0.0)
 
+    def weight(self, name: str) -> float:
+        """The weight of an expression, also of one that the act does not name."""
+        return self.weights.get(name, RELAXED.get(name, 0.0))
+
 
 RELAXED = {"eyeBlink": 0.13, "eyeSquint": 0.08, "mouthSmile": 0.18}
 """What an act has where it says nothing else."""

@@ -1,6 +1,7 @@
 """Demo: train an avatar on the demo's capture, show it in Blender and compare the pictures."""
 
 from argparse import ArgumentParser
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -13,9 +14,9 @@ from PIL import Image
 from ...avatar.embedding import to_world
 from ...avatar.file import Avatar, read_avatar
 from ...avatar.splats import SH_C0
-from ...capture.camera import Camera
+from ...capture.camera import UP, Camera, orbited
 from ...capture.images import read_image
-from ...capture.model import Capture
+from ...capture.model import Capture, evenly_spread
 from ...capture.open import open_capture
 from ...cli.commands import carry_out
 from ...errors import StgaError
@@ -23,20 +24,23 @@ from ...export.formats import export_avatar
 from ...export.playback import Playback
 from ...files import replacing, write_json
 from ...jobs.export import capture_views
+from ...jobs.track import RUN_FOLDER
 from ...jobs.train import Train
 from ...raster.cpu.precompile import begin_compiling
 from ...render.render import render, render_avatar, to_uint8
 from ...selection import SelectionOptions, select_capture
 from ...training.evaluate.metrics import evaluate_avatar
-from ...training.run.folder import AVATAR, RUN
+from ...training.run.folder import AVATAR, RUN, open_refined
 from ...training.settings import make_settings
-from .capture import unpack_capture
+from .capture import unpack_capture, unpack_takes
 
 SEED = 0
 POSES_PER_SECOND = 1.5
 """At which the web page plays the capture's expressions, which are single poses."""
 FRAMES_PER_SECOND = 8
 """Of demo.blend: its capture has a second of motion at this rate."""
+ANGLES_DEG = (0.0, 45.0, 90.0, 135.0, 180.0)
+"""Angles from the talk's camera, around the head, of the pictures in phone.png."""
 MAX_POSITION_ERROR_M = 1e-5
 """Largest distance between a splat in Blender and in numpy."""
 
@@ -93,15 +97,48 @@ def avatar_from_footage(out: Path, budget: Mapping[str, Any], device: str = "cpu
 
     Raises StgaError.
     """
+    footage = [str(out / "capture"), "--cameras", str(out / "capture/transforms.json")]
+    _avatar_command(footage, out / "footage", budget, device)
+
+
+def avatar_from_phone(out: Path, budget: Mapping[str, Any], device: str = "cpu") -> None:
+    """Make an avatar in OUT/phone from two videos as a phone films them, one around a still head
+    and one of a talk, and phone.png: a frame of the talk, then the avatar at `ANGLES_DEG`.
+    budget: as of `run_demo`.
+
+    Raises StgaError.
+    """
+    takes = unpack_takes(out / "takes")
+    _avatar_command([str(take) for take in takes], out / "phone", budget, device)
+    _picture_of_phone(out / "phone" / RUN_FOLDER, out / "phone.png")
+    print(f"{out / 'phone.png'}: the talk, and the avatar from its sides")
+
+
+def _picture_of_phone(run: Path, path: Path) -> None:
+    """Write a frame of the run's talk, and the avatar at `ANGLES_DEG` beside it."""
+    capture = open_refined(run)
+    views = capture.views["train"]
+    ((most, _),) = Counter(view.camera_index for view in views).most_common(1)
+    talk = [view for view in views if view.camera_index == most]
+    avatar = read_avatar(run / AVATAR)
+    pictures = [read_image(talk[0])]
+    for angle, view in zip(ANGLES_DEG, evenly_spread(talk, len(ANGLES_DEG)), strict=True):
+        mesh = capture.mesh(view.timestep)
+        camera = orbited(view.camera, mesh.mean(0), UP, np.radians(angle))
+        pictures.append(to_uint8(render_avatar(avatar, mesh, camera)))
+    _save(path, side_by_side(pictures))
+
+
+def _avatar_command(footage: list[str], out: Path, budget: Mapping[str, Any], device: str) -> None:
+    """Carry out `stga avatar FOOTAGE --out OUT` with the demo's budget."""
     from ...cli.commands import COMMANDS
 
-    cameras = ["--cameras", str(out / "capture/transforms.json")]
-    more = ["--out", str(out / "footage"), "--seed", str(SEED), "--device", device]
+    given = [*footage, "--out", str(out), "--seed", str(SEED), "--device", device]
     for name, value in budget.items():
-        more += ["--budget", f"{value}s"] if name == "seconds" else [f"--{name}", str(value)]
+        given += ["--budget", f"{value}s"] if name == "seconds" else [f"--{name}", str(value)]
     parser = ArgumentParser()
     COMMANDS["avatar"].add_arguments(parser, None)
-    COMMANDS["avatar"].carry_out(parser.parse_args([str(out / "capture"), *cameras, *more]), None)
+    COMMANDS["avatar"].carry_out(parser.parse_args(given), None)
 
 
 def _import_and_select(capture: Capture) -> tuple[object, dict[int, np.ndarray]]:

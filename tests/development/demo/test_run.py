@@ -8,6 +8,7 @@ import pytest
 from PIL import Image
 
 from stga_addon.avatar.file import read_avatar
+from stga_addon.capture.open import open_capture
 from stga_addon.cli.commands import COMMANDS
 from stga_addon.cli.main import main
 from stga_addon.development.demo import run
@@ -100,8 +101,29 @@ def test_the_demos_budget_is_iterations(given, budget, monkeypatch, tmp_path):
     monkeypatch.setattr(run, "run_demo", lambda out, own, **_: budgets.append(own))
     command = replace(COMMANDS["avatar"], run=lambda options, head: requests.append(options))
     monkeypatch.setitem(COMMANDS, "avatar", command)
-    assert main(["demo", "--out", str(tmp_path), "--device", "cpu", "--footage", *given]) == 0
+    monkeypatch.setattr(run, "_picture_of_phone", lambda *_: None)
+    more = ["--device", "cpu", "--footage", "--phone", *given]
+    assert main(["demo", "--out", str(tmp_path), *more]) == 0
     (own,) = budgets
     assert own == budget
-    (options,) = requests
-    assert vars(options).items() >= {"iterations": None, "seconds": None, **budget}.items()
+    for options in requests:
+        assert vars(options).items() >= {"iterations": None, "seconds": None, **budget}.items()
+    assert [len(options.footage) for options in requests] == [1, 2]
+
+
+@pytest.mark.nightly
+def test_demo_of_a_phone(tmp_path):
+    """Catches takes of the demo that structure from motion loses, and a head without a back: from
+    behind it is as wide as from the front, and shows no skin where the face is."""
+    pytest.importorskip("pycolmap")
+    run.avatar_from_phone(tmp_path, {"iterations": 300})
+    picture = np.asarray(Image.open(tmp_path / "phone.png")).astype(int)
+    width = (picture.shape[1] + 6) // (len(run.ANGLES_DEG) + 1)  # with the gap after it
+    front, back = picture[:, width : 2 * width - 6], picture[:, -width + 6 :]
+    capture = open_capture(tmp_path / "phone/capture")
+    assert len({view.camera_index for view in capture.views["train"]}) > 30
+    widths = [(shown.min(axis=2) < 200).any(axis=0).sum() for shown in (front, back)]
+    assert widths[1] == pytest.approx(widths[0], rel=0.25)
+    middle = slice(picture.shape[0] // 4, picture.shape[0] // 2)
+    skin = [(np.ptp(shown[middle], axis=2) > 60).mean() for shown in (front, back)]
+    assert skin[1] < skin[0] / 2
