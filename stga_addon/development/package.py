@@ -30,15 +30,16 @@ from .wheels import (
 
 ROOT = Path(__file__).resolve().parents[2]
 MANIFEST = "blender_manifest.toml"
-# Pure Python: one wheel serves every platform and Blender version. The manifest names the same
-# files.
+
 WHEELS = (
     "filelock-4.2.11-py3-none-any.whl",
     "trimesh-5.2.0-py3-none-any.whl",
     "tqdm-4.70.1-py3-none-any.whl",
 )
+"""Wheels that the manifest names. They are pure Python: one serves every platform and version of
+Blender."""
 KERNELS_FOLDER = "stga_addon/raster/cpu/compiled"
-"""In the zip; `raster.cpu.bundled.BUNDLE`."""
+"""Folder of the compiled kernels in the zip: `raster.cpu.bundled.BUNDLE`."""
 ENTRY_TIME = (1980, 1, 1, 0, 0, 0)
 """Modification time of every entry, the earliest that a zip can hold: equal sources give an equal
 zip."""

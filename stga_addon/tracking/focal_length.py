@@ -51,20 +51,24 @@ CHOSEN_QUANTILE = 0.6
 side; one that is too short by half makes another person."""
 INTERVAL = (0.05, 0.95)
 """Quantiles of the posterior that are reported."""
-MAX_SCALE_DIFFERENCE = 0.043  # Of a camera from the median of all; 5 % of focal length show
+MAX_SCALE_DIFFERENCE = 0.043
+"""Largest relative difference between a camera's scale and the median of all cameras. An error of
+5 % in focal length is found."""
 MAX_SIDE_DEG = 60.0
-"""Between the way the head faces and a camera, beyond which its landmarks are not compared: on the
-path-traced head, scales of single views have a standard deviation of 0.01 up to here, and of 0.03
-beyond, with a mean of −0.02."""
+"""Largest angle between the direction that the head faces and a camera whose landmarks are
+compared: on the path-traced head, scales of single views have a standard deviation of 0.01 up to
+here, and of 0.03 beyond, with a mean of −0.02."""
 MIN_CAMERAS = 4
+"""Least number of cameras for which scales are compared."""
 MIN_VISIBILITY = 0.1
-"""Squared cosine of the angle between a landmark's surface and a camera that may use it."""
+"""Least squared cosine of the angle between a landmark's normal and a camera that may use it."""
 MAX_COMPARED_TIMESTEPS = 40
+"""Largest number of timesteps in which cameras are compared."""
 SCALE_ITERATIONS = 8
 OUTLIER_SCALE = 1.5
-HERE = Similarity(
-    1.0, np.eye(3), np.zeros(3)
-)  # The camera's own world, in meters, in which the head is fitted
+
+HERE = Similarity(1.0, np.eye(3), np.zeros(3))
+"""The camera's world, in meters, in which the head is fitted."""
 
 
 @dataclass(frozen=True)

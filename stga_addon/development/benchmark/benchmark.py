@@ -33,8 +33,9 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 MAX_SEEDS = 1000
+"""Largest number of seeds of a variant."""
 MEMORY_GB = 1.0
-"""Of a variant's process; all variants of a slice have one at the same time."""
+"""Memory of a variant's process. All variants of a slice run at the same time."""
 COLUMNS = {
     "iterations": ("iterations", 0),
     "ms_per_iteration": ("ms/it", 1),

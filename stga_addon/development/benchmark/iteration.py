@@ -58,13 +58,14 @@ from ...training.schedule import learning_rates
 from ...training.settings import make_settings
 
 RATES = dict.fromkeys(learning_rates(make_settings(iterations=1).rates, 0), 1e-9)
+"""Learning rates, so small that the splats do not change while they are timed."""
 SSIM_WEIGHT = 0.2
-"""Of the image loss."""
+"""Weight of SSIM in the image loss."""
 LOSS_STAGE = "L1 + SSIM, both ways"
+"""Name of the image loss in the table."""
 LOSS_OPERATIONS = 3 * (14 * 11 + 28 + 12)
-"""Additions, multiplications, multiply-adds and the like that the image loss needs of a pixel: in
-each channel 14 blurs of 11, SSIM with its derivatives, and the rest.
-`tests/raster/test_assembly.py` counts them in the assembly."""
+"""Arithmetic operations of the image loss per pixel: in each channel, 14 blurs of 11 values, SSIM
+with its derivatives, and the rest. `tests/raster/test_assembly.py` counts them in the assembly."""
 
 REGIONS = {
     "bundled": ([0.031, 0.036, 0.09], [0.0, -0.034, 0.11]),
@@ -142,7 +143,7 @@ def copy_bandwidth() -> float:
 
 
 MULTIPLY_ADDS = 16
-"""Of one value in `multiply_add_rows`, one after the other."""
+"""Multiply-adds in sequence of each value in `multiply_add_rows`."""
 
 
 @parallel(lambda rows: len(rows), piece=16)

@@ -36,6 +36,7 @@ triangles that the default selection (2 mm) picks in that frame. ±: standard de
 `studio_head`, not in this repository: a path-traced head with 12 training timesteps, 15 training
 cameras at 275×401 and a tracked mesh of 10,696 triangles.
 """
+
 EXTENDING = """
 The training timesteps become two takes. *before* is an avatar of the first, which the arms continue
 for the same time: *extend* trains all splats in views of both takes; *anew* trains another avatar
@@ -43,8 +44,9 @@ on both, three times as long; *refine* trains the mouth (*region*) alone, *all* 
 same*: seconds until the region is as good as *all* leaves it; *s to 98 %*: until both takes have
 98 % of the PSNR of *anew*.
 """
+
 END = "\n<!-- What benchmark.results writes ends here. -->\n"
-"""What stands after it in the page stays."""
+"""Mark at the end of what is written; the page keeps what follows it."""
 PARTS = (("whole image", ""), ("head", "_mask"), ("moving", "_moving"))
 """Row of the table, and suffix of the metrics as `stga eval` writes them."""
 

@@ -29,7 +29,9 @@ if TYPE_CHECKING:
 WARM_UP_S = 1.0
 """Seconds of training before the run, not counted: caches fill and the processor's clock rises."""
 FIT_EXPOSURE = "--fit-exposure"
+"""Option that fits exposure before views are compared."""
 THREADS = "--threads"
+"""Option that limits the threads of a variant."""
 QUALITY = "quality.json"
 """Metrics of the finished avatar on all views of "val" and "test"; the run is finished when the
 file exists."""

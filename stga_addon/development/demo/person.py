@@ -27,13 +27,19 @@ from ..bundled_head import (
 )
 
 SURFACES = ("skin", "mouth", "gums", "teeth", "eyes")
+"""Surfaces with a color each."""
 IDENTITY_SEED = 14
+"""Seed of the random identity."""
 IDENTITIES = 40
+"""Identity components that are drawn at random."""
 IDENTITY_DEVIATION = 0.68
+"""Standard deviation of their coefficients."""
 EYES_IDENTITY = 10
+"""Identity component that is set, because with it the lids close over the eyes."""
 EYES = -0.3
-"""Component, and its coefficient, with which the lids close over the eyes."""
+"""Coefficient of EYES_IDENTITY."""
 SEED = 7
+
 # Linear RGB.
 SKIN_COLOR = np.array([0.66, 0.41, 0.305])
 LIP_COLOR = np.array([0.48, 0.17, 0.155])
@@ -43,6 +49,7 @@ MOUTH_COLOR = np.array([0.30, 0.075, 0.07])
 GUM_COLOR = np.array([0.42, 0.12, 0.11])
 TOOTH_COLOR = np.array([0.80, 0.75, 0.66])
 SCALP_COLOR = np.array([0.06, 0.038, 0.025])
+
 PARTS = (
     ("skin", SKIN),
     ("mouth", MOUTH_INSIDE),
@@ -51,15 +58,20 @@ PARTS = (
     ("eyes", LEFT_EYEBALL),
     ("eyes", RIGHT_EYEBALL),
 )
+"""(surface, first and last vertex of ICT-FaceKit's)"""
+
+# Heights are above the eyes.
 LIP_LINE_CM = -3.35
 LIP_HALF_WIDTH_CM = 2.35
 UPPER_LIP_CM = 0.98
 LOWER_LIP_CM = 1.28
+
 NECKLINE_CM = -10.6
+"""Height on the axis of the head above which there is no cloth."""
 NECKLINE_SLOPE = 0.30
-"""Height above which there is no cloth, on the axis of the head, and by how much it falls to the
-front."""
+"""Slope by which the neckline falls to the front."""
 HEAD_AXIS_Z_CM = -1.0
+"""Depth of the head's axis."""
 HAIRLINE = (
     (0, 35, 55, 68, 78, 88, 97, 106, 115, 130, 150, 180),
     (6.6, 6.5, 5.0, 3.5, -1.0, 1.0, 1.5, -1.5, -5.0, -8.0, -9.5, -10.0),

@@ -33,10 +33,11 @@ from ...training.settings import make_settings
 from .capture import unpack_capture
 
 SEED = 0
+
 POSES_PER_SECOND = 1.5
-"""At which the web page plays the capture's expressions, which are single poses."""
+"""Rate at which the web page plays the capture's expressions, which are single poses."""
 FRAMES_PER_SECOND = 8
-"""Of demo.blend: its capture has a second of motion at this rate."""
+"""Frame rate of demo.blend: its capture has a second of motion at this rate."""
 MAX_POSITION_ERROR_M = 1e-5
 """Largest distance between a splat in Blender and in numpy."""
 

@@ -11,6 +11,7 @@ from .threads import call_helpers, end_stages, parallel, pieces, stage
 
 ZERO = np.float32(0.0)
 ONE = np.float32(1.0)
+
 ROWS_PER_BLOCK = 256
 """Rows that a thread steps at a time."""
 ROWS_PER_SUM = 1024

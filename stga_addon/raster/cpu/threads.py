@@ -37,25 +37,32 @@ SEEN = STAGES + 2 * 14
 LIMIT, ENTRY = range(SEEN, SEEN + 2)
 """How many helpers are of use, and the function that calls the kernel with what CALL keeps."""
 JOB = 48
+"""Word that counts kernels; OVER after the last."""
 GATE = 64
-"""How many kernels there have been, negative after the last; and how many members are in one, OPEN
-more as long as others may enter."""
+"""Word that counts the workers in a kernel, plus OPEN as long as others may enter."""
 OPEN = 1 << 32
+"""Bit of GATE: others may enter."""
 OVER = -(1 << 62)
+"""Value of JOB after the last kernel."""
 CALL = 80
+"""First word of the kernel's arguments."""
 CALL_WORDS = 512
+"""Words for the kernel's arguments."""
 SLOTS = CALL + CALL_WORDS
+"""First word of the workers' slots. A slot holds whether the worker sleeps, and the lock for which
+it then waits."""
 SLOT_WORDS = 16
-"""Of each member, the caller the first: whether it sleeps, and the lock that it then waits for."""
+"""Words from one slot to the next."""
 CALLER = 0
+"""Slot of the thread that calls the kernel."""
 PATIENCE = 4000
-"""How often a member looks before it sleeps, some 0.1 ms: longer than Python takes from one kernel
-to the next, and shorter than from one iteration to the next."""
+"""Polls before a worker sleeps, some 0.1 ms: longer than Python takes from one kernel to the next,
+shorter than from one iteration to the next."""
 
 PROCESSORS = (
     len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 )
-"""That this process may use."""
+"""Number of processors that this process may use."""
 _team: "Team"
 
 
