@@ -34,7 +34,7 @@ LAST_FRAME = 1_048_574
 PART_OF_SHAPES = {"face": "expression", "jaw": "jaw", "eyes": "eyes", "head": "neck"}
 """Part of a face performance -> that of the head which it moves."""
 FIRST_OPTIONS = ("start", "strength", "neutral", "place")
-"""Of the dialog; the others unfold."""
+"""First options of the dialog; the others unfold."""
 NEUTRAL_LABELS = {"none": "As Recorded", "quiet": "Quiet Face", "first": "First Frame"}
 
 

@@ -32,7 +32,7 @@ TAB = "STGA"
 MAX_REPORT_CHARACTERS = 90
 """Length of what popup and status bar show of a report."""
 UNSAVED = "has not been saved yet"
-"""In messages that saving the file makes void."""
+"""Part of messages that saving the file makes obsolete."""
 PARENT_FOLDERS = re.compile(r"(?:[A-Za-z]:)?[\\/](?:[^\\/:;,()]+[\\/])+")
 
 Poll = Callable[[Any, Any], bool]

@@ -44,15 +44,17 @@ CHANGED_LINE_ENDS = (
 MAX_ARRAYS_BYTES = 1 << 30
 """Largest sum of the arrays that are read from an npz: an avatar of four million splats."""
 MAX_CHECKPOINT_BYTES = 4 << 30
-"""The same of a checkpoint, which has an avatar's arrays three times over."""
+"""The same for a checkpoint, which holds an avatar's arrays three times."""
 MIN_UNPACKED_BYTES = 32 << 20
 """Bytes to which any file of packed splats may unpack."""
 MAX_UNPACKED_RATIO = 16
-"""How many times its size a larger one may unpack to; splats reach 3, without harmonics 10."""
+"""Largest ratio of unpacked to packed size of larger files; splats reach 3, without harmonics
+10."""
 MIN_ARRAYS_BYTES = 384 << 20
 """Bytes to which any npz may unpack besides."""
 MIN_NUMBER_BYTES = 4
-"""What a number of an npz counts for at least, as readers make floats of small ones."""
+"""Least number of bytes that a number of an npz counts for, because readers convert small ones to
+floats."""
 BLOCK_BYTES = 1 << 20
 """Bytes of an array that are looked at together."""
 MAX_NAME_BYTES = 255
@@ -62,13 +64,13 @@ PARTIAL_NAME = re.compile(
 )
 """Name of a temporary file: .NAME.HOST-PROCESS-RANDOM.partial"""
 RENAME_PATIENCE_S = 5.0
-"""How long a rename is tried again while another program has the file open, on Windows."""
+"""Time for which a rename is retried on Windows while another program has the file open."""
 RENAME_INTERVAL_S = 0.1
 """Interval of these attempts."""
 WINDOWS_SHARING_ERRORS = (5, 32)
 """ERROR_ACCESS_DENIED and ERROR_SHARING_VIOLATION of an open file."""
 NO_FILE = (errno.ENOENT, errno.ENOTDIR, errno.ELOOP, errno.ENAMETOOLONG, errno.EINVAL)
-"""What the system answers where there is nothing under a name."""
+"""Errors of the system where no file has a name."""
 NewFile = Callable[[Path], AbstractContextManager[Path]]
 SEQUENCE_FILE = ".stga_sequence"
 BYTE_ORDER_MARKS = {
@@ -745,4 +747,5 @@ def save_npz(path: Path, arrays: dict[str, np.ndarray], compressed: bool = False
     with zipfile.ZipFile(path, "w", packing) as archive:
         for name, array in arrays.items():
             with archive.open(f"{name}.npy", "w", force_zip64=True) as out:
-                np.lib.format.write_array(out, np.asanyarray(array), allow_pickle=False)  # type: ignore[no-untyped-call]
+                np.lib.format.write_array(out, np.asanyarray(array), allow_pickle=False)  # type:
+                ignore[no-untyped-call]

@@ -43,7 +43,7 @@ _HEADER = {
 """Field of the avatar -> what JSON holds of it; of the regions their names."""
 
 SOURCES = "estimated", "gray_card", "file"
-"""Where an avatar's light can come from."""
+"""Origins of an avatar's light."""
 _LIGHT_ARRAYS = {
     "radiance": (9, 3),
     "transfer": (-1, 9),
@@ -58,9 +58,9 @@ _OPTIONAL_ARRAYS = "strain_range", "linear_base", "filmed_along"
 MIN_COLOR_CHANGE = 1 / 255
 """Offsets of colors that never change them by as much are not stored."""
 MIN_SHIFT_M = 2e-4
-"""The same of positions."""
+"""The same for positions."""
 MIN_SCALE_CHANGE = 0.02
-"""The same of scales, relative."""
+"""The same for scales, relative."""
 
 
 UNSEEN_REGION = "unseen"

@@ -13,8 +13,8 @@ SIGNALS: dict[str, Callable[[StrainBasis, FaceFrames], np.ndarray]] = {
     "smoothed_strain": lambda basis, frames: smoothed_strain(basis, frames.deformation),
     "normal": lambda basis, frames: frames.deformation[:, STRAIN_COMPONENTS:],
 }
-"""By name: (F, 3) float32 of a posed mesh's triangles, from the neutral mesh's basis and the
-frames; 0 where it is at rest. "normal": the change of the unit normal, world axes."""
+"""Name -> (F, 3) float32 of a posed mesh's triangles, from the neutral mesh's basis and the frames;
+0 where it is at rest. "normal": the change of the unit normal, world axes."""
 POSITION = "position"
 SCALE = "scale"
 COLOR = "color"
@@ -56,9 +56,9 @@ _ROWS = (
 )
 
 OFFSETS: dict[str, DrivenOffset] = {offset.name: offset for offset in _ROWS}
-"""By name. Everything that trains, stores or poses avatars goes by this table. Skin that is
-compressed bulges and darkens, and splats on what is stretched grow; skin that turns in a light that
-stays gets brighter or darker."""
+"""Name -> driven offset. Everything that trains, stores or poses avatars uses this table.
+Compressed skin bulges and darkens, splats on stretched skin become larger, and skin that turns in a
+fixed light becomes brighter or darker."""
 
 
 def offset_of(coefficients: np.ndarray, signal: np.ndarray) -> np.ndarray:

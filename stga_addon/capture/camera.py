@@ -8,7 +8,8 @@ import numpy as np
 from ..flame.quaternions import from_axis_angle, to_matrices, unit
 
 MAX_IMAGE_PIXELS = 1 << 26
-"""Of the largest machine-vision sensors; a small file that claims more could fill the memory."""
+"""Pixels of the largest machine-vision sensors; a small file that claims more could fill the
+memory."""
 MAX_FOCAL_PIXELS = 1e7
 """Largest focal length."""
 MAX_COORDINATE_M = 1e5

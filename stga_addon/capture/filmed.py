@@ -23,7 +23,7 @@ FACE = ("left_eye", "right_eye", "nose", "mouth")
 STILL_MM = 1.0
 """Difference between timesteps of how far the face moves, below which it has one expression."""
 ONE_EXPRESSION = "one expression"
-"""What is said of a face that does not move."""
+"""Description of a face that does not move."""
 SECTOR_DEG = 15
 """Width of the cells into which directions around a head are divided."""
 SECTORS = 360 // SECTOR_DEG
@@ -31,7 +31,7 @@ SECTORS = 360 // SECTOR_DEG
 BANDS_DEG = (-90.0, -12.0, 25.0, 90.0)
 """Bounds of the cells' elevations: from below, level, from above."""
 SIDE_DEG = 90
-"""How far around a head is to be filmed to both sides: to behind the ears."""
+"""Angle up to which a head is to be filmed on both sides: to behind the ears."""
 PICTURE_PX = 160
 """Side of the picture of directions."""
 HEAD_RADIUS = 0.3

@@ -10,7 +10,8 @@ from ..errors import StgaError
 from .camera import Camera
 
 MIN_RADIUS = 1e-9
-"""Below it, an angle and its tangent are the same number; and parameters have no effect."""
+"""Radius below which an angle and its tangent are the same number, and parameters have no
+effect."""
 ZOOM_RANGE = (0.5, 2.0)
 """Range of the pinhole's focal length over the lens's: a fisheye's rim leaves few pixels inside."""
 ZOOM_STEPS = 30

@@ -74,7 +74,7 @@ TYPICAL_HEAD_EXTENT_M = 0.3
 MAX_HEAD_EXTENT_M = 3.0
 """Largest extent of a neutral mesh in meters."""
 NO_FOLDER = "is not a folder; expected that of a capture"
-"""What messages say of a path that is neither a capture nor anything else."""
+"""Message for a path that is neither a capture nor anything else."""
 NEUTRAL = ("neutral", "canonical")
 """Names of a mesh without expression."""
 MAX_COMPARED_VIEWS = 4

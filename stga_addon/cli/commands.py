@@ -488,7 +488,7 @@ def _perform(options: Namespace, head: OpenHead | None) -> None:
 
 
 TRACKED_AS = [s.name for s in option_fields(Track) if s.name not in ("footage", "out", "avatar")]
-"""What `stga avatar` takes of `stga track`."""
+"""Options of `stga track` that `stga avatar` takes."""
 COMMANDS = {
     "avatar": Command(
         "Make an avatar from footage: track, train, and write a report and a .blend file. Called "

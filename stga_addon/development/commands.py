@@ -21,10 +21,10 @@ from ..worker.machine import processors
 from .benchmark.variants import Benchmark
 
 DEMO_ITERATIONS = 300
-"""Of a training, as good on a busy machine as on an idle one, where they take about 15 seconds on
-two cores."""
+"""Iterations of the training, so that it is as good on a busy machine as on an idle one, where they
+take about 15 seconds on two cores."""
 SLICES = "benchmark"
-"""How the names of a benchmark's jobs, and of their folders, begin."""
+"""First letters of the names of a benchmark's jobs and of their folders."""
 
 
 @dataclass(frozen=True)

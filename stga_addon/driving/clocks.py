@@ -22,7 +22,7 @@ TYPICAL_BASE = 60
 EVEN_TOLERANCE_S = 1e-6
 """Difference of unevenness within which bases explain the frame numbers equally well."""
 OTHER_RATE = "--recorded-fps, in Blender Recorded At, sets another rate"
-"""What a guess of the rate ends with."""
+"""End of a message about a guessed rate."""
 DAY_S = 86_400.0
 
 DROP_DAY_S = (30 * DAY_S - 2 * 1296) * 1001 / 30_000

@@ -21,7 +21,7 @@ ARKIT_SHAPES = (
     "browInnerUp", "browOuterUpLeft", "browOuterUpRight", "cheekPuff", "cheekSquintLeft",
     "cheekSquintRight", "noseSneerLeft", "noseSneerRight", "tongueOut",
 )  # fmt: skip
-"""In the order of Live Link Face's CSV files."""
+"""ARKit's shapes, in the order of Live Link Face's CSV files."""
 COUNT = len(ARKIT_SHAPES)
 MAX_WEIGHT = 10.0  # Beyond it, weights of shapes are in percent, or are no weights
 COLUMN = {name: column for column, name in enumerate(ARKIT_SHAPES)}

@@ -28,7 +28,7 @@ MAX_SPLAT_BYTES = 16 << 30
 READ_FILES = "the folder of a run, an avatar (.npz), or splats (.ply, .spz, .splat)"
 
 CLOUDCOMPARE_PREFIX = "scalar_"
-"""What CloudCompare writes before the names of other properties."""
+"""Prefix that CloudCompare writes before the names of other properties."""
 COLOR_NAMES = (("red", "green", "blue"), ("r", "g", "b"))
 
 FRAME_NAME = re.compile(r"(\d{5,}|-\d{4,})\.ply")

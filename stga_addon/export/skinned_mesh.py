@@ -15,9 +15,9 @@ SHAPE_STEP_M = 4e-5
 """Step of what a shape moves a vertex by; larger where one moves farther than a short integer
 holds."""
 MIN_SHAPE_M = 8e-5
-"""What a shape moves by less is left where it is."""
+"""Least displacement by a shape that is kept."""
 BASE_STEP_M = 2.0**-20
-"""Of vertices at rest: so fine that no thin triangle becomes a line."""
+"""Quantization step of vertices at rest, so fine that no thin triangle becomes a line."""
 MAX_SHORT = 32767
 MAX_USHORT = 65535
 _INDICES = 34963

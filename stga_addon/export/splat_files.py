@@ -14,7 +14,7 @@ from .ply import MAX_SPLAT_BYTES, READ_FILES, read_ply
 from .spz import read_spz
 
 GAUSSIAN_OUTPUT = "point_cloud/iteration_*/*.ply"
-"""Where 3D Gaussian Splatting writes the splats of an iteration."""
+"""Paths at which 3D Gaussian Splatting writes the splats of an iteration."""
 CONVERTED = "are not read; save them as .ply, for example with SuperSplat"
 
 UNREAD_SUFFIXES = {
@@ -40,7 +40,8 @@ UNREAD_SUFFIXES = {
 SPLAT_ROW = np.dtype(
     [("xyz", "<f4", 3), ("scale", "<f4", 3), ("color", "u1", 4), ("rotation", "u1", 4)]
 )
-"""Of antimatter15's .splat: linear scales; red, green, blue, opacity; w, x, y, z from -1 to 1."""
+"""Row of antimatter15's .splat: linear scales; red, green, blue, opacity; w, x, y, z from -1 to
+1."""
 
 
 def is_splats(path: Path) -> bool:

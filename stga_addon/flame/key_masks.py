@@ -14,7 +14,7 @@ EYEBALLS = (3931, 4477, TEMPLATE_VERTICES)
 """Index layout: the first vertices of FLAME's left eyeball, after the skin, and of its right one,
 and the end of that."""
 EYE_REGION_RADII = 2.0
-"""How far from the middle of an eyeball the region of the eye reaches, in its radius."""
+"""Radius of an eye's region, in radii of the eyeball."""
 LIP_HEIGHT_SHARE = 0.18
 """How far from where lips meet they reach, as a share of the width of the mouth."""
 NOSE_RADIUS_SHARE = 0.35
@@ -23,7 +23,7 @@ height over the mouth."""
 MIDDLE_SHARE = 0.1
 """Half the width of the middle of a face, as a share of the eyes' distance."""
 RIDGE_POINTS = 9
-"""Of a nose, from the tip to between the eyes."""
+"""Points on the ridge of a nose, from the tip to between the eyes."""
 NECK_TILT = np.radians(29.3)
 """Radians between straight up and where the eyes are, seen from the end of FLAME's neck."""
 

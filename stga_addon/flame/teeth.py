@@ -38,9 +38,9 @@ ARCH_WIDTH = 0.85
 CLEARANCE = 0.03
 """Gap between the lips' inner surface and the teeth."""
 OVERBITE = 0.06
-"""How far the upper edge reaches below the lower one."""
+"""Distance that the upper edge reaches below the lower one."""
 OVERJET = 0.02
-"""How far the upper edge stands in front of the lower one."""
+"""Distance that the upper edge stands in front of the lower one."""
 EDGE_THICKNESS = 0.05
 ROOT_THICKNESS = 0.1
 MAX_MOUTH_RINGS = 12

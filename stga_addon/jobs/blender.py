@@ -30,7 +30,8 @@ from ..worker.training_python import BLENDER_VARIABLE, PYTHON_VARIABLE
 from .train import Train
 
 PARTIAL = "rendering"
-"""In the name of the folder that Blender writes into; a picture leaves it when it is whole."""
+"""Part of the name of the folder into which Blender writes; a finished picture is moved out of
+it."""
 SAVED = re.compile(r"Saved: '(?P<path>.+)'")  # What Blender prints when it has written a picture
 LAST_LINES = 30  # Lines of Blender's output that are searched for why it failed
 STOP_TIMEOUT_S = 10.0

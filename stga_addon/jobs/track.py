@@ -59,7 +59,7 @@ TAKES = {
 }
 """Choice of what was filmed -> what it is."""
 MATTES = {"auto": "made for frames without a mask", "none": "only those of the footage"}
-"""What `Track.mattes` may be but a folder of masks."""
+"""Values of `Track.mattes` beside a folder of masks."""
 CAPTURE_FOLDER = "capture"
 RUN_FOLDER = "run"
 
@@ -67,7 +67,7 @@ INPUTS = "inputs.json"
 """File in the folder of `MakeAvatar`: capture, run, and what was asked for when they began, which
 alone continues."""
 KINDS = "kinds"
-"""In it what each of several takes is, once that was found out."""
+"""Key in that file of each take's kind, once it is known."""
 
 
 def _parsed_mattes(text: str) -> str:
@@ -233,7 +233,7 @@ OF_ONE_TAKE = ("cameras", "landmarks", "focal", "start", "stop", "offset", "sync
 QUICK: Mapping[str, Any] = {"most": 24, "size": 0.5}
 """Fields of `Track` for a first look at an avatar, as soon of a long video as of a short one."""
 QUICK_S = 30.0
-"""Of training, for one."""
+"""Seconds of training for a quick look."""
 WRITER = "tracking is writing this capture"
 """Who holds the lock of a capture that is being tracked."""
 MAX_MISFIT = 0.5

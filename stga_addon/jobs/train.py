@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from ..training.run.session import Trained
 
 AFTERWARDS = (StgaError, Cancelled, MemoryError)
-"""What may end the work after a training, whose avatar is whole without it."""
+"""Exceptions that may end the work after a training; its avatar is complete without that work."""
 AFTER_S = 20.0
 """Seconds that light and world take after a training, about."""
 AFTER_SHARE = 0.05

@@ -18,11 +18,12 @@ MIN_ROWS = 128
 MAX_SUNS = 4
 """Suns that are taken out of an environment."""
 SUN_CONTRAST = 12.0
-"""How much brighter than the mean of the environment a pixel must be to belong to a sun."""
+"""Brightness, relative to the environment's mean, above which a pixel belongs to a sun."""
 SUN_RADIUS = np.radians(12)
 """Angle from the brightest pixel within which bright ones are the same sun."""
 UPRIGHT = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
-"""From Blender's axes (z up) to those of a capture that is shown upright (y up, face along z)."""
+"""Rotation from Blender's axes (z up) to those of a capture that is shown upright (y up, face along
+z)."""
 
 
 def read_hdr(path: Path) -> np.ndarray:

@@ -7,7 +7,7 @@ from ..avatar.splats import SH_C0, harmonics
 COUNT = 9
 
 DARK = 1e-5
-"""What counts as no light."""
+"""Radiance up to which there is no light."""
 LAMBERT = np.array([np.pi] + [2 * np.pi / 3] * 3 + [np.pi / 4] * 5)
 """Irradiance of an unoccluded surface: Σ LAMBERT · basis(normal) · radiance (Ramamoorthi 2001)."""
 GLOSSY = np.array([1.0] + [0.85] * 3 + [0.62] * 5)

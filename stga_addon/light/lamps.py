@@ -16,7 +16,7 @@ from .values import KINDS, Caster, Light, Lighting
 MAP_SIZE = 512
 """Texels a side of a light's shadow map, which just holds the head."""
 LIFT_M = 0.001
-"""How far points are lifted off the surface, so that it does not shade itself."""
+"""Distance by which points are lifted off the surface, so that it does not shade itself."""
 BIAS_M = 0.001
 """A surface shades what lies deeper by this, and on slopes by what its depth changes within the
 taps."""

@@ -82,8 +82,8 @@ WET_HIGHLIGHT_SHARE = 0.14
 MIN_DIFFUSE_SHARE = 0.1
 """Fraction of recorded colors that remains at least."""
 VIEW_MEANS = (1.0, 0.65, 0.195, -0.089375)
-"""By degree, harmonics' mean over directions that see a surface (cosine above 0.3), over their
-value straight from the front: what recorded colors are."""
+"""Degree -> mean of its harmonics over directions that see a surface (cosine above 0.3), relative
+to their value straight from the front. Recorded colors are such means."""
 
 
 class Relighter:

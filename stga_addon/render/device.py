@@ -15,7 +15,7 @@ if TYPE_CHECKING:  # without a GPU, choosing needs numpy only
     from ..raster.gpu.trial import Trial
 
 GPU = "gpu:"
-"""Before the adapter's name in a device."""
+"""Prefix of the adapter's name in a device."""
 DEVICES = ("auto", "cpu", "gpu")
 """Choices of `choose_device`, beside "gpu:NAME"."""
 EXPECTED_DEVICE = "auto, cpu, gpu or gpu:NAME"

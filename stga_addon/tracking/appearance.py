@@ -32,11 +32,11 @@ MEAN_ITERATIONS = 3
 ALBEDO_SCALE = 6 * NOISE_LEVELS
 """Difference from skin of one color, in levels, beyond which pixels are outliers."""
 TEXTURE_SCALE = 4 * NOISE_LEVELS
-"""The same from the texture while it is being averaged."""
+"""The same for the difference from the texture while it is being averaged."""
 LIGHT_SCALE = 2 * NOISE_LEVELS
-"""The same from the texture where the light is fitted."""
+"""The same for the difference from the texture where the light is fitted."""
 MEAN_SCALE = 3 * NOISE_LEVELS
-"""The same from a mean."""
+"""The same for the difference from a mean."""
 MIN_SHADING = 0.2
 """Least factor of the light on a texture."""
 MAX_SHADING = 4.0

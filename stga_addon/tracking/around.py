@@ -43,9 +43,9 @@ MIN_IMAGES_SHARE = 0.5
 MIN_ON_HEAD = 30
 """Points on the face, below which it was the room alone whose structure was found."""
 TIME_LIMIT_S = 900.0
-"""Of structure from motion."""
+"""Longest time of structure from motion."""
 MAX_THREADS = 8
-"""That COLMAP uses: each takes up to 300 MB."""
+"""Largest number of threads of COLMAP: each takes up to 300 MB."""
 REMEDY = (
     "film in even light and without blur, in steps of at most 15° around a head that keeps still, "
     "before a room with detail"
@@ -60,9 +60,10 @@ MIN_TURN_DEG = 30.0
 """Largest angle between two poses of the head before the camera, below which nobody walked around
 it."""
 MAX_AXIS_COSINE = -0.1
-"""Between the head's axes up and ahead and the camera's down and ahead, of a face that is seen."""
+"""Largest cosine between the head's axes up and ahead and the camera's axes down and ahead, of a
+face that is visible."""
 PAIR_S = 0.5
-"""Between the two frames of a video in which the room is compared."""
+"""Time between the two frames of a video in which the room is compared."""
 USUAL_FPS = 30.0
 """Frames per second where a take does not say."""
 PAIR_TURN_DEG = 1.0, 25.0
@@ -74,22 +75,22 @@ MIN_PAIRS = 3
 MATCH_RATIO = 0.75
 """Lowe's ratio test."""
 MAX_LIP_CHANGE = 0.08
-"""Of photos without a room, `Recognition.lip_change` beyond which the face is no still one: that of
-three still people, seen from 85° around, is .004, .016 and .022, that of a talk .21."""
+"""Largest `Recognition.lip_change` of a still face in photos without a room: three still people,
+seen from 85° around, have .004, .016 and .022, a talking one .21."""
 INNER_LIPS = 13, 14
 """Landmarks of the middle of the upper and the lower lip, where they meet."""
 EYE_CORNERS = 33, 263
 """Landmarks of the outer corners of the eyes."""
 FACE_MARGIN = 0.6
-"""Of the face's size, around it, which is no part of the room."""
+"""Margin around the face that does not belong to the room, in sizes of the face."""
 PERSON_PROBABILITY = 0.3
-"""From which on a pixel is no part of the room."""
+"""Probability of a person above which a pixel does not belong to the room."""
 MIN_PARALLAX = 0.2
 """Radians that the room moves behind the head for each radian by which the head turns before the
 camera; 0 of a camera that stands still, 1 − (distance of the head / distance of the room) of one
 that goes around."""
 MIN_CORRELATION = 0.6
-"""Of the room's motion with the head's turns, below which a hand shook the camera."""
+"""Correlation of the room's motion with the head's turns below which a hand shook the camera."""
 
 
 class CamerasNotFound(StgaError):

@@ -26,7 +26,7 @@ from .stages import ReportStage, Stage, unreported
 from .write_capture import moving_arrays
 
 SOLVED_FILE = "tracking_solved.npz"
-"""In a corrected capture: the parameters as they were solved without keys."""
+"""File in a corrected capture with the parameters as they were solved without keys."""
 DEFAULT_SPAN = 12  # Timesteps before and after a key that it may change
 
 

@@ -59,7 +59,7 @@ OPENING_STEP_M = 0.008
 REST_QUANTILE = 0.2
 """Fraction of the timesteps at which a region moves so little that it is at rest."""
 REST_SCALE_M = 0.002
-"""How much farther than in these a region at rest may move."""
+"""Additional distance that a region at rest may move."""
 HELD_OUT_LEVEL = len(appearance.LEVELS_M)
 """Stands for the points that are not fitted, where a level is asked for."""
 ALL_POINTS = HELD_OUT_LEVEL + 1

@@ -21,15 +21,15 @@ LANDMARKS_FOLDER = "landmarks"
 PLACES_FILE = "head_model.npz"
 
 FOOTAGE_FILE = f"{LANDMARKS_FOLDER}/footage.json"
-"""What the landmarks were found in."""
+"""File that describes the footage in which the landmarks were found."""
 KEPT_FOLDER = "unfinished"
-"""Of results of parts, with which an interrupted tracking goes on; removed at its end."""
+"""Folder with results of parts, with which an interrupted tracking goes on; removed at its end."""
 LOCK_FILE = "tracking.lock"
 """Held while the capture is written."""
 SPLIT_FILES = ("transforms_train.json", "transforms_val.json", "transforms_test.json")
 
 MOTIONS = {"head": "turns with the head", "still": "keeps its direction", "own": "turns on its own"}
-"""How a torso can move -> its description."""
+"""Motion of a torso -> its description."""
 TORSO_KEY = "torso"
 """Key of the report; null where the torso's motion could not be determined."""
 FOCAL_KEYS = {
@@ -46,8 +46,8 @@ FOCAL_SOURCES = {
     "estimated": "estimated from the head's landmarks",
     "avatar": "that of the avatar's camera",
 }
-"""Where the focal length of a camera without calibration is from (`Footage.focal`; "usual" and
-"solved" in captures of earlier versions) -> its description."""
+"""Origin of the focal length of a camera without calibration (`Footage.focal`; "usual" and "solved"
+in captures of earlier versions) -> its description."""
 POINTS_FILE = "torso_points.npz"
 
 AVATAR_MISFIT = "avatar"

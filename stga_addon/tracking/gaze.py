@@ -30,12 +30,12 @@ EYEBALL_SIGMA_RAD = np.array([0.06, 0.025])
 are off: both lie too high together, but a face is symmetric, and sideways they are off against each
 other."""
 SINGLE_EYEBALL_SIGMA_RAD = np.array([0.06, 0.15])
-"""The same of a single eye, whose errors nothing is compared with."""
+"""The same for a single eye, whose errors cannot be compared with the other's."""
 MIN_REMOVED_RAD = 0.1
 """Constant turn of an eye, not taken for gaze, from which on a warning names it."""
 PARALLEL_QUANTILE = 0.8
-"""Of how far a take's left eye looks to the left of the right one, at which both look in parallel:
-eyes converge on what is near, and do not look apart."""
+"""Quantile, over a take, of the angle by which the left eye looks to the left of the right one, at
+which both look in parallel: eyes converge on near things and never diverge."""
 AXES = 2
 """About which an eye turns: x, by which it looks up and down, and y, sideways."""
 

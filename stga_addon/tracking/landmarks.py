@@ -32,8 +32,8 @@ MAX_TWO_FACES_SHARE = 0.34
 """Share of a camera's frames, or of all where each camera has one, with a second face, beyond which
 the footage is not of one person: a pattern on a wall may look like one."""
 MIN_PART_TIMESTEPS = 50
-"""Of a camera's parts, which are worked on at once, and as many as there may be helpers: each
-decodes a video from the key frame before it, or from the beginning."""
+"""Least number of timesteps in a part of a camera's take. There are as many parts as helpers at
+most: each decodes a video from the key frame before it, or from the beginning."""
 MIN_OVERLAP = 0.3  # Two faces whose boxes share this much of their area are one, found twice
 
 

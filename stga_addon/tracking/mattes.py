@@ -58,8 +58,8 @@ OPAQUE_HAIR_SHARE = 0.9
 """Of the way from the backdrop's color to the hair's, from which hair is opaque: gloss is a little
 nearer to a bright backdrop."""
 EVEN_COLORS_WEIGHT = 4.0
-"""Of the variance of both sides' colors, beside SIMILAR_COLORS_LEVELS, in what hair's coverage is
-trusted: before a room and in dyed hair, a pixel's color tells nothing."""
+"""Weight of the variance of both sides' colors, beside SIMILAR_COLORS_LEVELS, in the confidence of
+hair's coverage: before a room and in dyed hair, a pixel's color is no evidence."""
 NEIGHBORHOOD_SHARES = (0.03, 0.12)
 """Standard deviations of the neighborhoods that colors are means of, as fractions of the head's
 size."""

@@ -31,7 +31,8 @@ from .pictures import picture_of_first_frame
 from .stages import Crew, Stage
 
 BUNDLED_PLACES = Path(__file__).parent / "networks/bundled_head_places.npz"
-"""Of the bundled head, as `calibrate` finds them; made by `development/bundled_head.py`."""
+"""Landmarks on the bundled head, as `calibrate` finds them; made by
+`development/bundled_head.py`."""
 MIN_FACE_SHARE = 1 / 3  # Of the timesteps, at which a face has to be detected
 FACE_REMEDY = "where the face is too small in the frame, crop the video to head and shoulders"
 MIN_FACE_PIXELS = 1.0  # Extent of the landmarks in an image, below which they are but a point

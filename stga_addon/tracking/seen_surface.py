@@ -53,7 +53,7 @@ OUTLINE_RADIUS_M = 0.01
 MAX_COSINE = 0.25
 """Cosine between normal and camera up to which a point moves the outline (15°)."""
 RIM_COSINE = 0.5
-"""The same of a triangle: those farther from the outline are not drawn."""
+"""The same for a triangle: triangles farther from the outline are not drawn."""
 PICTURE_SIDE = 600
 """Side in pixels with which the mesh's mask is drawn, since it has no soft edge."""
 MAX_ENLARGEMENT = 2

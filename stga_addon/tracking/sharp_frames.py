@@ -18,7 +18,7 @@ MIN_CORNERS = 8
 CORNER_QUALITY = 0.01
 """Least strength of a corner, relative to the strongest."""
 CORNER_DISTANCE_PX = 8
-"""Between corners."""
+"""Least distance between corners."""
 SHAKE_FRAMES = 9
 """Frames over which motion is averaged, so that a hand's shaking is none."""
 

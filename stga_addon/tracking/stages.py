@@ -35,7 +35,7 @@ class Stage(Enum):
     REFINEMENT = ("Refinement", 0.355, 0.465)
 
     ONLY_DENSE = ("Dense tracking", 0.225, 0.465)
-    """In place of surface and refinement where one camera does not show the surface."""
+    """Instead of surface and refinement where one camera does not show the surface."""
     MATTES = ("Mattes", 0.465, 0.695)
 
     TORSO = ("Torso", 0.695, 0.83)
@@ -45,9 +45,9 @@ class Stage(Enum):
     HEADS = ("Heads", 0.98, 1.0)
 
     AVATAR = ("Avatar", 1.0, 2.0)
-    """Of a known person, whose avatar is posed in the capture."""
+    """A known person's avatar is posed in the capture."""
     CORRECTION = ("Solve", 0.0, 0.9)
-    """Of a capture, around heads that were posed by hand."""
+    """Correction of a capture around heads that were posed by hand."""
 
     def __init__(self, title: str, begin: float, end: float) -> None:
         self.title = title

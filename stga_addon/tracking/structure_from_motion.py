@@ -29,11 +29,12 @@ times as many points and an error of the focal length of 2 instead of 12 %."""
 EDGE_THRESHOLD = 20.0
 """Largest ratio of a feature's curvatures, twice COLMAP's: lashes, lips and seams are edges."""
 MAX_FEATURES = 4096
-"""Of an image, the largest ones: comparing two images takes the time of its square."""
+"""Largest number of features of an image, the largest ones: comparing two images takes a time that
+is quadratic in it."""
 NEAR_IMAGES = 10
 """Images of a video that are compared with one before them."""
 LOOP_STEP = 4
-"""Of every so many, all are compared: a camera may come back."""
+"""Every LOOP_STEP-th image is compared with all others of them: a camera may come back."""
 MIN_MODEL_IMAGES = 3
 """Images of the smallest model that COLMAP keeps."""
 LENS_GAIN = 0.03
@@ -45,7 +46,7 @@ LOSS_SCALE_PX = 1.0
 MIN_FACE_VIEWS = 2
 """Images in which a point lies on the face, for it to be one of the head."""
 PERSON_PROBABILITY = 0.5
-"""Of a pixel, from which on it is the person's."""
+"""Probability above which a pixel belongs to the person."""
 DATABASE = "features.db"
 IMAGES_FOLDER = "images"
 MASKS_FOLDER = "masks"

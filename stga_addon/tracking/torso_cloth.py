@@ -58,7 +58,8 @@ DEPTH_SIGMA_M = 0.02
 MIN_WEIGHT = 0.5
 """Sum of weights from which the surface is observed."""
 DIRECTIONS_RAD = np.radians(np.arange(-80, 81, 5))
-"""From the base of the neck, as seen from the front: from straight down to the person's left."""
+"""Directions from the base of the neck, seen from the front: from straight down to the person's
+left."""
 SLOPE = 0.8
 """Factor on the angle around the neck, because shoulders slope down."""
 REACH_RAD = np.radians(10)
@@ -70,7 +71,7 @@ MIN_POINTS = 5
 FARTHEST_SHARE = 0.98
 """Fraction of a direction's points that the mesh reaches."""
 BEYOND_M = 0.015
-"""How far beyond these the mesh reaches."""
+"""Distance that the mesh reaches beyond these."""
 FULL_HEIGHT = 0.5  # Height (see `TorsoSheet`) from which vertices lie on the surface alone
 
 

@@ -27,7 +27,7 @@ CALIBRATION_VIEWS = 8
 WARM_UP_ITERATIONS = 3
 """First iterations that are not measured: they allocate memory."""
 TRACKED_TIMESTEPS = 3
-"""By which the time of tracking by the avatar is measured."""
+"""Number of timesteps with which the time of tracking by the avatar is measured."""
 MAX_ITERATIONS = 2000
 """Limit for captures of a few pixels."""
 

@@ -27,7 +27,7 @@ MAX_PLATE_PIXELS = 500_000
 MATTE_MARGIN_SHARE = 0.008
 """Around the person, where a matte is uncertain; share of the image's height."""
 PERSON = 256
-"""Above every level of a pixel: sorts behind them."""
+"""Value above every level of a pixel, so that it is sorted behind them."""
 RADII = 24
 """Shells that are tried."""
 NEAREST_RADIUS = 0.3
@@ -35,7 +35,8 @@ NEAREST_RADIUS = 0.3
 FARTHEST_RADIUS = 12.0
 """Radius of the largest shell, in the same unit."""
 DEFAULT_RADIUS = 3.0
-"""Where the plates do not tell, because a wall is of one color or a single camera sees it."""
+"""Radius where the plates do not determine it, because a wall has one color or a single camera sees
+it."""
 SAMPLED_POINTS = 4000
 """Pixels of each plate by which shells are compared."""
 MIN_SHARED = 0.1

@@ -71,7 +71,7 @@ REGIONS = {
     "bundled": ([0.031, 0.036, 0.09], [0.0, -0.034, 0.11]),
     "ellipsoid": ([0.03, -0.04, 0.08], [0.0, 0.06, 0.07]),
 }
-"""Where each head's selected regions lie: an eye and the mouth."""
+"""Head -> centers of its selected regions: an eye and the mouth."""
 
 
 def bundled_head(count: int, rng: np.random.Generator) -> tuple[Splats, np.ndarray, np.ndarray]:
@@ -175,7 +175,7 @@ def arithmetic_rate(clock: Callable[[], float]) -> float:
 
 
 Stage = tuple[Callable[[], object], int]
-"""What a stage does, and the bytes that it must move at least."""
+"""A stage's function, and the least number of bytes that it must move."""
 BACKGROUND = np.ones(3, np.float32)
 
 

@@ -28,14 +28,15 @@ from . import inline_jit, jit
 from .elementary import acquire, exchange, fetch_add, latest, pause, release, yield_processor
 
 NEXT, UNITS, PIECE, FAILED, STAGES = range(5)
-"""Where a kernel's `work` int64 holds its next unit, their number, those of a piece, whether a
-member has failed, and of each stage its next unit and how many are done: all that a member sees of
-it."""
+"""Indices in a kernel's `work` int64 of its next unit, the number of units, the size of a piece,
+whether a worker has failed; from STAGES on, each stage's next unit and number of finished units.
+Workers see nothing else of it."""
 SEEN = STAGES + 2 * 14
 # The caller sees all of the team's words. Those that many threads write lie apart, because a
 # processor's core takes over 64 or 128 bytes at a time.
 LIMIT, ENTRY = range(SEEN, SEEN + 2)
-"""How many helpers are of use, and the function that calls the kernel with what CALL keeps."""
+"""Words that hold the number of useful helpers, and the function that calls the kernel with the
+arguments in CALL."""
 JOB = 48
 """Word that counts kernels; OVER after the last."""
 GATE = 64

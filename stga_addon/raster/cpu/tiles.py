@@ -253,7 +253,7 @@ def _move_by_digit(k, row, keys, values, least, shift, moved_keys, moved):
 
 
 SPLATS_AHEAD = 16
-"""So many splats ahead, memory is asked for what lies in no order."""
+"""Splats ahead of the current one whose scattered values are prefetched."""
 
 
 @part_jit

@@ -17,9 +17,9 @@ from .layout import SH, WORKGROUP, XYZ
 from .rasterize import DEPTH_BITS, MAX_TILE_BITS, sort_passes
 
 KERNEL_FILES = ("frames", "project", "tiles", "blend", "image_loss", "optimizer", "rows")
-"""Of the kernels of an iteration, and of those between two, beside those of `sort`."""
+"""Files with the kernels of an iteration and of the work between two, beside those of `sort`."""
 STEP_OFFSET = "optimizer.step_offset"
-"""What any iteration may dispatch beside sorting and steps of driven offsets."""
+"""Kernel that any iteration may dispatch beside sorting and steps of driven offsets."""
 RATES = (*Parameters._fields, "sh_rest", "strain_color")
 """Learning rates in the order of the kernels."""
 

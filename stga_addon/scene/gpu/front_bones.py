@@ -13,7 +13,7 @@ MAX_SHAPES = 256
 WIDTH_SHARE = 0.15
 """Half the width of a bone as a fraction of its length."""
 MARGIN_PX = 6.0
-"""What is added to a bone's half width for outlines."""
+"""Margin around a bone's half width for outlines."""
 
 
 def front_bones(space: Any, region: Any, width: int, height: int) -> np.ndarray:

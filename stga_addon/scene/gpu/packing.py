@@ -216,9 +216,9 @@ LIGHT_TEXELS = 4
 MAP_TEXELS = 4
 """Texels of a shadow map."""
 RELIT_TEXELS = 14
-"""Of a layer: share and factor of color; roughness, specular, first light and number of lights;
-eye, damping; typical albedo; nine harmonics of the world as highlights show them; gain and share of
-what is kept of recorded colors (`light.relight`)."""
+"""Texels of a relit layer: weight and factor of color; roughness, specular, first light and number
+of lights; eye, damping; typical albedo; nine harmonics of the world as highlights show them; gain
+and weight of the part of recorded colors that is kept (`light.relight`)."""
 MAX_MAPS = 16
 
 

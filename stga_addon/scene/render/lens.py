@@ -13,9 +13,9 @@ SHUTTER_START = {"START": 0.0, "CENTER": -0.5, "END": -1.0}
 """When the shutter opens, in exposure times from the frame."""
 
 TIME_STEP = 0.7548776662
-"""Of a sample's moment to the next one's, in exposure times: 1 over the plastic number."""
+"""Time from a sample to the next one, in exposure times: 1 over the plastic number."""
 GOLDEN_STEP = 0.6180339887
-"""Of a sample's angle in the aperture to the next one's, in turns."""
+"""Angle in the aperture from a sample to the next one, in turns."""
 
 
 class Sample(NamedTuple):

@@ -14,7 +14,8 @@ from PIL import Image
 from ...capture.images import FORMATS
 
 FULL_FRAME_DIAGONAL_MM = 43.27
-"""Of 36 x 24 mm; equivalent lengths have one angle of view over the diagonal (CIPA DCG-001)."""
+"""Diagonal of 36 x 24 mm; equivalent lengths have one angle of view over the diagonal (CIPA
+DCG-001)."""
 MIN_EQUIVALENT_MM = 5.0
 """Least focal length for 35 mm film that is plausible."""
 MAX_EQUIVALENT_MM = 2000.0

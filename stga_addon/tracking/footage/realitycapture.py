@@ -13,7 +13,7 @@ from ...flame.forward import axis_angle_matrices
 from .shots import Calibrated, ImageSize, Shot, listed, numbers, pinhole, read_xml
 
 FILM_WIDTH_MM = 36.0
-"""Of the 35 mm film that focal lengths are given for; it stands for the image's longer side."""
+"""Width of the 35 mm film to which focal lengths refer; it stands for the image's longer side."""
 REQUIRED_COLUMNS = ("name", "x", "y", "alt", "heading", "pitch", "roll", "f")
 LENS_COLUMNS = ("k1", "k2", "k3", "k4", "t1", "t2")
 

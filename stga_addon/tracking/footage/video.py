@@ -19,21 +19,22 @@ from ...files import file_address
 from .focal_tags import clean_aperture
 
 MIN_HD_LINES = 720
-"""From this height on, videos without a stated color matrix use that of HD (BT.709)."""
+"""Height from which on videos without a stated color matrix use that of HD (BT.709)."""
 TIMED_CONTAINERS = ("mov", "matroska")
 """FFmpeg's names of containers that store when each packet is shown."""
 SEEKABLE_CONTAINERS = (*TIMED_CONTAINERS, "mpegts")
 """Containers in which a frame has the same presentation time after a seek as in order."""
 CODECS_WITH_HIDDEN_PACKETS = ("vp8",)
-"""Whose reference frames that are not shown are packets of their own."""
+"""Codecs whose reference frames that are not shown are packets of their own."""
 DISPLAY_MATRIX_ONE = 1 << 16
-"""In the fixed-point numbers of a display matrix (ISO/IEC 14496-12, track header)."""
+"""The number 1 in the fixed-point numbers of a display matrix (ISO/IEC 14496-12, track header)."""
 CHECKED_FRAMES = 8
 """Frames at the beginning of a video that are decoded to check the times of its packets."""
 MAX_FRAMES_AHEAD = 100
 """Frames that are decoded to reach a later one; further ahead, a key frame is sought."""
 SEEK_BACK_FRAMES = (0, 16, 64, 256)
-"""How far before a frame a seek is tried, in turn, before all is decoded from the beginning."""
+"""Distances before a frame to which a seek is tried, in turn, before all is decoded from the
+beginning."""
 RATE_TOLERANCE = 0.01
 """Relative difference up to which a stated frame rate is that of the frames' times."""
 TURN_TOLERANCE = 0.02
@@ -371,7 +372,8 @@ def _from_key_frame(frames: Iterator[Any], time: int) -> Iterator[Any]:
 
 
 def _ascending(times: Sequence[int | None]) -> bool:
-    return None not in times and all(a < b for a, b in itertools.pairwise(times))  # type: ignore[operator]
+    return None not in times and all(a < b for a, b in itertools.pairwise(times))  # type:
+    ignore[operator]
 
 
 def _is_of(container: Any, formats: Sequence[str]) -> bool:

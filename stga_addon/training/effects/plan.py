@@ -30,16 +30,17 @@ MIN_STRAIN_GAIN_DB = 0.35
 """Mean gain of sampled colors, in frames and in cameras that are left out, from which splats follow
 deformation: with less, trainings with and without differ by no more than their noise."""
 MIN_TRACKED_STRAIN_GAIN_DB = -0.35
-"""The same of a capture by `stga track`, whose mesh lies beside what is seen by so much that colors
-sampled there show nothing of what trainings gain."""
+"""The same for a capture by `stga track`, whose mesh is so far from the true surface that colors
+sampled there do not show what trainings gain."""
 MIN_TIMESTEPS_FOR_STRAIN = 4
 """With fewer, leaving out one and its neighbors leaves no two to fit a dependence to."""
 MIN_SIGNAL_CHANGE = 1e-5
-"""Of strain or a unit normal; less is rounding."""
+"""Least change of strain or a unit normal; smaller ones are rounding errors."""
 MIN_TURN_DEG = 2.0
 """Root mean square over frames and triangles, from which colors follow where skin faces."""
 MAX_PIXEL_WIDTH_RATIO = 1.25
-"""Of pixels at the head; above it, splats narrower than a pixel look different to each camera."""
+"""Largest ratio of pixel widths at the head; above it, splats narrower than a pixel look different
+to each camera."""
 FINE_SPLAT_PIXELS = 4.0
 """Median pixels per splat below which the screen-space low-pass filter changes how splats look."""
 MAX_BACKGROUND_SPREAD_LEVELS = 6.0
@@ -50,7 +51,7 @@ MESH_AS_MASK = (
     "what the head's mesh does not cover, hair included, is left out (`stga track --mattes auto` "
     "makes masks)"
 )
-"""What becomes of images without a mask."""
+"""Treatment of images without a mask."""
 MIN_UNCOVERED_SHARE = 0.003
 """Share of the foreground that the mesh does not cover, from which splats are added for it."""
 MIN_PIXELS_PER_SPLAT = 0.5

@@ -27,7 +27,8 @@ SAMPLED_HEIGHT_PIXELS = 400
 """Height to which images half as high again are shrunk: triangles are then two or three pixels
 wide."""
 MIN_FACING_COSINE = 0.35
-"""Between normal and line of sight; below it, a triangle is too oblique to have a color."""
+"""Least cosine between normal and line of sight; below it, a triangle is too oblique to have a
+color."""
 MASK_EDGE_PIXELS = 3
 """Along the mask's edge, colors are mixed with the background."""
 TRACKING_ERROR_SHARE = 0.01

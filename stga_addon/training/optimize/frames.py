@@ -35,11 +35,12 @@ LAYER_HEIGHT_SHARE = 0.8
 """Height of the middle of hair's outer layer as a fraction of the height of hair, before half of
 its thickness is taken off."""
 LAYER_VOXELS = 0.5
-"""What is taken off that height, half of the layer's thickness."""
+"""Subtracted from that height: half of the layer's thickness."""
 SKIN_DEPTH = 0.1
 """Depth of the layer on skin, in the triangles' units, so that it does not stand out."""
 HEAD_RADIUS_VOXELS = 22.5
-"""By which hair's outer layer is wider than the scalp."""
+"""Radius of the head, by which hair's height is divided: hair's outer layer is wider than the scalp
+by that ratio."""
 
 
 @dataclass

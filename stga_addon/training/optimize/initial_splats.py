@@ -62,7 +62,8 @@ the head that no view contradicts would become floaters in other views."""
 SILHOUETTE_TOLERANCE_SHARE = 0.01
 """Error of the tracked silhouette, as a share of the image height."""
 FEW_CAMERAS = 4
-"""Up to which a torso's visual hull bulges by centimeters: `TorsoPoints` are better."""
+"""Largest number of cameras with which a torso's visual hull bulges by centimeters: `TorsoPoints`
+are better."""
 CONTINUED_SHARE = 0.4
 """How far a torso is continued beyond the image of a single camera, as a fraction of the image's
 width."""

@@ -17,10 +17,10 @@ SCALP_ELEVATION_DEG = 38.0
 NECK_ANGLE_DEG = 60.0
 """Angle from straight ahead behind which the neck begins."""
 EYES_TO_MIDDLE = 1.35
-"""How far the head's middle lies behind the eyes, in distances of the eyes from the mouth, the unit
-of all levels here."""
+"""Distance of the head's middle behind the eyes, in distances of the eyes from the mouth, the unit
+of all lengths here."""
 BROWS_OVER_EYES = 0.15
-"""How far the head's middle lies above the eyes."""
+"""Height of the head's middle above the eyes: that of the brows."""
 BROWS_LEVEL = 0.45
 """Height of the brows over the eyes."""
 JAW_LEVEL = -0.5

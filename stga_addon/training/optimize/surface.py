@@ -45,9 +45,9 @@ UNSEEN_COSINE = -0.1
 """Cosine between a triangle and the camera that it faces most below which not even hair stands in
 an outline."""
 HIDDEN_COSINE = 0.0
-"""Below it, the triangle is hidden."""
+"""Cosine below which a triangle is hidden."""
 GRAZING_COSINE = 0.2
-"""Below it, the triangle fills little of any image; many outlines tell its shape."""
+"""Cosine below which a triangle fills little of any image; many outlines show its shape."""
 OUTLINE_VIEWS = 16
 """Views, spread over all, whose outlines are measured."""
 OUTLINE_COSINE = 0.2
@@ -89,13 +89,13 @@ NECK_SIDE_DEG = 95.0
 NECK_HALF_WIDTH_DEG = 45.0
 """Half the angle over which they are measured."""
 HANGING_HEIGHT = 0.4
-"""How far long hair stands out from there, in distances of the eyes from the mouth."""
+"""Height of long hair above the scalp, in distances of the eyes from the mouth."""
 MAX_APART_DEG = 8.0
-"""Between the directions in which one camera sees a triangle, and their mean."""
+"""Largest angle between the directions in which one camera sees a triangle, and their mean."""
 MAX_BESIDE_SHARE = 0.1
 """Share of the masks in whose image a point lies, that it may lie outside of."""
 MAX_STICKING_SHARE = 0.05
-"""Of the triangles of a torso that is where images show a body."""
+"""Largest fraction of a torso's triangles that lie outside masks where images show a body."""
 STANDING_VOXELS = 1.5
 """Height from which hair or a collar stands out."""
 STANDING_REACH_VOXELS = 4

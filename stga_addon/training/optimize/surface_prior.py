@@ -56,7 +56,7 @@ PULLED_COLUMNS = (
     "parameters/log_scale",
     *MOMENTS,
 )
-"""What is read of the splats that may be pulled."""
+"""Columns that are read of the splats that may be pulled."""
 PINNED_KINDS = ("parameters", "average", "first", "second")
 """Arrays of the splats whose color is pinned."""
 INNER_PARAMETERS = ("xyz", "rotation", "log_scale", "opacity")
@@ -386,7 +386,7 @@ PRIORS = (
     SmallLining,
     SunkenEyes,
 )
-"""In the order in which they apply: a later one may change what an earlier one did."""
+"""Priors in the order in which they apply: a later one may change the result of an earlier one."""
 
 
 def doubt(second: np.ndarray, reference: np.ndarray) -> np.ndarray:

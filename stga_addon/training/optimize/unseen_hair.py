@@ -14,8 +14,8 @@ from .frames import SKIN_DEPTH, FrameStore
 from .semantic_regions import HeadCoordinates
 
 STRAND_COSINE = -0.3
-"""Of the angle between a triangle and the camera that it faces most, below which strands grow:
-longer than the layer's splats, they would stand in outlines."""
+"""Largest cosine of the angle between a triangle and the camera that it faces most for which
+strands are added: longer than the layer's splats, they would stand out in outlines."""
 STRANDS = 10000
 """Strands that a whole scalp would have."""
 STRAND_SHARE = 1.35
@@ -28,13 +28,13 @@ SMOOTHING_STEPS = 10
 MIN_RISE = 0.3
 """Least cosine between hair's surface and a triangle in its slope."""
 CROWN_ELEVATION_DEG = 55.0
-"""Of the place from which hair grows in all directions, behind the middle of the head."""
+"""Elevation of the point behind the middle of the head from which hair grows in all directions."""
 LOCK_CONTRAST = 0.15
 """Standard deviation of the brightness of locks, as a fraction of it."""
 LOCKS = 400
 """Locks around the head."""
 LOCK_LENGTH = 0.7
-"""How far a lock keeps its brightness, in distances of the eyes from the mouth."""
+"""Length over which a lock keeps its brightness, in distances of the eyes from the mouth."""
 
 
 class UnseenHair:

@@ -29,17 +29,17 @@ SPREAD_VIEWS = 12
 OPEN_VIEWS = 6
 """Views whose colors are measured of the timesteps in which the mouth is highest."""
 MIN_TEETH_SHARE = 0.04
-"""Of the pixels that show the mouth, that teeth fill at least; a slit between lips is as well one
-of the mesh alone."""
+"""Least fraction of the mouth's pixels that teeth fill; with fewer, in a slit between the lips, all
+teeth count as hidden."""
 SOURCE_COSINE = 0.25
 """Cosine between a triangle and the camera that it faces most above which others take its color:
 hair at the temples and a beard beside the jaw are seen at 60 to 75° at least."""
 WELL_SHOWN_COSINE = 0.5
-"""The same above which a face is shown better than its mirror image could tell."""
+"""The same above which a view shows a face better than its mirror image does."""
 FRINGE_COSINE = 0.2
 """The same for the scalp, which takes the color of a fringe where it is not visible itself."""
 FRINGE_SHARE = 0.2
-"""Of what is shown above the brows, the highest, where hair is if there is any."""
+"""Highest fraction of the visible triangles above the brows; they show hair if there is any."""
 MIN_SHOWN_SHARE = 0.1
 """Fraction of the median of the pixels that show as much of the surface, below which it is not
 visible: a folded eyelid has less."""
@@ -51,13 +51,14 @@ over which unseen colors are softened."""
 COLLAR_SLOPE = 0.3
 """Rise of a collar from front to back, by its depth."""
 LEVEL_WEIGHT = 3.0
-"""By how much visible triangles of neck and shoulders above and below the collar's plane through a
-hidden one count as farther than those beside it: a chin's shadow is on a neck's front only."""
+"""Factor by which visible triangles of neck and shoulders count as farther where they are above or
+below a hidden triangle, along the normal of the collar's plane, instead of beside it: only a neck's
+front has a chin's shadow."""
 SAME_COLOR_DEVIATION = 0.12
 """Largest difference in 0…1 of colors that differ by their shade alone: collars and hairlines stay
 sharp."""
 MAX_LIGHT_RATIO = 2.0
-"""Of the light on one side of a face to that on the other."""
+"""Largest ratio of the light on one side of a face to that on the other."""
 SHOWN_COSINE = 0.6
 """Cosine between a triangle and the camera that it faces most above which its color depends on no
 view; up to SOURCE_COSINE, it depends wholly on the view."""

@@ -30,7 +30,7 @@ DENSITY_SPAN = (0.0, 0.6)
 MIN_GROUP_VIEWS = 4
 """Evaluation views of a group at least, where it has so many."""
 ROUNDING = 1e-5
-"""By which colors differ that went through harmonics of what is plausible off-axis."""
+"""Largest difference between colors that went through the harmonics of the off-axis prior."""
 
 
 def starting_state(

@@ -41,9 +41,9 @@ EXPOSURE_VIEWS = 24
 EXPOSURE_HEIGHT_PX = 160
 """Height of these images."""
 CAMERA_WEIGHT = 0.2
-"""Of the camera's exposure in that of a view, as a share of the view's pixels."""
+"""Weight of the camera's exposure in a view's exposure, relative to the view's number of pixels."""
 MIN_COVER = 250
-"""Of a mask, of 255, from which a pixel shows the person alone."""
+"""Least value of a mask, of 255, at which a pixel shows the person alone."""
 SHADING_PRIOR = 0.01
 """Weight of the light that the avatar was trained in as a fraction of the pixels, where that of a
 take is fitted."""
@@ -52,7 +52,8 @@ SHADING_ITERATIONS = 6
 SCALE_TIMESTEPS = 6
 """Spread over the take, that the scale is found from."""
 ROUNDS = 2
-"""Of tracking, each from the motion that the one before has led to, smoothed in takes in order."""
+"""Rounds of tracking, each from the motion that the round before led to, smoothed in takes in
+order."""
 IDENTITY = Similarity(1.0, np.eye(3), np.zeros(3))
 
 PART_TIMESTEPS = 16
