@@ -1,5 +1,5 @@
-"""Tracking by a finished avatar: pose and expression such that the avatar, its splats fixed, looks
-like the images.
+"""Tracking by a finished avatar: finds the pose and expression at which the avatar, with its splats
+fixed, looks like the images.
 
 Landmarks and dense tracking know a face in general; an avatar knows its person, with hair and
 teeth. The gradient is that of the training's own loss, passed from the splats to the head's
@@ -106,12 +106,11 @@ MISS_LEVELS = 24
 
 @dataclass(frozen=True)
 class AvatarTracking:
-    """Parameters (T, E + 18) of timesteps; (T,) the share of the head's pixels whose colors the
-    avatar misses by more than MISS_LEVELS, NaN where it tracks for the first time; (T, 3) by how
-    much the torso is shifted, of `torso_shapes`; (T,) the head's scale, where it was sought; and
-    (T, P, P) inverse covariances of what was sought: expressions, the torso's shift, scale, pose;
-    (T, 0, 0) of the recording that the avatar was trained on.
-    """
+    """Parameters (T, E + 18) of timesteps; (T,) the fraction of the head's pixels whose colors the
+    avatar misses by more than MISS_LEVELS, NaN where it tracks for the first time; (T, 3) the
+    torso's shift, see `torso_shapes`; (T,) the head's scale, where it was solved for; and (T, P, P)
+    inverse covariances of the solved parameters: expressions, the torso's shift, scale, pose; (T,
+    0, 0) for the recording that the avatar was trained on."""
 
     timesteps: tuple[int, ...]
     parameters: np.ndarray
@@ -189,7 +188,8 @@ class RefinedTracking:
         return with_sequence(capture, replace(self.sequence, frame=self.frame))
 
     def take(self, found: AvatarTracking, timesteps: Sequence[int]) -> list[int]:
-        """Give timesteps what was found: those left out in between change as their neighbors.
+        """Apply tracked parameters at some timesteps; the timesteps between them change as their
+        neighbors do.
 
         Returns the timesteps that stay as they were, because their head went farther than tracking
         can be wrong.
@@ -249,8 +249,8 @@ class TrainedAvatar(NamedTuple):
 def tracked_timesteps(
     settings: TrainingSettings, capture: Capture, timesteps: Sequence[int]
 ) -> list[int]:
-    """Those that an avatar tracks while it is trained for a number of iterations, evenly spread: as
-    many as TRACKED_SHARE allows. With a budget in seconds, all: time decides."""
+    """Timesteps, evenly spread, that an avatar tracks while it is trained for a number of
+    iterations: as many as TRACKED_SHARE allows. With a budget in seconds, all: time decides."""
     if settings.iterations is None:
         return list(timesteps)
     wanted = set(timesteps)
@@ -261,7 +261,7 @@ def tracked_timesteps(
 
 
 def not_moved(timesteps: Sequence[int]) -> str:
-    """The sentence about timesteps that `RefinedTracking.take` has left as they were."""
+    """The sentence about timesteps that `RefinedTracking.take` did not move."""
     listed = ", ".join(map(str, timesteps))
     return (
         f"the head would move by more than {100 * MAX_MOVE_M:.0f} cm at timesteps {listed}, "
@@ -316,8 +316,8 @@ def track_by_avatar(
 
 
 def normal_images(mesh: np.ndarray, faces: np.ndarray, shown: ArrayPair) -> ArrayPair:
-    """Where a camera sees a mesh, (H, W) bool, and the surface's unit normals there (H, W, 3);
-    shown: `rasterize` of the mesh."""
+    """Pixels (H, W) bool that show a mesh, and the surface's unit normals there (H, W, 3); shown:
+    `rasterize` of the mesh."""
     triangles, share = shown
     seen = triangles >= 0
     found = np.zeros((*triangles.shape, 3))
@@ -342,7 +342,8 @@ Shots = Sequence[tuple[View, np.ndarray]]
 
 
 class _Effort(NamedTuple):
-    """Renderings of each view at most; share of the loss by which a step has to lower it."""
+    """Largest number of renderings of each view; fraction of the loss by which a step has to lower
+    it."""
 
     renderings: int
     least_gain: float
@@ -435,7 +436,8 @@ class _Tracker:
         effort: _Effort,
         first: tuple[float, np.ndarray] | None = None,
     ) -> tuple[np.ndarray, np.ndarray]:
-        """From `start` on, and their inverse covariance; first: the start's `_loss`, if known."""
+        """Parameters after minimization from `start`, and their inverse covariance; first: the
+        start's `_loss`, if known."""
         precision = self._precision()  # of the change from those that were tracked
         known = self._gauss_newton(start, shots) + np.diag(precision)
         root = np.linalg.cholesky(known)
@@ -494,9 +496,10 @@ class _Tracker:
         return shots
 
     def _cut(self, view: View, image: np.ndarray) -> np.ndarray:
-        """The image (H, W, 3) uint8 and, where no mask tells what lies behind the head, the avatar
-        itself beyond the mesh that is being tried: what is not known pulls nowhere. Cut by the mesh
-        that was tracked, the image would say that the head has not moved."""
+        """The image (H, W, 3) uint8. Where no mask shows the background, pixels beyond the mesh
+        that is being tried are replaced by the avatar's, so that the unknown background has no
+        gradient. If the tracked mesh cut the image, the image would show that the head has not
+        moved."""
         if not self._cuts or view.mask is not None:
             return image
         margin = max(1, round(TOLERANCE_SHARE * len(image)))

@@ -88,7 +88,7 @@ class DensityControl:
         backend.assign(every, {"screen_gradient": 0.0, "gradient_count": 0.0})
 
     def score(self, columns: Mapping[str, np.ndarray]) -> np.ndarray:
-        """(N,) how much detail is missing at each splat: its mean screen gradient."""
+        """(N,) mean screen gradient of each splat: how much detail is missing there."""
         gradient = columns["screen_gradient"] / np.maximum(columns["gradient_count"], 1)
         return np.asarray(gradient)
 

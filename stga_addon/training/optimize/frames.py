@@ -123,14 +123,14 @@ class FrameStore:
 
     @cached_property
     def hair_layer_scale(self) -> np.ndarray:
-        """(F,) of hair's outer layer where it faces away from all cameras, in local units: smaller,
-        it has gaps, through which the head's inside shows. 0 elsewhere."""
+        """(F,) scale of hair's outer layer where it faces away from all cameras, in local units; 0
+        elsewhere. A smaller one would leave gaps that show the head's inside."""
         is_hair = self.surface.hidden & (self.surface.hair_height > 0)
         return np.asarray(np.where(is_hair, SCALE * self.units * self.hair_widening, 0))
 
     @cached_property
     def hair_widening(self) -> np.ndarray:
-        """(F,) how much wider hair's outer layer is than the scalp; 1 elsewhere."""
+        """(F,) ratio of the width of hair's outer layer to the scalp's; 1 elsewhere."""
         return np.asarray(1 + self.surface.hair_height / (HEAD_RADIUS_VOXELS * self.voxel))
 
     def of(self, timestep: int) -> FaceFrames:

@@ -98,7 +98,7 @@ def initial_splats(capture: Capture, settings: TrainingSettings) -> Splats:
 
 
 def unseen_share(capture: Capture, convention: str, splats: Splats) -> np.ndarray:
-    """Share (N,) of the cameras of the first training timestep in whose image an unbound splat does
+    """Fraction (N,) of the first training timestep's cameras in whose image an unbound splat does
     not lie.
 
     0 for bound splats. A hull point outside of most images is held by few masks only, and often in
@@ -280,8 +280,8 @@ def flat_points(
 
 
 def _without_face(capture: Capture) -> np.ndarray:
-    """(F,) bool: triangles that are not the face's; all of a mesh that has no others, or of which
-    that is not known."""
+    """(F,) bool: triangles outside the face; all of a mesh that consists of a face or whose face is
+    not known."""
     at = head_coordinates(capture)
     others = np.ones(len(capture.faces), bool) if at is None else ~face_of(at)
     return others if others.any() else ~others
@@ -304,8 +304,8 @@ def _nearest_triangle(
 def _followed(
     capture: Capture, timestep: int, points: np.ndarray, torso: bool
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Distance (N,) to the mesh, and triangle (N,) of each point: the nearest, of those below the
-    base of the neck with `torso` the nearest of the torso."""
+    """Distance (N,) to the mesh, and the nearest triangle (N,) of each point. With `torso`, points
+    below the base of the neck take the torso's nearest triangle."""
     mesh = capture.mesh(timestep)
     distance, face = _nearest_triangle(points, mesh, capture.faces)
     if torso and capture.flame is not None:

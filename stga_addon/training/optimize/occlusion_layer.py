@@ -1,5 +1,5 @@
-"""An opaque layer behind the surface, which off-axis views would look through: images make a head's
-sides transparent where it is tracked too wide, and a torso may have a front only."""
+"""An opaque layer behind the surface, which blocks off-axis views: images make a head's sides
+transparent where the tracked mesh is too wide, and a torso may have a front only."""
 
 from dataclasses import dataclass
 
@@ -106,10 +106,10 @@ def occlusion_layer(surface: Surface, sides: UnseenSides) -> OcclusionLayer:
 def _behind_sides(
     surface: Surface, at: HeadCoordinates, allowed: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """One triangle in each cell, of those `allowed` (F,) bool that an off-axis view may look
-    through, as (F,) bool: what is `_grazed`; neck and clothes, as what a collar or a fold hides
-    from the cameras need not be opaque for them. The neutral vertices (V, 3), moved inside the head
-    until masks cover them."""
+    """One triangle in each cell of those `allowed` (F,) bool that an off-axis view may look
+    through, as (F,) bool: the triangles of `_grazed`, and of neck and clothes, because images need
+    not make opaque what a collar or a fold hides from the cameras. And the neutral vertices (V, 3),
+    moved inside the head until masks cover them."""
     faces = surface.capture.faces
     neutral = np.asarray(surface.capture.neutral, np.float64)
     voxel = voxel_size(neutral)
@@ -146,8 +146,8 @@ def _reaches_beside(surface: Surface, rows: np.ndarray, offsets: np.ndarray) -> 
 
 
 def _grazed(surface: Surface, at: HeadCoordinates) -> np.ndarray:
-    """(F,) bool: what no camera sees well, of head and neck but for the face, up to an angle from
-    straight ahead."""
+    """(F,) bool: triangles of head and neck, without the face and up to an angle from straight
+    ahead, that no camera sees well."""
     limit = GRAZED_COSINE
     angle_deg = FACE_ANGLE_DEG
     if surface.filmed_along is not None:
@@ -169,8 +169,8 @@ def _is_off_border(surface: Surface) -> np.ndarray:
 
 
 def _open_front(surface: Surface, at: HeadCoordinates) -> np.ndarray:
-    """(F,) bool: triangles of a torso whose inner side shows from behind, but for what sticks out
-    of masks. A bust, which ends soon, has none."""
+    """(F,) bool: triangles of a torso whose inner side is visible from behind, except those that
+    stick out of masks. A bust, which is short, has none."""
     across, _, ahead = at.axes
     front = np.zeros(len(surface.outside), bool)
     for angle in np.radians(BEHIND_DEG):

@@ -1,5 +1,5 @@
-"""Pruning of splats outside of the masks: a needle beside the hair, which a few images call for and
-many others push back, would survive the training."""
+"""Pruning of splats outside of the masks: without it, a needle beside the hair that a few images
+call for, and many others reject, would survive the training."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -32,7 +32,7 @@ Coefficients = dict[str, np.ndarray]
 
 @dataclass(frozen=True)
 class Outline:
-    """What a mask leaves clear, with a margin, (H, W) bool; camera: of that size."""
+    """Pixels (H, W) bool that a mask with a margin does not cover; camera: of that size."""
 
     timestep: int
     camera: Camera
@@ -55,8 +55,8 @@ def read_outlines(capture: Capture, seed: int) -> list[Outline]:
 
 
 def clear_of(covered: np.ndarray, margin_share: float = TOLERANCE_SHARE) -> np.ndarray:
-    """(H, W) bool: pixels that a mask, which covers these (H, W) bool, leaves clear, but for a
-    margin beside it; with a negative one, also a margin within it. margin_share: of the height."""
+    """(H, W) bool: pixels that a mask (H, W) bool does not cover, without a margin beside it; a
+    negative margin includes pixels within it. margin_share: fraction of the height."""
     margin = max(1, round(abs(margin_share) * len(covered)))
     moved = binary_dilation if margin_share > 0 else binary_erosion
     return np.asarray(~moved(covered, iterations=margin))

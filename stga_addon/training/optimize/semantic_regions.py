@@ -1,4 +1,4 @@
-"""Which seen triangles of a head unseen ones look like: hair has hair, a neck a neck."""
+"""Which visible triangles of a head unseen ones look like: hair like hair, a neck like a neck."""
 
 from collections.abc import Collection
 from dataclasses import dataclass
@@ -150,8 +150,8 @@ def face_of(at: HeadCoordinates) -> np.ndarray:
 def kinds_of(
     at: HeadCoordinates, is_outside: np.ndarray, has_long_hair: bool = False
 ) -> dict[str, np.ndarray]:
-    """Kind -> (F,) bool: scalp, which includes the back of a neck that long hair hides, and body,
-    which is neck and shoulders; unseen parts of each look as seen ones."""
+    """Kind -> (F,) bool: "scalp", which includes the back of a neck that long hair hides, and
+    "body", neck and shoulders. Unseen parts of each kind look like visible ones of it."""
     angle = np.degrees(np.abs(at.azimuth))
     elevation = np.degrees(at.elevation)
     ear = ears_of(at)
@@ -183,8 +183,8 @@ def nearest_rows(known: np.ndarray, places: np.ndarray, count: int) -> np.ndarra
 def hairy_triangles(
     sources: np.ndarray, centers: np.ndarray, color: np.ndarray, skin: np.ndarray
 ) -> np.ndarray:
-    """Those of a scalp's triangles whose color differs from skin in another way than skin's own
-    shades (K, 3) do; all where no skin is known."""
+    """Triangles of a scalp whose color differs from skin by more than skin's shades (K, 3) do among
+    each other; all of them where no skin is known."""
     if not len(sources) or not len(skin):
         return sources
     median = np.median(skin, axis=0)
@@ -199,10 +199,10 @@ def hairy_triangles(
 def inside_colors(
     capture: Capture, color: np.ndarray, shown: np.ndarray, inside: np.ndarray
 ) -> np.ndarray:
-    """Colors (M, 3) of triangles `inside` (F,) bool, which show where mouth or lids move as in no
-    view: teeth, gums and lining near the mouth, in the light on the person's lips and eyes; what
-    lids hide of eyeballs, as white as the rest; elsewhere as the skin around. color, shown: of
-    `mean_colors`."""
+    """Colors (M, 3) of triangles `inside` (F,) bool that no view shows and that motion of mouth or
+    lids exposes: teeth, gums and lining near the mouth, in the light on the person's lips and eyes;
+    the hidden part of eyeballs, as white as the visible part; elsewhere the color of the skin
+    around. color, shown: of `mean_colors`."""
     faces = capture.faces
     centers = np.asarray(capture.neutral)[faces].mean(1)
     skin = skin_of(capture)
@@ -249,8 +249,8 @@ def skin_of(capture: Capture) -> np.ndarray:
 
 
 def lining_of(capture: Capture) -> np.ndarray:
-    """(F,) bool: skin so near to the middle of the mouth that it may line it; none where it is not
-    known where that is."""
+    """(F,) bool: skin so near to the middle of the mouth that it may line it; none where the mouth
+    is not known."""
     at = head_coordinates(capture)
     if at is None:
         return np.zeros(len(capture.faces), bool)

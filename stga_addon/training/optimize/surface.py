@@ -1,4 +1,4 @@
-"""What training views tell of a head's surface: which triangles face a camera, where something
+"""What training views show of a head's surface: which triangles face a camera, where something
 stands above them, where the mesh ends."""
 
 from functools import cached_property
@@ -178,14 +178,13 @@ class Surface:
 
     @cached_property
     def turned_away(self) -> np.ndarray:
-        """(F,) share in 0…1 of what views do not tell of a triangle's shape, by how it faces them:
-        1 where it faces away, 0 where it does not graze."""
+        """(F,) in 0…1, by how training views face a triangle: 1 where it faces away and its shape
+        is unknown, 0 where no view grazes it."""
         return self.turned_from(GRAZING_COSINE)
 
     def turned_from(self, cosine: float, away: float = UNSEEN_COSINE) -> np.ndarray:
-        """(F,) 1 where a triangle faces all cameras by less than the cosine `away`, less the better
-        it faces one, 0 from the other cosine on; with many cameras, which outlines tell enough, 1
-        or 0."""
+        """(F,) 1 where a triangle faces all cameras by less than the cosine `away`; it falls to 0
+        at the other cosine. With many cameras, whose outlines show the shape, only 1 or 0."""
         if not self.has_few_cameras:
             return np.asarray(self.facing <= UNSEEN_COSINE, float)
         return np.asarray(np.interp(self.facing, (away, cosine), (1, 0)))
@@ -198,14 +197,14 @@ class Surface:
 
     @cached_property
     def closed(self) -> np.ndarray:
-        """(F,) bool: hidden triangles that an opaque layer closes, so that no view shines through:
-        all but those that stick out."""
+        """(F,) bool: hidden triangles that an opaque layer closes, so that no view shows the
+        inside: all except those that stick out."""
         return np.asarray(self.hidden & ~self.sticks_out)
 
     @cached_property
     def sticks_out(self) -> np.ndarray:
-        """(F,) bool: triangles that lie outside of some masks, or touch one that does, as an ear of
-        a head whose turn is tracked too far: they have to be as transparent as images say."""
+        """(F,) bool: triangles outside of some masks, or next to such a triangle, as an ear of a
+        head that was tracked with too much turn: they must be as transparent as images show."""
         every = np.arange(len(self.outside))
         touched = np.zeros(len(self.capture.neutral), bool)
         touched[self.capture.faces[self.beside_masks(every, np.zeros((1, 3)))[:, 0]]] = True
@@ -298,8 +297,8 @@ class Surface:
 
     @cached_property
     def border(self) -> np.ndarray:
-        """(F,) bool: triangles at the longest edge of the mesh, where a bust ends; none of a torso,
-        which ends where images do."""
+        """(F,) bool: triangles at the longest edge of the mesh, where a bust ends. None for a
+        torso, whose end is outside the images."""
         faces = self.capture.faces
         count = len(self.capture.neutral)
         edges = np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
@@ -322,9 +321,9 @@ class Surface:
 
     @cached_property
     def hair_height(self) -> np.ndarray:
-        """(F,) meters that hair stands above the scalp's triangles: as measured, else as where it
-        is measured around there, on both sides of the head alike, but within masks; of long hair
-        behind the neck as beside it at least. 0 elsewhere."""
+        """(F,) meters of hair above the scalp's triangles, 0 elsewhere: as measured, else as
+        measured in the neighborhood, equal on both sides of the head, but within masks. Long hair
+        is at least as high behind the neck as beside it."""
         height = np.zeros(len(self.outside))
         scalp = np.flatnonzero(self._scalp)
         measured = scalp[self._is_measured[scalp]] if len(scalp) else scalp
@@ -350,9 +349,9 @@ class Surface:
 
     @cached_property
     def is_flat(self) -> np.ndarray:
-        """(F,) bool: hidden triangles and, where few cameras do not tell how thick it is, skin and
-        clothes, above which no outline shows anything to stand. Not the torso where parts of it
-        stick out of masks: what images show there, as arms and hands, is elsewhere."""
+        """(F,) bool: hidden triangles and, with few cameras, skin and clothes above which no
+        outline shows anything. The torso is left out where parts of it stick out of masks: hands
+        and arms that images show there are elsewhere."""
         if self.at is None or not self.has_few_cameras:
             return self.hidden
         voxel = voxel_size(np.asarray(self.capture.neutral))

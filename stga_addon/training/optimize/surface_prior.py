@@ -1,5 +1,5 @@
-"""Priors of what training views tell little of: what shines through the front, and a pixel of an
-outline, would give such splats any color, size and place."""
+"""Priors for splats that training views show little of. Without them, light through the front, or a
+pixel of an outline, would give such splats any color, size and place."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -97,7 +97,7 @@ class Prior(Protocol):
 
 
 class SurfacePrior:
-    """Pulls bound splats towards what is plausible, the more the less the views tell of them.
+    """Pulls bound splats toward a prior; the pull is stronger where views determine less.
 
     How much views tell is read from Adam's second moments, root mean squares of gradients. Without
     this, its steps, which are of one length for strong and weak gradients, would let splats that
@@ -112,7 +112,7 @@ class SurfacePrior:
 
     @cached_property
     def may_be_pulled(self) -> np.ndarray:
-        """(F,) bool: triangles some of whose splats may be; of many cameras, few."""
+        """(F,) bool: triangles with splats that priors may pull; few with many cameras."""
         surface = self._surface
         sides = self._frames.sides
         may_be = sides.triangles | ~sides.shown | surface.lids | surface.is_flat
@@ -180,8 +180,8 @@ class _Known:
 
 
 class PlausibleColor:
-    """What views do not show has the color of `UnseenSides`, and keeps it where no view can tell:
-    of a folded lid, views show only the edge, in the fold's shade."""
+    """Splats that views do not show take the color of `UnseenSides`, and keep it where no view
+    determines it: training views see only the shaded edge of a folded lid."""
 
     def __init__(self, known: _Known) -> None:
         self._known = known
@@ -216,8 +216,8 @@ class PlausibleColor:
 
 
 class OpaqueSurface:
-    """What turns away from the views is opaque and lies on the surface, or in the outer layer of
-    hair."""
+    """Splats that face away from the views are opaque and lie on the surface, or in the outer layer
+    of hair."""
 
     def __init__(self, known: _Known) -> None:
         self._known = known
@@ -245,8 +245,9 @@ class OpaqueSurface:
 
 
 class ShortSteps:
-    """Where gradients are below DOUBT times those of well observed splats, Adam moves and shapes
-    splats by steps that are as much shorter: a layer that hardly shows would get holes."""
+    """Where gradients are below DOUBT times those of well observed splats, Adam's steps in position
+    and shape are shortened by that ratio. Otherwise a layer that is hardly visible would get
+    holes."""
 
     def __init__(self, known: _Known) -> None:
         pass
@@ -259,7 +260,8 @@ class ShortSteps:
 
 
 class FlatSkin:
-    """Splats on skin and clothes stay thin, those of the hidden layer as wide as closes it."""
+    """Splats on skin and clothes stay thin, and those of the hidden layer stay wide enough to close
+    it."""
 
     def __init__(self, known: _Known) -> None:
         self._known = known
@@ -296,8 +298,8 @@ class FlatSkin:
 
 
 class FixedInnerLayer:
-    """Splats of the mouth's unseen inside, and those behind lids and sides, stay as `inner_layer`
-    has them: views would make them any size."""
+    """Splats of the mouth's unseen inside, and behind lids and sides, stay as `inner_layer` placed
+    them: views would make them any size."""
 
     def __init__(self, known: _Known) -> None:
         self._inner = known.inner
@@ -337,8 +339,8 @@ class FixedEnd:
 
 
 class SmallLining:
-    """Splats on the lips' inner side, which few cameras do not show well, stay small: they would
-    hang before the teeth when the lips part."""
+    """Splats on the lips' inner side that few cameras show well stay small: large ones would hang
+    in front of the teeth when the lips part."""
 
     def __init__(self, known: _Known) -> None:
         capture = known.frames.capture
@@ -390,8 +392,8 @@ PRIORS = (
 
 
 def doubt(second: np.ndarray, reference: np.ndarray) -> np.ndarray:
-    """Share (N,) in 0…1 of what is plausible: 1 where views tell nothing, a half where gradients
-    are DOUBT times those of well observed splats. second (N, C): Adam's moments; reference (M, C):
+    """Weight (N,) of the prior in 0…1: 1 where views determine nothing, 0.5 where gradients are
+    DOUBT times those of well observed splats. second (N, C): Adam's moments; reference (M, C):
     those of well observed splats."""
     little = DOUBT * np.median(np.sqrt(reference.mean(1))) + np.finfo(np.float32).tiny
     return np.asarray(little / (little + np.sqrt(second.mean(1))), np.float32)
@@ -412,9 +414,9 @@ def width(rotation: np.ndarray, log_scale: np.ndarray, axis: int) -> np.ndarray:
 def flattened(
     rotation: np.ndarray, log_scale: np.ndarray, axis: int, limit: np.ndarray, least: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Splats compressed along a local axis to the standard deviation `limit` (N,), at most, and
-    widened across it to a `width` of `least` (N,): rotation (N, 4) wxyz and log_scale (N, 3),
-    float32. What is seen along that axis of those wide enough stays as it is."""
+    """Splats compressed along a local axis to a standard deviation of at most `limit` (N,), and
+    widened across it to a `width` of at least `least` (N,): rotation (N, 4) wxyz and log_scale (N,
+    3), float32. Splats that are wide enough look the same along that axis as before."""
     wide = np.maximum(width(rotation, log_scale, axis), np.sqrt(MIN_VARIANCE))
     wider = np.maximum(least / wide, 1)
     sides = to_matrices(rotation) * np.exp(log_scale)[:, None] * wider[:, None, None]

@@ -136,7 +136,7 @@ class Trainer:
 
     @property
     def state(self) -> TrainState:
-        """A GPU backend copies it, so do not read it in every iteration."""
+        """The training state. A GPU backend copies it, so do not read it in every iteration."""
         return self._backend.state
 
     @state.setter
@@ -243,8 +243,7 @@ def density_control(settings: TrainingSettings) -> DensityControl:
 
 
 def _placed_splats(frames: FrameStore, settings: TrainingSettings) -> tuple[TrainState, int]:
-    """The splats that a training begins with; how many there would be, had the lattice begun with
-    all of its points."""
+    """The splats that a training begins with, and how many there would be on the whole lattice."""
     capture = frames.capture
     triangles = len(capture.faces)
     splats = initial_splats(capture, settings)

@@ -1,4 +1,4 @@
-"""Strands and locks of hair where no view shows any: without them, it looks like a helmet."""
+"""Strands and locks of hair where no view shows the hair: without them, it looks like a helmet."""
 
 from dataclasses import replace
 from functools import cache, cached_property
@@ -38,7 +38,7 @@ LOCK_LENGTH = 0.7
 
 
 class UnseenHair:
-    """Hair's outer layer where it faces away from all cameras: the same in every run."""
+    """Hair's outer layer where it faces away from all cameras. It is the same in every run."""
 
     def __init__(self, frames: FrameStore) -> None:
         self._frames = frames
@@ -175,8 +175,8 @@ def growth(at: HeadCoordinates, places: np.ndarray, normals: np.ndarray) -> np.n
 
 
 def lock_shades(at: HeadCoordinates, places: np.ndarray) -> np.ndarray:
-    """(N,) brightness of hair at places (N, 3), relative to the typical one: locks, which reach
-    from the crown down, have their own, that changes slowly along them."""
+    """(N,) brightness of hair at places (N, 3), relative to the typical one. It differs from lock
+    to lock and changes slowly along a lock, which reaches down from the crown."""
     crown = _crown(at)
     across = at.axes[0]
     away = places - at.middle

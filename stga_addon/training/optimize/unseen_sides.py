@@ -1,4 +1,5 @@
-"""Colors of what no training view shows, sides of the head and the inside of a closed mouth."""
+"""Colors for parts that no training view shows: sides of the head, and the inside of a closed
+mouth."""
 
 from dataclasses import dataclass
 
@@ -92,10 +93,11 @@ class UnseenSides:
 
 
 def unseen_sides(surface: Surface) -> UnseenSides:
-    """Triangles that no camera looks at. They look as the nearest that views show, on either side
-    of the head: those on the other side as their mirror images, in the light of this one. Hair has
-    one color where no view shows it, and ears look as ears. What views show looks as there, but for
-    faces of few cameras, which look as their mirror images where these are shown better."""
+    """Colors of triangles that no camera faces. They take the color of the nearest visible
+    triangles on either side of the head; those on the other side are mirrored and relit by this
+    side's light. Unseen hair has one color, and ears take the color of ears. Visible triangles keep
+    their color, except on faces of few cameras, which take their mirror image's color where that is
+    shown better."""
     capture = surface.capture
     cosine = surface.facing
     is_outside = surface.outside
@@ -152,9 +154,10 @@ def unseen_sides(surface: Surface) -> UnseenSides:
 
 
 def plausible_off_axis(splats: Splats, along: np.ndarray, sides: UnseenSides) -> Splats:
-    """Splats that views show along one direction only, that of their triangle (F, 3), with what is
-    plausible off-axis: hair, and of the rest what lies on it, not what hangs before it. What looks
-    like hair on skin that turns away is hair behind it: it is skin off-axis."""
+    """Splats that views show along one direction only, that of their triangle (F, 3), with their
+    prior's color off-axis: hair, and elsewhere the splats that lie on the surface, not those that
+    hang in front of it. A hair-colored splat on skin that turns away belongs to hair behind it:
+    off-axis it is skin."""
     face = splats.face
     share = OFF_AXIS_WEIGHT * sides.view_dependence[face]
     share[splats.unbound & ~sides.is_hair[face]] = 0
@@ -308,9 +311,9 @@ def _color_views(capture: Capture) -> list[View]:
 
 
 def _unseen_inside(capture: Capture, shown: np.ndarray, is_outside: np.ndarray) -> np.ndarray:
-    """(F,) bool: triangles inside of mouth and eyes that no view shows, nor any neighbor of theirs.
-    Not the folds of ears, which other views show. None in a long recording whose meshes are files:
-    not all of its mouths were looked for."""
+    """(F,) bool: triangles inside of mouth and eyes that neither a view nor a view of a neighbor
+    shows. Folds of ears are left out, because other views show them. None in a long recording whose
+    meshes are files, because not all open mouths were looked for."""
     if capture.flame is None and len(capture.timesteps) > SPREAD_VIEWS:
         return np.zeros(len(shown), bool)
     touched = np.zeros(len(capture.neutral), bool)
