@@ -1,4 +1,4 @@
-"""Appearance of a head's surface points: sampled in image pyramids, freed of lighting, averaged."""
+"""Appearance of a head's surface points: sampled in image pyramids, without lighting, averaged."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -178,8 +178,8 @@ def box_of(where: np.ndarray, margin: int) -> tuple[slice, slice]:
 def mean_around(
     image: np.ndarray, known: np.ndarray, deviations: Sequence[float], places: np.ndarray
 ) -> np.ndarray:
-    """(N, 3) float32 mean of pixels that are known, (H, W) 0 or 1, around places (N, 2), rows and
-    columns; those far away where none is near.
+    """(N, 3) float32 mean of the known pixels, (H, W) 0 or 1, around places (N, 2), rows and
+    columns; the mean of those far away where none is near.
 
     deviations: standard deviations, in pixels, of the near and the far neighborhood.
     """
@@ -203,7 +203,7 @@ def mean_around(
 
 
 def reduced(image: np.ndarray, size: tuple[int, ...]) -> np.ndarray:
-    """The image's means over the areas of a smaller one's pixels; by halves, which is fast."""
+    """The image at a smaller size: means over the areas of its pixels, by halves, which is fast."""
     import cv2
 
     while not any(
@@ -233,8 +233,8 @@ def projection_derivative(camera: Camera, points: np.ndarray) -> np.ndarray:
 
 
 def flow_targets(at: np.ndarray, before: Views, now: Views) -> Any:
-    """(key, camera, pixels (M, 2) to which optical flow (DIS, Kroeger et al. 2016) moves points at
-    `at` (M, 3)) of each camera that saw both timesteps."""
+    """(key, camera, pixels (M, 2)) of each camera that saw both timesteps: the pixels to which
+    optical flow (DIS, Kroeger et al. 2016) moves points at `at` (M, 3)."""
     import cv2
 
     opencv: Any = cv2  # whose type stubs lack DIS
@@ -303,7 +303,7 @@ def robust(residual: np.ndarray, scale: float) -> np.ndarray:
 
 
 def point_weights(residual: np.ndarray, level: int) -> np.ndarray:
-    """(M,) of points whose channels differ from a view's by (M, 3) NOISE_LEVELS."""
+    """(M,) weights of points whose channels differ from a view's by (M, 3) NOISE_LEVELS."""
     share = residual**2 @ CHANNEL_WEIGHTS / OUTLIER_SQUARED[level]
     return POINT_SHARE / (1 + share) ** 2
 
@@ -311,13 +311,13 @@ def point_weights(residual: np.ndarray, level: int) -> np.ndarray:
 def unexplained(
     residual: np.ndarray, level: int, weights: np.ndarray = CHANNEL_WEIGHTS
 ) -> np.ndarray:
-    """(M,) from 0 where images explain points to 1, of differences (M, 3) in NOISE_LEVELS."""
+    """(M,) from 0, images explain the points, to 1, for differences (M, 3) in NOISE_LEVELS."""
     squared = residual**2 @ weights
     return squared / (OUTLIER_SQUARED[level] + squared)
 
 
 def flow_weights(miss: np.ndarray) -> np.ndarray:
-    """(M,) of points that lie (M, 2) pixels from where optical flow moves them."""
+    """(M,) weights of points that lie (M, 2) pixels from where optical flow moves them."""
     return FLOW_SHARE * robust(np.linalg.norm(miss, axis=1), FLOW_SCALE_PX)
 
 
@@ -366,8 +366,8 @@ def average_texture(samples: Sequence[Sample]) -> Texture:
 def _robust_mean(
     values: Sequence[np.ndarray], weight: np.ndarray, start: np.ndarray | None = None
 ) -> np.ndarray:
-    """(N, 3) of M values (N, 3) with weights (M, N), from the weighted median on; outliers by
-    detail and redness."""
+    """(N, 3) mean of M values (N, 3) with weights (M, N), starting at the weighted median; outliers
+    by detail and redness count less."""
     stacked = np.stack(values)
     mean = start
     if mean is None:

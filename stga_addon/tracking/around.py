@@ -94,12 +94,12 @@ MIN_CORRELATION = 0.6
 
 
 class CamerasNotFound(StgaError):
-    """Structure from motion gives no cameras; says why, and what helps."""
+    """Structure from motion gives no cameras; the message names the reason and what helps."""
 
 
 @dataclass(frozen=True)
 class Recognition:
-    """What frames of a single camera say of the take.
+    """What frames of a single camera show about the take.
 
     turn_deg     largest angle between two poses of the head before the camera
     parallax     as MIN_PARALLAX; NaN where too little of a room is seen
@@ -127,8 +127,8 @@ class Recognition:
 def with_found_cameras(
     footage: Footage, out: Path, take: str, crew: Crew
 ) -> tuple[Footage, tuple[str, ...]]:
-    """The footage of a single camera without a calibration, as that of a camera for each image
-    where it was filmed around a still head; and sentences about that.
+    """The footage of a single camera without a calibration and, if it was filmed around a still
+    head, with a camera for each image; and sentences about that.
 
     out: folder of the capture, in which what an interruption leaves is kept. take: "auto",
     "around" or "talk". Raises StgaError for a folder that is no place for a capture, and
@@ -163,7 +163,7 @@ def with_found_cameras(
 
 
 def take_of(footage: Footage, crew: Crew) -> tuple[str, str]:
-    """What was filmed, "around" a still head or else "talk"; and why, in a clause."""
+    """The kind of take, "around" a still head or else "talk"; and the reason, in a clause."""
     if footage.focal == "calibration":
         several = len(footage.cameras) >= MIN_IMAGES
         return "around" if several else "talk", f"{len(footage.cameras)} calibrated cameras"
@@ -270,7 +270,7 @@ def _chosen(camera: FootageCamera, crew: Crew) -> list[int]:
 
 
 def _require_cameras(footage: Footage, structure: Structure, count: int) -> None:
-    """Raise CamerasNotFound where these are too few, or of the room alone."""
+    """Raise CamerasNotFound where there are too few cameras, or where they show the room alone."""
     found = len(structure.timesteps)
     least = max(MIN_IMAGES, round(MIN_IMAGES_SHARE * count))
     if found < least:
@@ -318,7 +318,7 @@ def _cameras(camera: FootageCamera, structure: Structure) -> tuple[FootageCamera
 
 
 def _recognized(footage: Footage, camera: FootageCamera, crew: Crew) -> Recognition:
-    """What some of the frames say."""
+    """`Recognition` from some of the frames."""
     found = crew.helpers.run(
         recognize,
         (camera, footage.fps),
@@ -384,7 +384,7 @@ class _Sample:
 
 
 class _Look:
-    """Looks at frames of a camera for a head's pose, and for the room behind it."""
+    """Finds, in frames of a camera, a head's pose and features of the room behind it."""
 
     def __init__(self, camera: FootageCamera) -> None:
         import cv2
@@ -440,8 +440,8 @@ def _lip_gap(face: np.ndarray) -> float:
 
 
 def _parallax(pairs: Sequence[tuple[_Sample, _Sample]]) -> tuple[float, float]:
-    """`Recognition.parallax` and its correlation, of pairs of frames between which the head turns a
-    little."""
+    """`Recognition.parallax` and its correlation, from pairs of frames between which the head turns
+    a little."""
     turns = []
     moves = []
     for first, second in pairs:

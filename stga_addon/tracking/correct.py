@@ -149,7 +149,8 @@ def _are_parameters(values: np.ndarray | None, shape: tuple[int, ...]) -> bool:
 
 
 def _misfit(report: Mapping[str, Any]) -> dict[str, dict[int, float]]:
-    """Region -> timestep -> share of the images not explained, of a report that has one."""
+    """Region -> timestep -> fraction of the images that is not explained, from the report, if it
+    has one."""
     return {
         name: {int(t): float(value) for t, value in own.items()}
         for name, own in report.get("image_misfit", {}).items()
@@ -157,8 +158,8 @@ def _misfit(report: Mapping[str, Any]) -> dict[str, dict[int, float]]:
 
 
 def _trust(path: Path, report: Any, timesteps: Sequence[int]) -> np.ndarray:
-    """(T,) from 0 to 1: share of the images that the timesteps' worst regions explain, 1 where that
-    is not known; 0 without landmarks. Raises StgaError where the report says neither."""
+    """(T,) from 0 to 1: fraction of the images that is explained in the timesteps' worst regions, 1
+    where it is not known; 0 without landmarks. Raises StgaError where the report has neither."""
     without = report.get("interpolated") if isinstance(report, dict) else None
     if not isinstance(without, list) or not all(type(timestep) is int for timestep in without):
         raise StgaError(f"{path}: interpolated: expected timesteps, got {shorten(without)}")

@@ -1,4 +1,4 @@
-"""Where a detector's landmarks lie on a head model, found with the detector itself on pictures of
+"""Places of a detector's landmarks on a head model, found by running the detector on pictures of
 the model."""
 
 import math
@@ -131,8 +131,8 @@ def calibrate(
 
 
 def head_colors(model: FlameModel) -> np.ndarray:
-    """(V, 3) of the pictures: a detector needs irises to tell open eyes from closed ones, of models
-    whose eyes are closed in some."""
+    """(V, 3) colors for the pictures. A detector needs irises to distinguish open eyes from closed
+    ones on models that can close their eyes."""
     colors = np.tile(SKIN_RGB, (len(model.v_template), 1))
     for joint in EYE_JOINTS if BLINKS[0] in model.expression_names else ():
         eyeball = np.flatnonzero(model.weights[:, joint] > EYEBALL_WEIGHT)

@@ -100,8 +100,8 @@ MAX_UPPER_MISS_M = 0.01
 
 @dataclass(frozen=True)
 class DenseFit:
-    """fit; landmarks, of which those in regions that disagree are moved to the fit; how badly the
-    regions (R,) are explained at each timestep."""
+    """The fit; landmarks, moved to the fit in regions that disagree with it; and each timestep's
+    misfit by region (R,)."""
 
     fit: HeadFit
     landmarks: Mapping[int, TimestepLandmarks]
@@ -110,8 +110,8 @@ class DenseFit:
 
 @dataclass(frozen=True)
 class _Shot:
-    """What is known of a timestep: views, triangulated landmarks, where the fit so far is, and in
-    which regions of the face (R,) landmarks are the better evidence."""
+    """Data of a timestep: views, triangulated landmarks, parameters of the fit so far, and the
+    regions of the face (R,) in which landmarks are the better evidence."""
 
     views: Views
     landmarks: Observation
@@ -196,8 +196,7 @@ def _sampled_part(
 
 
 def _started_part(fit: HeadFit, take: RecordedTake, texture: Texture, step: Step) -> np.ndarray:
-    """(T, R) how badly the regions are explained in coarse images from where the fit is, at the
-    timesteps of a part."""
+    """(T, R) misfit by region in coarse images at the fit so far, for the timesteps of a part."""
     solver = _Solver(fit, take, texture)
     found = []
     for timestep in sorted(take.landmarks):
@@ -216,8 +215,8 @@ def _solved_part(
     settled: bool,
     step: Step,
 ) -> dict[str, np.ndarray]:
-    """The timesteps of a part, solved one from the other, every second one first; by name, T of
-    what `_Solved` has of each."""
+    """The timesteps of a part, each solved from the one before, every second one first; name ->
+    values of `_Solved` for T timesteps."""
     solver = _Solver(fit, take, texture, SETTLED_GAIN if settled else 0.0)
     timesteps = sorted(take.landmarks, reverse=settled)
 
@@ -309,9 +308,9 @@ class _Solver:
     def carried(
         self, shot: _Shot, before: tuple[_Shot, _Solved], after: tuple[_Shot, _Solved]
     ) -> _Solved | None:
-        """The start, moved as timesteps before and after it were moved from theirs, and a few steps
-        on; None where that is no better than the start, explains some region worse than they are
-        explained, or leaves its landmarks."""
+        """The start, moved as its neighbors were moved from their starts, after a few steps; None
+        where that is no better than the start, explains some region worse than its neighbors do, or
+        leaves its landmarks."""
         moves = [own.values - near.start for near, own in (before, after)]
         values = shot.start + np.mean(moves, axis=0)
         visible = self.head.visibility(values, shot.views)
@@ -336,8 +335,9 @@ class _Solver:
         return self.head.misfit(shot.views, visible, values, HELD_OUT_LEVEL, EVIDENCE_LEVEL)
 
     def _astray(self, shot: _Shot, values: np.ndarray, visible: np.ndarray) -> np.ndarray:
-        """(R,) bool: regions whose landmarks are missed by much more, though they are not explained
-        clearly better; and those of the upper face that went farther from them than it moves."""
+        """(R,) bool: regions whose landmarks are much farther away though the images are not
+        clearly better explained; and regions of the upper face that moved farther from their
+        landmarks than a face can."""
         both = (shot.start, values)
         astray = np.zeros(len(REGIONS), bool)
         old, new = (self._evidence(shot, own, visible).regions for own in both)
@@ -420,8 +420,8 @@ class _Solver:
 def _agreeing(
     head: DenseHead, fit: HeadFit, take: RecordedTake, missed: np.ndarray, better: np.ndarray
 ) -> dict[int, TimestepLandmarks]:
-    """The take's landmarks, moved towards the fit in regions where they miss it by more than they
-    mostly do.
+    """The take's landmarks, moved toward the fit in regions where their distance from it is larger
+    than at most timesteps.
 
     missed (T, L), better (T,): of `_Solved` at the take's timesteps.
     """

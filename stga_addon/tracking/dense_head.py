@@ -1,5 +1,5 @@
-"""The points of a person's face that dense tracking compares with images, by their texture and by
-optical flow."""
+"""Points of a person's face that dense tracking compares with images, by texture and by optical
+flow."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -75,8 +75,8 @@ def in_single_precision(model: FlameModel) -> FlameModel:
 
 @dataclass(frozen=True)
 class Misfit:
-    """How badly points are explained, from 0 to 1: over all, and by region (R,); 0 where no point
-    is seen."""
+    """Fraction in 0…1 of the images that points do not explain: of all points, and by region (R,);
+    0 where no point is visible."""
 
     all: float
     regions: np.ndarray
@@ -183,7 +183,7 @@ class DenseHead:
 
     def rest(self, take: Sequence[np.ndarray]) -> np.ndarray:
         """(T, N) weights of the timesteps' parameters for a point's texture: 1 where its region is
-        at rest, where detectors are mostly right, and low where it is moved far."""
+        at rest, where detectors are mostly right; low where it has moved far."""
         moved: Any = []
         regions, of_region = np.unique(self.region, return_inverse=True)
         for values in take:
@@ -274,8 +274,8 @@ class DenseHead:
     def flow_start(
         self, before: Views, visible: np.ndarray, values: np.ndarray, now: Views
     ) -> np.ndarray:
-        """Parameters at a timestep to which optical flow carries the head of another one, of which
-        are `before`, visible (C, N) and values."""
+        """Parameters at a timestep to which optical flow carries the head from another one, which
+        `before`, visible (C, N) and values describe."""
         start = self.positions(values, appearance.FLOW_POINTS)
         targets = list(appearance.flow_targets(start, before, now))
         rows = self.rows[appearance.FLOW_POINTS]

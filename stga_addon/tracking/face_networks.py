@@ -120,13 +120,13 @@ class FaceNetworks:
 
     def detect(self, image: np.ndarray) -> list[np.ndarray]:
         """Landmarks (478, 2) of at most two faces in an image (H, W, 3) uint8, in pixels, whose
-        centers lie at .5: of those that are large enough in the whole image."""
+        centers lie at .5. Only faces that are large enough in the whole image are found."""
         return [points[:, :2] for points in self._landmarks(image, [_whole(image)], MAX_FACES)]
 
     def find(self, image: np.ndarray, near: np.ndarray | None = None) -> list[np.ndarray]:
-        """As `detect`; where the whole image shows none, faces that are small in it, as of a person
-        two meters away: around the one that a frame before showed, landmarks `near` (N, 2), else
-        in parts of the image."""
+        """As `detect`. Where the whole image shows no face, small ones are looked for, as of a
+        person two meters away: around the landmarks `near` (N, 2) of a frame before, else in parts
+        of the image."""
         return [points[:, :2] for points in self._found(image, MAX_FACES, near)]
 
     def score(self, image: np.ndarray) -> FaceScores | None:
@@ -276,7 +276,8 @@ def _resampled(
 
 
 def _distinct(boxes: np.ndarray, shares: np.ndarray) -> list[np.ndarray]:
-    """Faces, the likeliest (M,) first, of what may be some (M, 16): center, size and six points.
+    """Distinct faces (M,), the most probable first, among candidates (M, 16): center, size and six
+    points.
 
     Boxes that overlap are one face, their mean weighted by how likely they are.
     """
@@ -307,7 +308,7 @@ def _tilt(right_eye: np.ndarray, left_eye: np.ndarray) -> float:
 
 
 def _places(image: np.ndarray, near: np.ndarray | None) -> Iterator[list[_Crop]]:
-    """Where a face is looked for, one after the other: see `FaceNetworks.find`."""
+    """Places where a face is looked for, in order: see `FaceNetworks.find`."""
     yield [_whole(image)]
     if near is not None:
         center = near.min(0) / 2 + near.max(0) / 2
@@ -321,8 +322,8 @@ def _places(image: np.ndarray, near: np.ndarray | None) -> Iterator[list[_Crop]]
 
 
 def _centers(length: int, side: float) -> np.ndarray:
-    """Of parts of that side along a length, which overlap by half of it, so that a face is whole in
-    one."""
+    """Centers of parts of that side along a length. They overlap by half, so that one of them shows
+    a face whole."""
     if length <= side:
         return np.array([length / 2])
     count = 1 + math.ceil((length - side) / (side / 2))

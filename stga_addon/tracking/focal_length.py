@@ -1,5 +1,5 @@
-"""Focal length of a single camera, from a head's landmarks and what is likely; and cameras of a rig
-that see the head larger or smaller than the others do."""
+"""Focal length of a single camera, from a head's landmarks and a prior; and cameras of a rig that
+see the head larger or smaller than the others do."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -164,7 +164,8 @@ def _turned(
 def _observed(
     head: HeadModel, places: SurfacePoints, views: Sequence[TimestepLandmarks]
 ) -> tuple[list[Observation], np.ndarray]:
-    """Landmarks in the camera's world at the head's depth, and poses (T, 18) that lead there."""
+    """Landmarks in the camera's world at the head's depth, and the poses (T, 18) that place the
+    head there."""
     neutral = places.on(head.model.v_template, head.model.faces)
     used = np.ones(len(places), bool)
     points = (head_fit.triangulated(view, used, neutral, 1.0) for view in views)
@@ -217,8 +218,9 @@ def _slope(
     observed: Sequence[Observation],
     frames: np.ndarray,
 ) -> float:
-    """Derivative of the negative log-likelihood by the logarithm of the focal length, at the best
-    fit: there it is that with a head that stays, whose image grows about the principal point."""
+    """Derivative of the negative log-likelihood by the logarithm of the focal length at the best
+    fit. There, it equals the derivative with a fixed head whose image grows about the principal
+    point."""
     points = PosedPoints(subject.model, places)
     total = 0.0
     for view, own, values in zip(views, observed, frames, strict=True):
@@ -238,8 +240,8 @@ def _slope(
 
 
 def scale_warnings(fit: HeadFit, take: RecordedTake) -> tuple[str, ...]:
-    """One sentence for each camera whose landmarks are of another size than the fitted head is
-    there: the sign of a wrong focal length. Faces seen from the side do not count."""
+    """One sentence for each camera whose landmarks differ in size from the fitted head's: the sign
+    of a wrong focal length. Faces seen from the side do not count."""
     visibility = head_fit.LandmarkVisibility(fit.head, take.places)
     used = take.reliable
     timesteps = sorted(fit.parameters)[:: 1 + len(fit.parameters) // MAX_COMPARED_TIMESTEPS]

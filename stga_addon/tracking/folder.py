@@ -1,4 +1,4 @@
-"""Files of a tracked capture's folder, and what they say of the torso."""
+"""Files of a tracked capture's folder, and what they report of the torso."""
 
 import shutil
 from collections.abc import Mapping
@@ -115,13 +115,13 @@ def is_tracked(out: Path) -> bool:
 
 
 def rounded(values: Mapping[str, Mapping[int, float]]) -> dict[str, dict[str, float]]:
-    """What the report has of values by camera or region, and timestep."""
+    """Values by camera or region, and timestep, rounded for the report."""
     return {name: {str(t): round(v, 3) for t, v in own.items()} for name, own in values.items()}
 
 
 @dataclass(frozen=True)
 class TorsoMotion:
-    """Which of MOTIONS the torso follows, and what speaks for it.
+    """The motion of MOTIONS that the torso follows, and the evidence for it.
 
     misfit    motion -> share of the points below the head, held out from fitting, that images do
               not explain
@@ -174,7 +174,7 @@ def read_torso_motion(capture: Path) -> TorsoMotion | None:
 
 @dataclass(frozen=True)
 class FocalLength:
-    """Of a single camera without calibration, in pixels.
+    """Focal length of a single camera without calibration, in pixels.
 
     source       which of FOCAL_SOURCES it is from
     interval_px  the interval that holds it with a probability of 90 %; None where it was not
@@ -207,7 +207,7 @@ def describe_focal_length(capture: Path) -> str:
 
 @dataclass(frozen=True)
 class TorsoPoints:
-    """Where the torso's surface is seen at a timestep: (N, 3) meters in the capture's world."""
+    """Visible points of the torso's surface at a timestep: (N, 3) meters in the capture's world."""
 
     timestep: int
     at: np.ndarray

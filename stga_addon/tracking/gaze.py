@@ -1,4 +1,4 @@
-"""Where a person looks: the eyes' joints, turned so that the irises are where they are seen."""
+"""Gaze: the eyes' joints, turned so that the model's irises are where the images show them."""
 
 from dataclasses import replace
 
@@ -43,8 +43,8 @@ AXES = 2
 def with_gaze(
     fit: HeadFit, take: RecordedTake, is_stranger: bool
 ) -> tuple[HeadFit, tuple[str, ...]]:
-    """The fit, its eyes turned so that the foremost points of the eyeballs are where the take's
-    landmarks have the irises; as it is where there are no eyeballs, or no landmarks of irises. And
+    """The fit with eyes turned so that the foremost points of the eyeballs are at the take's
+    landmarks of the irises; unchanged without eyeballs, or without landmarks of irises. And
     warnings, one sentence each.
 
     Beside hundreds of landmarks of skin, two of irises hardly count: eyes would turn by less than
@@ -92,8 +92,8 @@ def with_gaze(
 
 
 def _rest(turns: np.ndarray) -> np.ndarray:
-    """(2 E,) the turns of one or two eyes, the left one first, at which they look straight ahead
-    and in parallel, by all of a take (T, 2 E): their medians, as far apart as they seldom are."""
+    """(2 E,) turns of one or two eyes, the left one first, at which they look straight ahead and in
+    parallel, from all of a take (T, 2 E): their medians, as far apart as the eyes seldom are."""
     rest = np.median(turns, axis=0)
     if turns.shape[1] > AXES:
         left, right = (turns - rest)[:, 1::AXES].T

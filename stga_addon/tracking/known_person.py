@@ -26,7 +26,7 @@ BIAS_TIMESTEPS = 12
 
 @dataclass(frozen=True)
 class KnownPerson:
-    """Whom a tracked capture shows.
+    """The person whom a tracked capture shows.
 
     fit     the head, without a take's parameters
     camera  that recorded the person; None of several
@@ -40,8 +40,8 @@ class KnownPerson:
 
 
 def captured_person(capture: Capture, name: str = "") -> KnownPerson:
-    """Whose head a capture was tracked with. Raises StgaError, beginning with `name` or the
-    folder's, where it was tracked with neither FLAME nor the bundled head."""
+    """The person whose head a capture was tracked with. Raises StgaError, beginning with `name` or
+    the folder's, where it was tracked with neither FLAME nor the bundled head."""
     sequence = capture.flame
     if sequence is None:
         where = name or capture.root
@@ -54,8 +54,8 @@ def captured_person(capture: Capture, name: str = "") -> KnownPerson:
 
 
 def cameras_of(capture: Capture) -> dict[int, Camera]:
-    """By their index; where never two show one timestep, as a phone's in several takes, the first
-    take's stands for all."""
+    """Index -> camera. Where no two cameras show one timestep, as a phone's in several takes, the
+    first take's camera stands for all."""
     views = sorted(capture.all_views, key=lambda view: view.timestep)
     found = {view.camera_index: view.camera for view in views}
     if cameras_at_once(views) > 1:

@@ -1,4 +1,5 @@
-"""Footage that is about to be tracked: what of it is on disk already, and what is to be done."""
+"""Footage that is about to be tracked: which of its results are on disk already, and what is to be
+done."""
 
 import hashlib
 from collections.abc import Iterable

@@ -1,5 +1,5 @@
-"""Pictures of the head over the footage: for whoever watches the tracking, and the contact sheet of
-a tracked take, with errors of all views and the mesh drawn over the worst."""
+"""Pictures of the head over the footage, shown while it is tracked; and the contact sheet of a
+tracked take, with errors of all views and the mesh drawn over the worst."""
 
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
@@ -71,8 +71,8 @@ class PosedHead:
 def picture_of_first_frame(
     head: HeadModel, footage: Footage, detector: FaceNetworks, take: RecordedTake
 ) -> dict[str, np.ndarray] | None:
-    """The head on the first frame, within seconds; None where no face, or several, are seen. take:
-    of which landmarks are not known yet."""
+    """The head on the first frame, within seconds; None where no face, or several, are visible.
+    take: one whose landmarks are not known yet."""
     timestep = footage.timesteps[0]
     seeing = [camera for camera in footage.cameras if timestep in camera.timesteps]
     seeing = evenly_spread(seeing, FIRST_CAMERAS)

@@ -1,4 +1,4 @@
-"""What footage shows of a face: landmarks, detected or read, of a camera whose lens is known."""
+"""A face in footage: landmarks, detected or read, of a camera whose lens is known."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -86,8 +86,8 @@ def record(opened: OpenedFootage, crew: Crew) -> RecordedFootage:
 
 
 def with_focal(recorded: RecordedFootage, crew: Crew, likely: Camera | None) -> RecordedFootage:
-    """The footage of a single camera of unknown lens with a focal length that is estimated, or that
-    of `likely` where it is within the estimate's interval."""
+    """The footage of a single camera of unknown lens with a focal length that is estimated, or with
+    that of `likely` where it is within the estimate's interval."""
     footage = recorded.footage
     if footage.focal != "usual":
         return recorded
@@ -153,7 +153,7 @@ def _detected(opened: OpenedFootage, crew: Crew) -> tuple[dict[str, CameraLandma
 def _read(
     opened: OpenedFootage, landmarks: Path
 ) -> tuple[dict[str, CameraLandmarks], RecordedTake]:
-    """The landmarks of a folder; a take without landmarks yet."""
+    """The landmarks of a folder, and a take without landmarks yet."""
     footage = opened.footage
     detected = read_landmarks(footage, landmarks)
     _check_faces(footage, detected)

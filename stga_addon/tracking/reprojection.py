@@ -1,4 +1,4 @@
-"""How far landmarks lie from those of the fitted head, and cameras that do not fit the others."""
+"""Distances of landmarks from those of the fitted head, and cameras that do not fit the others."""
 
 import numpy as np
 
@@ -21,7 +21,7 @@ Errors = dict[str, dict[int, tuple[float, float]]]
 
 
 def reprojection_errors(fit: HeadFit, take: RecordedTake, footage: Footage) -> Errors:
-    """How far the landmarks of all cameras lie from those of the fitted head."""
+    """Distances of all cameras' landmarks from those of the fitted head."""
     points = PosedPoints(fit.head.model, take.places)
     errors: Errors = {camera.name: {} for camera in footage.cameras}
     for timestep, parameters in fit.parameters.items():

@@ -1,4 +1,4 @@
-"""From landmarks to a head on its torso: fitted to the landmarks, then to what images show."""
+"""From landmarks to a head on its torso: fitted to the landmarks, then to the images."""
 
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
@@ -68,7 +68,7 @@ class FittedHead:
 
 @dataclass(frozen=True)
 class SeenHead:
-    """All that a capture is written from.
+    """All data from which a capture is written.
 
     footage   with its mattes
     warnings  one sentence each
@@ -250,7 +250,7 @@ def _warnings(fitted: FittedHead) -> tuple[str, ...]:
 
 
 def _focal_warning(estimate: FocalEstimate) -> str:
-    """How well the focal length is known, and what would settle it."""
+    """A sentence about how well the focal length is known, and what would determine it."""
     turn = "" if estimate.turn_deg > ENOUGH_TURN_DEG else "a head that turns by 30°, "
     return (
         f"the focal length is an estimate: {estimate.low:.0f} to {estimate.high:.0f} px with a "

@@ -1,4 +1,4 @@
-"""Where images and masks show the surface of a fitted head."""
+"""Surface of a fitted head as images and masks show it."""
 
 import math
 from dataclasses import dataclass, replace
@@ -81,8 +81,8 @@ class Sweep:
 
 @dataclass(frozen=True)
 class SurfaceSearch:
-    """Surface points (N) that are looked for, by a sweep; near (N,) bool: of which masks may
-    tell."""
+    """Surface points (N) that are looked for, by a sweep; near (N,) bool: points near which masks
+    are evidence."""
 
     points: SurfacePoints
     near: np.ndarray
@@ -202,8 +202,8 @@ VisiblePoints = dict[tuple[int, ...], np.ndarray]
 
 @dataclass(frozen=True)
 class SeenSurface:
-    """Where cameras see N points of a surface: positions (N, 3) in meters, unit normals (N, 3) and
-    weights (N,)."""
+    """N visible points of a surface: positions (N, 3) in meters, unit normals (N, 3) and weights
+    (N,)."""
 
     position: np.ndarray
     normal: np.ndarray
@@ -273,7 +273,7 @@ def seen_surface(
 
 
 def rounded_direction(direction: np.ndarray, steps: int) -> tuple[int, ...]:
-    """A direction (3,) in so many steps: within one, a head hides the same of itself."""
+    """A direction (3,), rounded to steps within which a head hides the same parts of itself."""
     return tuple(np.round(steps * direction / np.linalg.norm(direction)).astype(int).tolist())
 
 

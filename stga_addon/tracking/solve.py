@@ -287,7 +287,7 @@ def normal_equations(
 def residuals(
     points: PosedPoints, parameters: np.ndarray, observation: Observation
 ) -> tuple[np.ndarray, np.ndarray]:
-    """What landmarks miss by at parameters (K + 18,), in LANDMARK_SIGMA_M: (N, 3), and its
+    """Differences of landmarks at parameters (K + 18,), in LANDMARK_SIGMA_M: (N, 3), and their
     derivatives (N, 3, K + 18)."""
     positions, jacobian = points.linearized(*split(parameters))
     away = positions - observation.position

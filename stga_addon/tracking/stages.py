@@ -1,4 +1,4 @@
-"""Stages of a tracking, and how they are reported."""
+"""Stages of a tracking, and their progress reports."""
 
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
@@ -100,11 +100,11 @@ Show = Callable[[Draw, Mapping[str, float]], None]
 
 
 def unreported(stage: Stage, done: int, total: int) -> None:
-    """The `ReportStage` that nobody reads."""
+    """A `ReportStage` that discards reports."""
 
 
 def unseen(draw: Draw, figures: Mapping[str, float]) -> None:
-    """The `Show` that nobody watches."""
+    """A `Show` that discards pictures."""
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""Structure from motion (pycolmap): poses and the one lens of images of a still head, without a
+"""Structure from motion (pycolmap): poses and the common lens of images of a still head, without a
 calibration.
 
 Runs in a helping process: COLMAP has threads, and cannot be interrupted.
@@ -55,7 +55,7 @@ MODELS_FOLDER = "models"
 
 @dataclass(frozen=True)
 class Structure:
-    """What structure from motion found.
+    """Result of structure from motion.
 
     timesteps   (N,) of the images that have a pose
     poses       (N, 3, 4) from the world, whose unit is free, to OpenCV's camera axes
@@ -286,9 +286,9 @@ class _Search:
         return max(found.values(), key=_observations, default=None)
 
     def _mapped_again(self, found: Any) -> Any:
-        """The model, or that which COLMAP finds from its focal length, whichever sees points more
-        often: from a focal length that is far off, images are lost or placed wrong, as are the
-        first pairs of which they see points."""
+        """The model, or the one that COLMAP finds from its focal length, whichever observes points
+        more often. From a wrong focal length, images are lost or misplaced; so are the first pairs,
+        which determine the points."""
         database = self._colmap.Database.open(self._folder / DATABASE)
         (camera,) = database.read_all_cameras()
         (known,) = found.cameras.values()
@@ -299,8 +299,8 @@ class _Search:
         return found if again is None else max(found, again, key=_observations)
 
     def _with_lens(self, model: Any) -> Any:
-        """The model after a last, robust bundle adjustment; with a radial distortion where the
-        residuals clearly ask for one."""
+        """The model after a last, robust bundle adjustment, with a radial distortion where the
+        residuals clearly require one."""
         colmap = self._colmap
         radial = colmap.Reconstruction(model)
         (camera,) = radial.cameras.values()

@@ -1,5 +1,5 @@
-"""From a head fitted to landmarks to one fitted to the skin that the cameras see, with the person's
-own offsets."""
+"""From a head fitted to landmarks to one fitted to the skin that the cameras see, with smooth
+personal offsets."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
@@ -151,8 +151,8 @@ class _Search:
 def _solved_subject(
     head: HeadModel, start: HeadFit, take: RecordedTake, points: SurfacePoints, search: _Search
 ) -> tuple[RecordedTake, HeadFit, dict[int, SeenSurface]] | None:
-    """Of `_identity`, by the skin, and by the masks' outlines where they are those of the skin; and
-    the take, without masks where they are not."""
+    """Result of `_identity` by the skin, and by the masks' outlines where these agree with the
+    skin; and the take, without masks where they do not."""
     near = near_landmarks(head, points, take)
     by_skin, by_outline = (
         [SurfaceSearch(points, near, sweep) for sweep in sweeps]
@@ -302,7 +302,7 @@ def _found_part(
 
 
 def _fitted_landmarks(fit: HeadFit, first: HeadFit, take: RecordedTake) -> dict[int, Observation]:
-    """Where the head of `first` has the landmarks at every timestep, in the world of the fit."""
+    """The landmarks of the fit `first` at every timestep, in the world of the fit."""
     points = PosedPoints(first.head.model, take.places)
     count = len(take.reliable)
     scale = fit.to_capture.scale / first.to_capture.scale

@@ -1,4 +1,5 @@
-"""The torso's motion: whether what is below the head turns with it, stays, or moves on its own.
+"""The torso's motion: whether the body below the head turns with the head, is still, or moves
+independently.
 
 Landmarks of a face cannot tell the neck's rotation from the head's, so that a tracked head and the
 ring of shoulders that its neck ends in turn as one. Here the root joint, which carries that ring,
@@ -167,8 +168,8 @@ def _followed(
 def _motions(
     take: TorsoTake, seen: torso_take.SeenPoints, some: Sequence[int], walk: torso_take.BothWays
 ) -> dict[str, Motion]:
-    """The motions that a torso may have, at some timesteps and at that of the points, whose depth
-    one of them tells first."""
+    """The possible motions of a torso, at some timesteps and at the timestep of the points, whose
+    depth is determined first by one of these motions."""
     seen = torso_take.at_depth(take, seen, {})["stereo"]
     (rough,) = _poses(walk, [_Follower(take, seen, False)], some)
     seen = torso_take.at_depth(take, seen, {"own": take.motion(rough, rigid=False)})["own"]
@@ -198,7 +199,7 @@ def _everywhere(
 def _poses(
     walk: torso_take.BothWays, followers: Sequence["_Follower"], timesteps: Iterable[int]
 ) -> list[dict[int, TorsoPose]]:
-    """For each follower, the torso's pose by timestep."""
+    """The torso's poses by timestep, for each follower."""
     found = walk.along(_Follower.follow, followers, followers[0].seen.timestep, timesteps)
     return [{timestep: TorsoPose(**arrays) for timestep, arrays in own.items()} for own in found]
 
@@ -271,7 +272,7 @@ class _Follower:
     def _by_flow(
         self, shot: torso_take.TorsoShot, before: torso_take.TorsoShot, pose: TorsoPose
     ) -> TorsoPose:
-        """The pose to which optical flow leads from `pose`, that at the timestep before."""
+        """The pose to which optical flow leads from `pose`, the pose at the timestep before."""
         old = self._posed(before.timestep, pose)
         found = pose
         views = list(before.views.values()), list(shot.views.values())

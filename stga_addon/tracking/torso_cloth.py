@@ -178,7 +178,7 @@ class Bending:
 def found_bending(
     take: TorsoTake, motion: Motion, points: TorsoPoints, some: Sequence[int], walk: BothWays
 ) -> Bending | None:
-    """How a torso with a rigid motion bends; None where images are not explained better so."""
+    """The bending of a torso with a rigid motion; None where it does not explain images better."""
     sheet = torso_sheet(take.model)
     if sheet is None:
         return None
@@ -285,7 +285,8 @@ class _Cloth:
         return {"bend": states_along(self._take, way, first, bent, step)}
 
     def misfit(self, bends: Mapping[int, np.ndarray], timesteps: Sequence[int]) -> list[float]:
-        """Share, 0 to 1, of pixels that were not fitted that is not explained: rigid, and bent."""
+        """Fraction in 0…1 of held-out pixels that is not explained: by the rigid torso, and by the
+        bent one."""
         total = np.zeros(2)
         count = 0
         rigid = np.zeros_like(self._drape)
@@ -390,7 +391,7 @@ def _solved(matrix: Any, right: np.ndarray) -> np.ndarray:
 
 
 def _missed(reference: _Reference, now: _Returned) -> tuple[np.ndarray, np.ndarray]:
-    """Pixels (P, 2) from points to where the images show them, and weights (P,), 0 to 1."""
+    """Pixels (P, 2) from points to where images show them, and weights (P,), 0 to 1."""
     import cv2
 
     opencv: Any = cv2  # whose type stubs lack DIS

@@ -55,7 +55,7 @@ UNREAD_MARKS: dict[str, tuple[str, ...]] = {
 
 
 class Program(NamedTuple):
-    """Whose calibrations are read.
+    """A program whose calibrations are read.
 
     find      those in a folder, files or folders that stand for several, the best first
     read      shots of one of them, and sentences about what it lists and is left out

@@ -1,5 +1,5 @@
-"""What recordings state beside their pixels: focal lengths in photos' EXIF and in metadata of
-QuickTime's and MP4's tracks, whose clean aperture too."""
+"""Metadata of recordings: focal lengths from photos' EXIF and from tracks of QuickTime and MP4, and
+their clean aperture."""
 
 import mmap
 import re

@@ -154,7 +154,7 @@ def sized(footage: Footage, size: float) -> Footage:
 
 
 def _no_footage(path: Path) -> str:
-    """What a path is that is neither a folder nor a video."""
+    """Description of a path that is neither a folder nor a video."""
     if not exists(path):
         return "does not exist"
     if path.suffix.lower() in IMAGE_SUFFIXES:

@@ -1,4 +1,4 @@
-"""Frames of one camera that are in a video, decoded with PyAV."""
+"""Frames of one camera from a video, decoded with PyAV."""
 
 import itertools
 from collections.abc import Iterator, Mapping, Sequence
@@ -277,7 +277,7 @@ def _square_width(frame: Any, aspect: Fraction) -> int:
 
 
 def _unheard(path: Path, frame: Any) -> list[str]:
-    """What a video asks for and does not get."""
+    """Requests of a video that are not followed."""
     sentences = []
     matrix = _display_matrix(frame)
     if matrix is not None:
@@ -314,8 +314,8 @@ def opened_video(path: Path) -> Iterator[Any]:
 
 
 def _packet_times(path: Path) -> tuple[list[int], bool]:
-    """When packets are shown, ascending, without those that an edit list hides; none where they do
-    not say it, so that all frames must be decoded. And whether the file was found to end within a
+    """Presentation times of packets, ascending, without those that an edit list hides; none where
+    packets have no times, so that all frames must be decoded. And whether the file ends within a
     packet, which is left out."""
     with opened_video(path) as container:
         stream = container.streams.video[0]
