@@ -34,7 +34,7 @@ from .errors import StgaError, shorten
 MAX_FILE_BYTES = 1 << 30
 MAX_JSON_BYTES = 256 << 20
 MAX_TOML_BYTES = 16 << 20
-STRAY_BYTES = 1 << 10
+PROBED_BYTES = 1 << 10
 DAMAGE_BYTES = 1 << 20
 WEB_PAGE = re.compile(rb"(<\?xml[^>]*>|<!--.*?-->|\s)*<(!doctype html|html|head|body)\b", re.DOTALL)
 CHANGED_LINE_ENDS = (
@@ -448,15 +448,15 @@ def read_bytes(path: Path, limit: int = MAX_FILE_BYTES) -> bytes:
         raise StgaError(f"{path}: has {size} bytes, more than the {limit} allowed")
     with naming(path, "read"):
         data = path.read_bytes()
-    if unexpected := stray_content(data):
+    if unexpected := unexpected_content(data):
         raise StgaError(f"{path}: {unexpected}")
     return data
 
 
-def stray_content(data: bytes) -> str | None:
+def unexpected_content(data: bytes) -> str | None:
     """What stands in the place of a file whose download or checkout went wrong, and what to do, to
     follow its name in a message; None where it is neither a Git LFS pointer nor a web page."""
-    start = data[:STRAY_BYTES].removeprefix(b"\xef\xbb\xbf").lstrip().lower()
+    start = data[:PROBED_BYTES].removeprefix(b"\xef\xbb\xbf").lstrip().lower()
     if start.startswith(b"version https://git-lfs.github.com/"):
         return "is a Git LFS pointer, not the file; fetch the file with git lfs pull"
     if WEB_PAGE.match(start):
@@ -710,7 +710,7 @@ def damage_of(path: Path) -> str | None:
         return None
     with naming(path, "read"), path.open("rb") as stream:
         start = stream.read(DAMAGE_BYTES)
-    return stray_content(start) or (CHANGED_LINE_ENDS if line_ends_changed(start) else None)
+    return unexpected_content(start) or (CHANGED_LINE_ENDS if line_ends_changed(start) else None)
 
 
 def _read_array(stream: IO[bytes], size: int) -> np.ndarray:
@@ -747,5 +747,4 @@ def save_npz(path: Path, arrays: dict[str, np.ndarray], compressed: bool = False
     with zipfile.ZipFile(path, "w", packing) as archive:
         for name, array in arrays.items():
             with archive.open(f"{name}.npy", "w", force_zip64=True) as out:
-                np.lib.format.write_array(out, np.asanyarray(array), allow_pickle=False)  # type:
-                ignore[no-untyped-call]
+                np.lib.format.write_array(out, np.asanyarray(array), allow_pickle=False)  # type: ignore[no-untyped-call]

@@ -46,7 +46,7 @@ QUALITIES_DB = {"Good": 30.0, "Usable": 25.0, "Rough": -math.inf}
 
 MIN_SEEN_GAIN_DB = 0.1
 """Gains that nobody sees are smaller."""
-MORE_GAIN = "what may help: Growth, which adds splats there, or footage that shows it larger"
+MORE_GAIN = "what may help: More Splats (--growth), or footage that shows it larger"
 """Advice where training a region further gains nothing visible."""
 
 

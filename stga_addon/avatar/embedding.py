@@ -120,7 +120,7 @@ def frame_backward(
     """
     force = by_frame[:, :3]
     torque = by_frame[:, 3:6]
-    growth = by_frame[:, 6]
+    enlargement = by_frame[:, 6]
     corners = (np.asarray(vertices, np.float64)[faces] - frames.origin[:, None]) @ frames.rotation
     x = corners[..., 0]
     y = corners[..., 1]
@@ -136,9 +136,9 @@ def frame_backward(
     # The first axis points from the origin to p0.
     spin = np.where(flat, 0.0, torque[:, 2] / np.where(flat, 1.0, x[:, 0]))
     pull = np.repeat(force[:, None] / 3, 3, axis=1)
-    pull[..., 0] += growth[:, None] / 2 * slope_x
+    pull[..., 0] += enlargement[:, None] / 2 * slope_x
     turn = np.array([2 / 3, -1 / 3, -1 / 3])
-    pull[..., 1] += growth[:, None] / 2 * slope_y + spin[:, None] * turn
+    pull[..., 1] += enlargement[:, None] / 2 * slope_y + spin[:, None] * turn
     pull[..., 2] += torque[:, :1] * slope_y - torque[:, 1:2] * slope_x
     pull = (pull @ frames.rotation.transpose(0, 2, 1)).reshape(-1, 3)
     return np.stack([np.bincount(faces.ravel(), column, len(vertices)) for column in pull.T], -1)

@@ -21,7 +21,7 @@ from .offsets import (
     POSITION,
     SCALE,
     SIGNALS,
-    limited_growth,
+    limited_enlargement,
     moved_frames,
     offset_of,
 )
@@ -182,7 +182,7 @@ class Avatar:
     def with_limited_offsets(self) -> "Avatar":
         """With coefficients of 0 where they do not change a triangle's splats by MIN_COLOR_CHANGE,
         MIN_SHIFT_M or a share of MIN_SCALE_CHANGE anywhere in `strain_range`, and with smaller ones
-        where they would blow splats up somewhere in it (`limited_growth`)."""
+        where they would blow splats up somewhere in it (`limited_enlargement`)."""
         basis = self._strain
         kept = {}
         if basis is None:
@@ -201,7 +201,7 @@ class Avatar:
             offset = OFFSETS[name]
             if offset.target == SCALE:
                 signals = np.stack([SIGNALS[offset.signal](basis, end) for end in ends])
-                coefficients = limited_growth(coefficients, signals, size)
+                coefficients = limited_enlargement(coefficients, signals, size)
             signal = np.abs(SIGNALS[offset.signal](basis, frames))
             change = offset_of(np.abs(coefficients), signal).max(1)
             if not signal.any():  # it does not come from the deformation

@@ -20,12 +20,12 @@ SCALE = "scale"
 COLOR = "color"
 TARGETS = (POSITION, SCALE, COLOR)
 
-MAX_GROWTH = 3.0
+MAX_ENLARGEMENT = 3.0
 """Factor by which a signal may enlarge any splat: 99 % of the triangles of one `studio_head` run
 changed their splats' size by less in filmed poses."""
-MAX_GROWN_M = 0.015
-"""Standard deviation (m) up to which a signal may enlarge a splat by more than MAX_GROWTH. A splat
-of `studio_head` would reach .2 m without this limit, costing unseen expressions .01 dB."""
+MAX_ENLARGED_M = 0.015
+"""Standard deviation (m) up to which a signal may enlarge a splat by more than MAX_ENLARGEMENT. A
+splat of `studio_head` would reach .2 m without this limit, costing unseen expressions .01 dB."""
 
 
 @dataclass(frozen=True)
@@ -66,7 +66,9 @@ def offset_of(coefficients: np.ndarray, signal: np.ndarray) -> np.ndarray:
     return np.einsum("fk,fkc->fc", signal, coefficients)
 
 
-def limited_growth(coefficients: np.ndarray, signals: np.ndarray, size: np.ndarray) -> np.ndarray:
+def limited_enlargement(
+    coefficients: np.ndarray, signals: np.ndarray, size: np.ndarray
+) -> np.ndarray:
     """Coefficients (F, S, 3) of a SCALE offset, made smaller where a pose that was never filmed
     could blow a splat up.
 
@@ -74,11 +76,11 @@ def limited_growth(coefficients: np.ndarray, signals: np.ndarray, size: np.ndarr
     others may combine all of the extremes. size (F,) meters: the largest standard deviation of a
     triangle's splats at rest.
     """
-    growth = np.maximum(*(signals * coefficients[..., 0])).sum(1)
-    limit = np.log(np.maximum(MAX_GROWTH, MAX_GROWN_M / np.maximum(size, 1e-9)))
-    return (coefficients * np.minimum(1, limit / np.maximum(growth, limit))[:, None, None]).astype(
-        coefficients.dtype
-    )
+    enlargement = np.maximum(*(signals * coefficients[..., 0])).sum(1)
+    limit = np.log(np.maximum(MAX_ENLARGEMENT, MAX_ENLARGED_M / np.maximum(size, 1e-9)))
+    return (
+        coefficients * np.minimum(1, limit / np.maximum(enlargement, limit))[:, None, None]
+    ).astype(coefficients.dtype)
 
 
 def moved_frames(

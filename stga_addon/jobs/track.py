@@ -349,14 +349,14 @@ def _with_found_cameras(
 ) -> tuple["Footage", tuple[str, ...]]:
     """As `around.with_found_cameras`; what is refused leaves nothing."""
     from ..tracking.around import with_found_cameras
-    from ..tracking.stages import Crew
+    from ..tracking.stages import Workers
 
     out = request.out
     is_new = not is_begun(out)
     try:
         with Helpers(folder=out / KEPT_FOLDER) as helpers:
-            crew = Crew(helpers, steps.report, steps.show)
-            return with_found_cameras(footage, out, request.take, crew)
+            workers = Workers(helpers, steps.report, steps.show)
+            return with_found_cameras(footage, out, request.take, workers)
     except StgaError:
         if is_new and is_begun(out):
             clear(out)
@@ -550,7 +550,7 @@ def _kinds(request: MakeAvatar, report: Report, say: Say) -> list[str]:
     which the others are none."""
     from ..tracking.around import take_of
     from ..tracking.footage.open import open_footage
-    from ..tracking.stages import Crew
+    from ..tracking.stages import Workers
 
     track = request.track
     stored = read_inputs(request.out)
@@ -566,7 +566,7 @@ def _kinds(request: MakeAvatar, report: Report, say: Say) -> list[str]:
         steps = _Steps(report)
         with Helpers() as helpers:
             for own, path in zip(opened, footage, strict=True):
-                kind, why = take_of(own, Crew(helpers, steps.report, steps.show))
+                kind, why = take_of(own, Workers(helpers, steps.report, steps.show))
                 kinds.append(kind)
                 what = "around a still head" if kind == "around" else "a head that moves"
                 say(f"take: {path.name}: {what} ({why})")

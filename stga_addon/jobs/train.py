@@ -28,7 +28,7 @@ from ..training.effect_catalog import RELIGHT, WORLD
 from ..training.run import folder as run_folder
 from ..training.run.folder import AVATAR, Continuation, Run
 from ..training.run.identity import identity_of
-from ..training.settings import MAX_GROWTH, TrainingSettings, with_budget
+from ..training.settings import MAX_ADDED_RATIO, TrainingSettings, with_budget
 
 if TYPE_CHECKING:
     from ..training.run.session import Trained
@@ -117,7 +117,7 @@ class _Continue:
         "splats to add, as a share of those on the triangles that are trained",
         0.0,
         0,
-        MAX_GROWTH,
+        MAX_ADDED_RATIO,
         metavar="SHARE",
     )
     seconds: float | None = like(TrainingSettings, "seconds", help="training time")

@@ -199,7 +199,7 @@ class Relighter:
         self, mesh: np.ndarray, eye: np.ndarray, lighting: Lighting, casters: Sequence[Caster]
     ) -> np.ndarray:
         vertex_normal = vertex_normals(mesh, self.avatar.faces)
-        distant, likeness = self.distant_in_head(mesh, lighting)
+        distant, kept = self.distant_in_head(mesh, lighting)
         world = distant[:, :3]
         casters = (*casters, *self.lash_casters(mesh, lighting))
         lamps = Lamps(lighting, mesh, self.avatar.faces, casters)
@@ -231,9 +231,9 @@ class Relighter:
         albedo = self.albedo if color is self.diffuse_color else self._albedo(color)
         lit = albedo * arriving * np.float32(1 / np.pi)
         lit += np.float32(lighting.specular) * highlight
-        if likeness.share > 0:
-            same = np.asarray(likeness.gain, np.float32) * self._recorded(mesh, eye)
-            lit += kept_shares(likeness, arriving, self.irradiance)[:, None] * (same - lit)
+        if kept.share > 0:
+            same = np.asarray(kept.gain, np.float32) * self._recorded(mesh, eye)
+            lit += kept_shares(kept, arriving, self.irradiance)[:, None] * (same - lit)
         return lit
 
     def _albedo(self, color: np.ndarray) -> np.ndarray:

@@ -22,14 +22,14 @@ from . import folder
 from .face_networks import FaceNetworks, PersonNetwork
 from .fit import pose_from_one_camera
 from .footage.model import Footage, FootageCamera, ImageFrames
-from .footage.open import usual_focal
+from .footage.open import typical_focal
 from .footage.shots import listed
 from .footage.video import VideoFrames
 from .landmarks import read_places
 from .opened import check_place, file_state
 from .recorded import BUNDLED_PLACES
 from .sharp_frames import choose_frames, reduced_to
-from .stages import Crew, Stage
+from .stages import Stage, Workers
 from .structure_from_motion import SearchOptions, Structure, find_structure
 
 MAX_PHOTOS = 60
@@ -64,7 +64,7 @@ MAX_AXIS_COSINE = -0.1
 face that is visible."""
 PAIR_S = 0.5
 """Time between the two frames of a video in which the room is compared."""
-USUAL_FPS = 30.0
+TYPICAL_FPS = 30.0
 """Frames per second where a take does not say."""
 PAIR_TURN_DEG = 1.0, 25.0
 """Turns of the head between two frames that are compared."""
@@ -125,7 +125,7 @@ class Recognition:
 
 
 def with_found_cameras(
-    footage: Footage, out: Path, take: str, crew: Crew
+    footage: Footage, out: Path, take: str, workers: Workers
 ) -> tuple[Footage, tuple[str, ...]]:
     """The footage of a single camera without a calibration and, if it was filmed around a still
     head, with a camera for each image; and sentences about that.
@@ -144,15 +144,15 @@ def with_found_cameras(
             raise CamerasNotFound(
                 f"{footage.root}: --take around: has {count} images, expected at least {MIN_IMAGES}"
             )
-        found, line = _with_cameras(footage, out, crew)
+        found, line = _with_cameras(footage, out, workers)
         return found, (f"take: around a still head, as given; {line}",)
-    kind, why = take_of(footage, crew)
+    kind, why = take_of(footage, workers)
     if kind == "talk":
         return footage, (
             f"take: a head that moves before a camera ({why}; else give --take around)",
         )
     try:
-        found, line = _with_cameras(footage, out, crew)
+        found, line = _with_cameras(footage, out, workers)
     except StgaError as error:
         warning = (
             f"take: looks like one around a still head, but {error}. It is tracked as one of a "
@@ -162,7 +162,7 @@ def with_found_cameras(
     return found, (f"take: around a still head ({why}; else give --take talk); {line}",)
 
 
-def take_of(footage: Footage, crew: Crew) -> tuple[str, str]:
+def take_of(footage: Footage, workers: Workers) -> tuple[str, str]:
     """The kind of take, "around" a still head or else "talk"; and the reason, in a clause."""
     if footage.focal == "calibration":
         several = len(footage.cameras) >= MIN_IMAGES
@@ -171,7 +171,7 @@ def take_of(footage: Footage, crew: Crew) -> tuple[str, str]:
     count = len(camera.timesteps)
     if count < MIN_IMAGES:
         return "talk", f"{count} images"
-    seen = _recognized(footage, camera, crew)
+    seen = _recognized(footage, camera, workers)
     photos = isinstance(camera.frames, ImageFrames) and count <= MAX_PHOTOS
     is_plain = photos and seen.turns and bool(np.isnan(seen.parallax))
     plain_photos = is_plain and seen.lip_change <= MAX_LIP_CHANGE
@@ -185,7 +185,7 @@ def take_of(footage: Footage, crew: Crew) -> tuple[str, str]:
     return "talk", why + (", but the room does not move with it" if seen.turns else "")
 
 
-def _with_cameras(footage: Footage, out: Path, crew: Crew) -> tuple[Footage, str]:
+def _with_cameras(footage: Footage, out: Path, workers: Workers) -> tuple[Footage, str]:
     """The footage with a camera for each image, and a line on these. Raises CamerasNotFound."""
     (camera,) = footage.cameras
     if find_spec("pycolmap") is None:
@@ -193,7 +193,7 @@ def _with_cameras(footage: Footage, out: Path, crew: Crew) -> tuple[Footage, str
             f"{footage.root}: finding cameras needs the package pycolmap, which this Python lacks; "
             "install it, or give --cameras"
         )
-    timesteps = _chosen(camera, crew)
+    timesteps = _chosen(camera, workers)
     given = footage.focal != "usual"
     focal = camera.camera.fl_x if given else None
     threads = min(processors(), MAX_THREADS)
@@ -203,8 +203,8 @@ def _with_cameras(footage: Footage, out: Path, crew: Crew) -> tuple[Footage, str
     scratch = out / folder.KEPT_FOLDER / f"structure-{file_state(camera.frames.files)}"
     part = (camera, timesteps, options, scratch)
     stages = [(stage, len(timesteps)) for stage in _SEARCH_STAGES]
-    report = _Stages(crew, stages, footage)
-    found = crew.helpers.run(find_structure, part, report, keep=True, apart=True)
+    report = _Stages(workers, stages, footage)
+    found = workers.helpers.run(find_structure, part, report, keep=True, apart=True)
     structure = Structure.of_arrays(found)
     _require_cameras(footage, structure, len(timesteps))
     cameras = _cameras(camera, structure)
@@ -232,8 +232,10 @@ class _Stages:
     """Reports the steps of work that has several stages, as (stage, steps), one after another.
     Raises CamerasNotFound beyond TIME_LIMIT_S."""
 
-    def __init__(self, crew: Crew, stages: Sequence[tuple[Stage, int]], footage: Footage) -> None:
-        self._crew = crew
+    def __init__(
+        self, workers: Workers, stages: Sequence[tuple[Stage, int]], footage: Footage
+    ) -> None:
+        self._workers = workers
         self._stages = stages
         self._root = footage.root
         self._end = monotonic() + TIME_LIMIT_S
@@ -246,24 +248,24 @@ class _Stages:
             )
         for stage, total in self._stages[:-1]:
             if steps < total:
-                self._crew.report(stage, steps, total)
+                self._workers.report(stage, steps, total)
                 return
             steps -= total
         stage, total = self._stages[-1]
-        self._crew.report(stage, min(steps, total), total)
+        self._workers.report(stage, min(steps, total), total)
 
 
-def _chosen(camera: FootageCamera, crew: Crew) -> list[int]:
+def _chosen(camera: FootageCamera, workers: Workers) -> list[int]:
     """Timesteps whose images get a camera."""
     timesteps = list(camera.timesteps)
     limit = MAX_PHOTOS if isinstance(camera.frames, ImageFrames) else FRAMES
     if len(timesteps) <= limit:
         return timesteps
     total = len(timesteps)
-    found = crew.helpers.run(
+    found = workers.helpers.run(
         choose_frames,
         (camera, timesteps, FRAMES),
-        lambda steps: crew.report(Stage.FRAMES, steps, total),
+        lambda steps: workers.report(Stage.FRAMES, steps, total),
     )
     chosen: list[int] = found["timesteps"].tolist()
     return chosen
@@ -317,12 +319,12 @@ def _cameras(camera: FootageCamera, structure: Structure) -> tuple[FootageCamera
 # Recognition
 
 
-def _recognized(footage: Footage, camera: FootageCamera, crew: Crew) -> Recognition:
+def _recognized(footage: Footage, camera: FootageCamera, workers: Workers) -> Recognition:
     """`Recognition` from some of the frames."""
-    found = crew.helpers.run(
+    found = workers.helpers.run(
         recognize,
         (camera, footage.fps),
-        lambda steps: crew.report(Stage.OPENING, steps, SAMPLES),
+        lambda steps: workers.report(Stage.OPENING, steps, SAMPLES),
     )
     return Recognition(*found["recognition"].tolist())
 
@@ -345,7 +347,7 @@ def recognize(camera: FootageCamera, fps: float | None, step: Step) -> dict[str,
     pairs = []
     if turn >= MIN_TURN_DEG:
         photos = isinstance(camera.frames, ImageFrames) and len(timesteps) <= MAX_PHOTOS
-        ahead = 1 if photos else max(1, round(PAIR_S * (fps or USUAL_FPS)))
+        ahead = 1 if photos else max(1, round(PAIR_S * (fps or TYPICAL_FPS)))
         for number, sample in samples.items():
             other = min(number + ahead, len(timesteps) - 1)
             later = look.at(timesteps[other]) if other != number else None
@@ -410,7 +412,7 @@ class _Look:
             return None
         face = self._near = faces[0]
         height, width = image.shape[:2]
-        focal = usual_focal(width, height)
+        focal = typical_focal(width, height)
         size = width, height
         lens = Camera(*size, focal, focal, width / 2, height / 2, np.eye(4))
         posed = pose_from_one_camera(lens, face[self._rows], self._neutral)

@@ -27,7 +27,7 @@ from .fit import (
 )
 from .posed_points import split
 from .solve import Observation, acceleration_precision, normal_equations, prior_terms, smoothed
-from .stages import Crew, Stage
+from .stages import Stage, Workers
 
 MIN_TIMESTEPS = 6
 """Least number of timesteps: an average texture of fewer is no evidence of how timesteps differ."""
@@ -135,7 +135,7 @@ class _Solved:
 
 
 def fit_dense(
-    fit: HeadFit, take: RecordedTake, crew: Crew, settled: bool = False
+    fit: HeadFit, take: RecordedTake, workers: Workers, settled: bool = False
 ) -> DenseFit | None:
     """Expression and pose of every timestep from the images; None where the take is too short for
     it.
@@ -161,7 +161,7 @@ def fit_dense(
         work: Callable[..., Any], parts: Sequence[tuple], before: int, keep: bool = False
     ) -> list:
         every = [(*excerpt(fit, take, part), *arguments) for part, *arguments in parts]
-        return crew.map(work, every, (stage, before, total), keep)
+        return workers.map(work, every, (stage, before, total), keep)
 
     weights = head.rest([fit.parameters[t] for t in chosen])
     weights = np.maximum(weights, SETTLED_WEIGHT if settled else 0)

@@ -86,7 +86,7 @@ def estimated_focal(
     head: HeadModel, take: RecordedTake, step: Step = lambda: None
 ) -> FocalEstimate:
     """Focal length of the only camera of `take`, whose own is that of a phone
-    (`open.usual_focal`).
+    (`open.typical_focal`).
 
     A quantile of its posterior. The likelihood is that of landmarks of the most differently turned
     timesteps, under the best fit of the head for each focal length; the prior knows the angle of

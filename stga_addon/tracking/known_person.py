@@ -15,7 +15,7 @@ from .face_networks import FaceNetworks
 from .fit import ROUNDS, HeadFit, RecordedTake, fit_head, posed_mesh
 from .head_model import HeadModel
 from .posed_points import PosedPoints, face_size, split
-from .stages import Crew, Stage
+from .stages import Stage, Workers
 
 BIAS_ROUNDS = 3
 """Rounds in which the networks' bias is measured, each on heads fitted without that of the round
@@ -63,7 +63,7 @@ def cameras_of(capture: Capture) -> dict[int, Camera]:
     return {view.camera_index: found[view.camera_index] for view in views[:1]}
 
 
-def without_own_bias(take: RecordedTake, person: KnownPerson, crew: Crew) -> RecordedTake:
+def without_own_bias(take: RecordedTake, person: KnownPerson, workers: Workers) -> RecordedTake:
     """The take, each camera's landmarks corrected by the networks' bias: how far, in the median,
     they are off in pictures of the avatar, drawn with fitted heads as the camera sees them.
 
@@ -79,7 +79,9 @@ def without_own_bias(take: RecordedTake, person: KnownPerson, crew: Crew) -> Rec
     for _ in range(BIAS_ROUNDS):
         part = replace(corrected, landmarks={t: corrected.landmarks[t] for t in some})
         work = fit_head, (person.fit.head, part)
-        fit: HeadFit = crew.helpers.run(*work, lambda steps: crew.report(Stage.FIT, 0, ROUNDS))
+        fit: HeadFit = workers.helpers.run(
+            *work, lambda steps: workers.report(Stage.FIT, 0, ROUNDS)
+        )
         points = PosedPoints(fit.head.model, take.places)
         shares: dict[str, list[np.ndarray]] = {}
         for timestep, values in fit.parameters.items():

@@ -18,7 +18,7 @@ from .fit import MIN_LANDMARKS
 from .folder import PLACES_FILE
 from .footage.model import Footage, FootageCamera
 from .posed_points import SurfacePoints
-from .stages import Crew, Stage
+from .stages import Stage, Workers
 
 MIN_BARYCENTRIC = -1e-3
 """Least barycentric coordinate of a landmark's place."""
@@ -63,7 +63,7 @@ def detect_landmarks(
     detector: FaceNetworks,
     unbiased: Callable[[np.ndarray, Camera], np.ndarray],
     folder: Path,
-    crew: Crew,
+    workers: Workers,
 ) -> dict[str, CameraLandmarks]:
     """Landmarks by camera; each camera's are written to `folder`, and read from there where they
     are already.
@@ -84,7 +84,7 @@ def detect_landmarks(
             parts = [(camera, part, detector) for part in parts_of(camera.timesteps, limit)]
             seen = [
                 faces
-                for part in crew.map(_detect, parts, (Stage.LANDMARKS, done, total))
+                for part in workers.map(_detect, parts, (Stage.LANDMARKS, done, total))
                 for faces in part
             ]
             several = [t for t, own in zip(camera.timesteps, seen, strict=True) if len(own) > 1]
@@ -108,7 +108,7 @@ def detect_landmarks(
         # in the file's precision, whether it was detected now or before
         found[camera.name] = read_camera(path, camera)
         done += len(camera.timesteps)
-        crew.report(Stage.LANDMARKS, done, total)
+        workers.report(Stage.LANDMARKS, done, total)
     if len(crowded) > MAX_TWO_FACES_SHARE * total:
         camera, timestep = crowded[0]
         raise StgaError(

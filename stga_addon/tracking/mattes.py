@@ -24,7 +24,7 @@ from .appearance import box_of, mean_around, reduced
 from .face_networks import PersonNetwork
 from .folder import MATTES_FILE, mask_name
 from .footage.model import Footage, FootageCamera, write_png
-from .stages import Crew, Stage
+from .stages import Stage, Workers
 
 PART_TIMESTEPS = 24
 """Timesteps of a camera that are worked on at once, at most."""
@@ -100,7 +100,7 @@ def with_mattes(
     head_pixels: HeadPixels,
     out: Path,
     source: dict[str, Any],
-    crew: Crew,
+    workers: Workers,
 ) -> tuple[Footage, tuple[str, ...]]:
     """The footage with a mask for every frame, and warnings.
 
@@ -127,9 +127,9 @@ def with_mattes(
             warnings.append(_bar_warning(camera, bars))
         work = [(camera, bars, {t: files[t] for t in part}, head_pixels) for part in parts]
         done += len(kept)
-        found = crew.map(_write_mattes, work, (Stage.MATTES, done, total))
+        found = workers.map(_write_mattes, work, (Stage.MATTES, done, total))
         done += len(left)
-        crew.report(Stage.MATTES, done, total)
+        workers.report(Stage.MATTES, done, total)
         known = {t: is_seen for part in found for t, is_seen in part.items()}
         unseen += [f"{camera.name} at timestep {t}" for t in left if not known.get(t, True)]
         mattes = {t: file for t, file in files.items() if t in kept or t in known}

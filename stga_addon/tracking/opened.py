@@ -39,7 +39,7 @@ class TrackingOptions:
     person: KnownPerson | None = None
 
 
-USUAL_OPTIONS = TrackingOptions()
+DEFAULT_OPTIONS = TrackingOptions()
 
 
 @dataclass(frozen=True)

@@ -28,7 +28,7 @@ from .landmarks import (
 )
 from .opened import OpenedFootage, begin_landmarks
 from .pictures import picture_of_first_frame
-from .stages import Crew, Stage
+from .stages import Stage, Workers
 
 BUNDLED_PLACES = Path(__file__).parent / "networks/bundled_head_places.npz"
 """Landmarks on the bundled head, as `calibrate` finds them; made by
@@ -65,11 +65,11 @@ class RecordedFootage:
         return [name for name in self.detected if name not in sees]
 
 
-def record(opened: OpenedFootage, crew: Crew) -> RecordedFootage:
+def record(opened: OpenedFootage, workers: Workers) -> RecordedFootage:
     """The landmarks of the networks, kept in the capture's folder, or those of the options' folder.
     Raises StgaError where there are too few, and an interruption leaves what is detected."""
     given = opened.options.landmarks
-    detected, take = _detected(opened, crew) if given is None else _read(opened, given)
+    detected, take = _detected(opened, workers) if given is None else _read(opened, given)
     check_count(detected, take.places)
     neutral = _neutral(opened, take)
     if np.ptp(neutral[take.reliable], axis=0).max() < head_fit.MIN_FACE_M:
@@ -85,18 +85,20 @@ def record(opened: OpenedFootage, crew: Crew) -> RecordedFootage:
     return found
 
 
-def with_focal(recorded: RecordedFootage, crew: Crew, likely: Camera | None) -> RecordedFootage:
+def with_focal(
+    recorded: RecordedFootage, workers: Workers, likely: Camera | None
+) -> RecordedFootage:
     """The footage of a single camera of unknown lens with a focal length that is estimated, or with
     that of `likely` where it is within the estimate's interval."""
     footage = recorded.footage
     if footage.focal != "usual":
         return recorded
-    crew.report(Stage.FOCAL_LENGTH, 0, len(RATIOS))
+    workers.report(Stage.FOCAL_LENGTH, 0, len(RATIOS))
     (camera,) = footage.cameras
-    estimate: FocalEstimate = crew.helpers.run(
+    estimate: FocalEstimate = workers.helpers.run(
         estimated_focal,
         (recorded.opened.head, recorded.take),
-        lambda steps: crew.report(Stage.FOCAL_LENGTH, steps, len(RATIOS)),
+        lambda steps: workers.report(Stage.FOCAL_LENGTH, steps, len(RATIOS)),
     )
     pixels = estimate.pixels
     source = "estimated"
@@ -119,13 +121,15 @@ def in_world(recorded: RecordedFootage) -> RecordedFootage:
     return replace(recorded, take=replace(recorded.take, metric=metric))
 
 
-def _detected(opened: OpenedFootage, crew: Crew) -> tuple[dict[str, CameraLandmarks], RecordedTake]:
+def _detected(
+    opened: OpenedFootage, workers: Workers
+) -> tuple[dict[str, CameraLandmarks], RecordedTake]:
     """Where the networks find landmarks, kept in the folder; a take without landmarks yet."""
     out = opened.out
     footage = opened.footage
     is_begun = folder.is_begun(out)
     detector = FaceNetworks()
-    crew.report(Stage.HEAD_MODEL, 0, 1)
+    workers.report(Stage.HEAD_MODEL, 0, 1)
     model = opened.head.model
     if opened.head_file is None and opened.options.person is None:
         places, reliable = read_places(BUNDLED_PLACES, len(model.faces))
@@ -135,16 +139,16 @@ def _detected(opened: OpenedFootage, crew: Crew) -> tuple[dict[str, CameraLandma
     kept = out / folder.LANDMARKS_FOLDER
     write_places(kept / folder.PLACES_FILE, places, reliable)
     take = RecordedTake(places, reliable, {})
-    crew.show(partial(picture_of_first_frame, opened.head, footage, detector, take), {})
+    workers.show(partial(picture_of_first_frame, opened.head, footage, detector, take), {})
     try:
         neutral = places.on(model.v_template, model.faces)
         unbiased = partial(without_bias, neutral=neutral, reliable=reliable)
-        detected = detect_landmarks(footage, detector, unbiased, kept, crew)
+        detected = detect_landmarks(footage, detector, unbiased, kept, workers)
         _check_faces(footage, detected)
         _check_share(footage, detected)
     except StgaError:
         if not is_begun:  # what it holds is of no use for other footage
-            crew.helpers.end()  # which may be writing frames
+            workers.helpers.end()  # which may be writing frames
             folder.clear(out)
         raise
     return detected, take

@@ -12,7 +12,7 @@ OUTLIER_FACTOR = 4.0
 others."""
 MIN_OUTLIER_SHARE = 0.03
 """And by this fraction of the face's size."""
-MAX_USUAL_SHARE = 0.04
+MAX_MEDIAN_ERROR = 0.04
 """Median over the cameras, beyond which they do not see one head: up to 0.016 on sound footage; the
 demo's gives 0.06 where no camera is in step with another, and 0.2 mirrored."""
 
@@ -70,7 +70,7 @@ def check_cameras(errors: Errors) -> None:
                 f"{at_worst(name)}, far more than those of the other cameras; "
                 "check its calibration, synchronization and mirroring"
             )
-    if len(share) > 1 and float(np.median(list(share.values()))) > MAX_USUAL_SHARE:
+    if len(share) > 1 and float(np.median(list(share.values()))) > MAX_MEDIAN_ERROR:
         raise StgaError(
             f"{at_worst(max(share, key=share.__getitem__))}, and those of the other cameras are "
             "too; check the calibration, and whether all are synchronized and none mirrored"

@@ -108,7 +108,7 @@ def unseen(draw: Draw, figures: Mapping[str, float]) -> None:
 
 
 @dataclass(frozen=True)
-class Crew:
+class Workers:
     """Who works on the stages of a tracking, and who is shown it."""
 
     helpers: Helpers

@@ -27,7 +27,7 @@ from .seen_surface import (
     surface_points,
 )
 from .solve import LANDMARK_SIGMA_M, Observation, person, solve_identity, solve_take
-from .stages import Crew, Stage
+from .stages import Stage, Workers
 
 IDENTITY_SWEEPS = (
     Sweep(0.010, 0.001, 0.0015),
@@ -78,7 +78,7 @@ def fit_surface(
     head: HeadModel,
     fit: HeadFit,
     take: RecordedTake,
-    crew: Crew,
+    workers: Workers,
     dense: bool = False,
 ) -> HeadFit:
     """The fit moved onto the surface that several cameras see; unchanged where no timestep has
@@ -105,7 +105,7 @@ def fit_surface(
     take = replace(take, landmarks=visible)
     points = surface_points(head, SURFACE_POINTS)
     early = (len(IDENTITY_SWEEPS) + len(OUTLINE_SWEEPS)) * len(chosen)
-    search = _Search(crew, early + len(timesteps))
+    search = _Search(workers, early + len(timesteps))
     start = replace(fit, parameters={t: fit.parameters[t] for t in chosen})
     solved = _solved_subject(head, start, take, points, search)
     if solved is None:
@@ -135,15 +135,15 @@ class _Search:
     """Parts of a search for the surface, worked on at once by helping processes, and reported as
     so many timesteps of `total`."""
 
-    def __init__(self, crew: Crew, total: int) -> None:
+    def __init__(self, workers: Workers, total: int) -> None:
         self.done = 0
-        self._crew = crew
+        self._workers = workers
         self._total = total
 
     def __call__(self, work: Callable[..., list], parts: Sequence[tuple]) -> list:
         """The results of the parts' timesteps, in order."""
         at = Stage.SURFACE, self.done, self._total
-        found = [one for result in self._crew.map(work, parts, at) for one in result]
+        found = [one for result in self._workers.map(work, parts, at) for one in result]
         self.done += len(found)
         return found
 

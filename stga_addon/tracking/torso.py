@@ -23,7 +23,7 @@ from .appearance import NOISE_LEVELS, flow_weights, point_weights, projection_de
 from .fit import HeadFit, posed_mesh
 from .folder import TorsoMotion, TorsoPoints
 from .footage.model import Footage
-from .stages import Crew, Stage
+from .stages import Stage, Workers
 from .surface import with_offset
 from .torso_cloth import Bending, found_bending
 from .torso_take import NECK, Motion, PosedTorso, TorsoPose, TorsoTake, axis_angle, head_turn
@@ -90,7 +90,7 @@ def follow_torso(
     fit: HeadFit,
     parameters: Mapping[int, np.ndarray],
     footage: Footage,
-    crew: Crew,
+    workers: Workers,
     bends: bool = True,
 ) -> FollowedTorso:
     """The torso's motion in a take of heads whose parameters (E + 18,) are given by timestep.
@@ -117,7 +117,7 @@ def follow_torso(
     seen = torso_take.seen_points(take, middle)
     if sum(map(len, seen.rows.values())) < MIN_POINTS:
         return FollowedTorso(fit, unchanged)
-    walk = torso_take.BothWays(crew, Stage.TORSO, 3 * len(some) + len(unchanged))
+    walk = torso_take.BothWays(workers, Stage.TORSO, 3 * len(some) + len(unchanged))
     motions = _motions(take, seen, some, walk)
     deep = torso_take.at_depth(take, seen, motions)
     found = torso_take.compared(take, deep, motions, some)
@@ -134,7 +134,7 @@ def follow_torso(
     points = TorsoPoints(middle, deep[name].at)
     bending = None
     if bends and name == "shifted":
-        walk = torso_take.BothWays(crew, Stage.CLOTH, len(unchanged))
+        walk = torso_take.BothWays(workers, Stage.CLOTH, len(unchanged))
         bending = found_bending(take, posed, points, some, walk)
     return replace(_followed(fit, take, posed, bending, decided), points=points)
 

@@ -21,7 +21,7 @@ from .appearance import NOISE_LEVELS, PyramidView, inside, sampled, unexplained
 from .fit import HeadFit, posed_mesh
 from .footage.model import FootageCamera
 from .posed_points import PosedPoints, SurfacePoints, head_rotation, split
-from .stages import Crew, Stage
+from .stages import Stage, Workers
 
 ROOT = JOINTS.index("root")
 NECK = JOINTS.index("neck")
@@ -226,8 +226,8 @@ def masked(image: np.ndarray, mask: np.ndarray) -> np.ndarray:
 class BothWays:
     """Work along a take, from one timestep to both ends, by helping processes, each on a way."""
 
-    def __init__(self, crew: Crew, stage: Stage, total: int) -> None:
-        self._crew = crew
+    def __init__(self, workers: Workers, stage: Stage, total: int) -> None:
+        self._workers = workers
         self._stage = stage
         self._done = 0
         self._total = total
@@ -239,7 +239,7 @@ class BothWays:
         later = [first, *sorted(t for t in timesteps if t > first)]
         earlier = [first, *sorted((t for t in timesteps if t < first), reverse=True)]
         every = [(own, way) for own in who for way in (later, earlier)]
-        found = self._crew.map(follow, every, (self._stage, self._done, self._total), keep=True)
+        found = self._workers.map(follow, every, (self._stage, self._done, self._total), keep=True)
         self._done += len(who) * (len(later) + len(earlier) - 2)
         results: list[dict[int, Rows]] = [{} for _ in who]
         for number, ((_, way), own) in enumerate(zip(every, found, strict=True)):

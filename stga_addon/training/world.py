@@ -42,7 +42,7 @@ SAMPLED_POINTS = 4000
 MIN_SHARED = 0.1
 """Fraction of the sampled pixels that another plate must contain for a shell to tell the world's
 distance."""
-MIN_LIKENESS = 0.3
+MIN_SIMILARITY = 0.3
 """Correlation of what both plates show there at least."""
 DETAIL_SHARES = 0.003, 0.03
 """Filters between which lie the details that plates are compared by; of the image's height."""
@@ -194,12 +194,12 @@ def shell_radius(plates: Sequence[CleanPlate], center: np.ndarray) -> float:
         details.append(fine - coarse)
     distance = np.median([np.linalg.norm(plate.camera.position - center) for plate in plates])
     radii = distance * np.geomspace(NEAREST_RADIUS, FARTHEST_RADIUS, RADII)
-    likeness = [_likeness(plates, details, center, radius) for radius in radii]
-    best = int(np.argmax(likeness))
-    return float(radii[best] if likeness[best] > MIN_LIKENESS else DEFAULT_RADIUS * distance)
+    similarity = [_similarity(plates, details, center, radius) for radius in radii]
+    best = int(np.argmax(similarity))
+    return float(radii[best] if similarity[best] > MIN_SIMILARITY else DEFAULT_RADIUS * distance)
 
 
-def _likeness(
+def _similarity(
     plates: Sequence[CleanPlate], details: Sequence[np.ndarray], center: np.ndarray, radius: float
 ) -> float:
     """Correlation of plates at the same points of a shell; 0 where they share too few."""

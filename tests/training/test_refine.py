@@ -39,7 +39,7 @@ ITERATIONS = 16
 
 @pytest.fixture(scope="module")
 def finished(toy, tmp_path_factory):
-    """With strain color, density control and hull points; the avatar is the last state's."""
+    """With strain color, density control and visual-hull points; the avatar is the last state's."""
     out = tmp_path_factory.mktemp("finished") / "run"
     without_held_out = replace(toy, views={"train": toy.views["train"]})
     run = run_of(

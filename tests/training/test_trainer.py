@@ -165,7 +165,7 @@ def test_outlier_resets_and_density_control_come_when_due(toy):
 
 
 def test_initial_splats_with_hull_points(tmp_path):
-    """Catches hull points mixed up with the lattice, which would escape its limits."""
+    """Catches visual-hull points mixed up with the lattice, which would escape its limits."""
     hairy = open_capture(factory.write_mesh_capture(tmp_path / "hairy"))
     rows, columns = np.mgrid[: factory.HEIGHT, : factory.WIDTH] + 0.5
     mask = np.hypot(columns - factory.CX, rows - factory.CY) < 29  # the ball itself: 20 pixels

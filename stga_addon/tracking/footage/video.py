@@ -372,8 +372,7 @@ def _from_key_frame(frames: Iterator[Any], time: int) -> Iterator[Any]:
 
 
 def _ascending(times: Sequence[int | None]) -> bool:
-    return None not in times and all(a < b for a, b in itertools.pairwise(times))  # type:
-    ignore[operator]
+    return None not in times and all(a < b for a, b in itertools.pairwise(times))  # type: ignore[operator]
 
 
 def _is_of(container: Any, formats: Sequence[str]) -> bool:

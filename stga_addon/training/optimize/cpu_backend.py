@@ -199,10 +199,10 @@ class CpuBackend:
                 more = offset_of(offset.value, store.signals(timestep)(signal))
                 change[target] = change[target] + more
         # around the mesh's own origins, in the unit of the scaled frames
-        growth = np.exp(change[SCALE][:, :1].astype(np.float64))
-        shift = (change[POSITION] / growth).astype(np.float32)
+        factor = np.exp(change[SCALE][:, :1].astype(np.float64))
+        shift = (change[POSITION] / factor).astype(np.float32)
         splats = splats._replace(xyz=splats.xyz + shift[face])
-        scaled = replace(frames, scale=frames.scale * growth[:, 0])
+        scaled = replace(frames, scale=frames.scale * factor[:, 0])
         moved = self._moved_frames(timestep)
         total = 0.0
         by_frame = np.zeros((len(frames.scale), 7))

@@ -33,8 +33,8 @@ class DensityControl:
                    (Kerbl et al. 2023), 200 with the paper's settings
     span           shares of the budget from and before which it works; default (0.1, 0.6)
     split_share    largest share of the splats that is split at a time; default 0.2, ours
-    growth         most splats that are added, as a share of the whole lattice and the hull points;
-                   default 0.25, ours
+    growth         most splats that are added, as a share of the whole lattice and the visual-hull
+                   points; default 0.25, ours
     seed           of the halves' distances
     region_share   `split_share` where a region is trained, as in a refinement, which has few turns
     min_opacity    0…1, below which splats are pruned; ours, 0.005 in 3D Gaussian

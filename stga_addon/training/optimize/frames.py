@@ -57,7 +57,7 @@ class FrameStore:
     neutral   face frames of the neutral mesh
     units     (F,) float32: the length that a triangle's limits are multiples of, in local units
     unit_lengths  (F,) meters of the neutral mesh that are a triangle's local unit
-    voxel     meters between hull points
+    voxel     meters between visual-hull points
     surface   what training views tell of the triangles
     """
 
@@ -98,7 +98,7 @@ class FrameStore:
         limits[0] = np.maximum(limits[0], self.hair_layer_scale)
         return np.asarray(limits, np.float32)
 
-    def stray_limits(self, settings: TrainingSettings) -> np.ndarray:
+    def outlier_limits(self, settings: TrainingSettings) -> np.ndarray:
         """How far (F,) float32 bound splats may lie from the middle of their triangle, in local
         units: on the scalp as far as hair reaches."""
         share = np.where(self.surface.border, BORDER_DISTANCE_SHARE, 1.0)

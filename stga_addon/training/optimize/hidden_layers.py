@@ -104,12 +104,12 @@ def splats_behind(frames: FrameStore, sh_degree: int) -> Splats:
     """The opaque layer under lids, and the `occlusion_layer`. The lids' splats are trained on open
     eyes and would leave gaps when the eyes close."""
     surface = frames.surface
-    inner = inner_layer(frames, sh_degree)
+    inner = occluding_splats(frames, sh_degree)
     has_inner = (surface.lids & ~surface.closed) | frames.occlusion_layer.triangles
     return inner.rows(has_inner[inner.face])
 
 
-def inner_layer(frames: FrameStore, sh_degree: int = 0) -> Splats:
+def occluding_splats(frames: FrameStore, sh_degree: int = 0) -> Splats:
     """One splat in its plausible color, sorted by triangle, for each triangle of lids, under its
     middle and so large that closed lids have no gaps, of the mouth's unseen inside, and of the
     `occlusion_layer`."""

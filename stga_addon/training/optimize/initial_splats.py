@@ -1,6 +1,6 @@
 """The splats that training starts with: a lattice on the mesh, colored as the images show it, and
-hull points for what the mesh does not cover (hair, shoulders, clothes); a flat layer for a single
-camera."""
+visual-hull points for what the mesh does not cover (hair, shoulders, clothes); a flat layer for a
+single camera."""
 
 from collections.abc import Sequence
 
@@ -45,7 +45,7 @@ the mesh; below it, the cameras stand on both sides of the head."""
 MAX_ASYMMETRY_SHARE = 0.015
 """Largest median distance of a symmetric mesh from its mirror image, of its diagonal."""
 VOXEL_SIZE_M = 0.004
-"""Distance between hull points, on a mesh of a head's size."""
+"""Distance between visual-hull points, on a mesh of a head's size."""
 MIN_VOXEL_SIZE_SHARE = 1 / 200
 """Of the mesh's diagonal, so that the grid of a mesh in millimeters fits into memory."""
 MIN_MESH_DISTANCE_M = 0.006
@@ -76,7 +76,7 @@ SEEN_SPREAD = 0.5
 
 
 def initial_splats(capture: Capture, settings: TrainingSettings) -> Splats:
-    """The lattice on the neutral mesh and, if the settings say so, hull points of the first
+    """The lattice on the neutral mesh and, if the settings say so, visual-hull points of the first
     training timestep (`flat_points` where a single camera shows it)."""
     convention = settings.convention
     degree = settings.sh_degree
@@ -93,7 +93,7 @@ def initial_splats(capture: Capture, settings: TrainingSettings) -> Splats:
     if settings.hull_points and len(first) == 1:
         parts.append(flat_points(capture, first[0], convention, degree, settings.torso))
     elif settings.hull_points:
-        parts.append(hull_points(capture, first, convention, degree, settings.torso))
+        parts.append(visual_hull_points(capture, first, convention, degree, settings.torso))
     return joined(parts)
 
 
@@ -101,8 +101,8 @@ def unseen_share(capture: Capture, convention: str, splats: Splats) -> np.ndarra
     """Fraction (N,) of the first training timestep's cameras in whose image an unbound splat does
     not lie.
 
-    0 for bound splats. A hull point outside of most images is held by few masks only, and often in
-    the air.
+    0 for bound splats. A visual-hull point outside of most images is held by few masks only, and
+    often in the air.
     """
     share = np.zeros(len(splats), np.float32)
     unbound = np.flatnonzero(splats.unbound)
@@ -192,7 +192,7 @@ def mirror_images(
     return rows, partner[rows]
 
 
-def hull_points(
+def visual_hull_points(
     capture: Capture, views: Sequence[View], convention: str, sh_degree: int, torso: bool = False
 ) -> Splats:
     """Unbound splats on the surface of the visual hull of one timestep, outside the mesh.
@@ -288,7 +288,7 @@ def _without_face(capture: Capture) -> np.ndarray:
 
 
 def voxel_size(mesh: np.ndarray) -> float:
-    """Distance in meters between hull points around a mesh (V, 3)."""
+    """Distance in meters between visual-hull points around a mesh (V, 3)."""
     return max(VOXEL_SIZE_M, MIN_VOXEL_SIZE_SHARE * float(np.linalg.norm(np.ptp(mesh, axis=0))))
 
 

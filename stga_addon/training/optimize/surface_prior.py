@@ -13,7 +13,7 @@ from ...avatar.splats import SH_C0, Splats
 from ...flame.quaternions import from_matrices, to_matrices
 from .backend import Backend
 from .frames import FrameStore
-from .hidden_layers import HIDDEN_OPACITY, hidden_order, inner_layer, layer_on
+from .hidden_layers import HIDDEN_OPACITY, hidden_order, layer_on, occluding_splats
 from .semantic_regions import eyeballs_of, lining_of
 from .state import parameters_and_average
 from .step_hook import Schedule
@@ -60,24 +60,24 @@ PULLED_COLUMNS = (
 PINNED_KINDS = ("parameters", "average", "first", "second")
 """Arrays of the splats whose color is pinned."""
 INNER_PARAMETERS = ("xyz", "rotation", "log_scale", "opacity")
-"""Parameters of the inner layer, and of the occlusion layer's end, that do not change."""
+"""Parameters of occluding splats, and of the layer where the mesh ends, that do not change."""
 
 
 @dataclass(frozen=True)
 class BoundSplats:
     """The bound splats that priors may change, as they were before the first prior.
 
-    rows       (N,) their rows in the backend
-    columns    PULLED_COLUMNS, (N, …) each
-    reference  MOMENTS of well observed splats, (M, …) each
-    is_inner   (N,) bool: splats of the `inner_layer`
+    rows          (N,) their rows in the backend
+    columns       PULLED_COLUMNS, (N, …) each
+    reference     MOMENTS of well observed splats, (M, …) each
+    is_occluding  (N,) bool: those of `occluding_splats`
     """
 
     backend: Backend
     rows: np.ndarray
     columns: Mapping[str, np.ndarray]
     reference: Mapping[str, np.ndarray]
-    is_inner: np.ndarray
+    is_occluding: np.ndarray
 
     @property
     def face(self) -> np.ndarray:
@@ -132,7 +132,7 @@ class SurfacePrior:
         reference = np.flatnonzero(well_seen if well_seen.any() else is_bound)
         moments = backend.columns(MOMENTS, reference)
         columns = backend.columns(PULLED_COLUMNS, rows)
-        splats = BoundSplats(backend, rows, columns, moments, self._is_inner(columns))
+        splats = BoundSplats(backend, rows, columns, moments, self._is_occluding(columns))
         for prior in self._priors:
             prior.apply(splats)
 
@@ -144,7 +144,7 @@ class SurfacePrior:
     def _priors(self) -> list[Prior]:
         return [prior(self._known) for prior in PRIORS]
 
-    def _is_inner(self, columns: Mapping[str, np.ndarray]) -> np.ndarray:
+    def _is_occluding(self, columns: Mapping[str, np.ndarray]) -> np.ndarray:
         """(N,) bool: the splats of the layer behind lids and sides, each the nearest to its place.
         By depth, lids' own splats would join it, as training moves them by more than the tenth of a
         millimeter that it is deep, and never leave it."""
@@ -156,9 +156,9 @@ class SurfacePrior:
         distance = np.linalg.norm(columns["parameters/xyz"][rows] - place, axis=1)
         order = np.lexsort((distance, face))
         _, first = np.unique(face[order], return_index=True)
-        is_inner = np.zeros(len(columns["face"]), bool)
-        is_inner[rows[order[first]]] = True
-        return is_inner
+        is_occluding = np.zeros(len(columns["face"]), bool)
+        is_occluding[rows[order[first]]] = True
+        return is_occluding
 
 
 class _Known:
@@ -176,7 +176,7 @@ class _Known:
 
     @cached_property
     def inner(self) -> Splats:
-        return inner_layer(self.frames)
+        return occluding_splats(self.frames)
 
 
 class PlausibleColor:
@@ -191,20 +191,20 @@ class PlausibleColor:
         sides = known.sides
         face = splats.face
         moments = splats.columns["second/color"]
-        is_inner = splats.is_inner
+        is_occluding = splats.is_occluding
         share = doubt(moments, splats.reference["second/color"]) * ~sides.shown[face]
         # the avatar is made of averages, which only steps move
         is_untouched = ~sides.shown[face] & ~moments.any(1)
         is_folded = known.surface.folded_lids[face] & ~sides.shown[face]
-        is_pinned = sides.triangles[face] | is_inner | is_untouched | is_folded
+        is_pinned = sides.triangles[face] | is_occluding | is_untouched | is_folded
         colors = sides.color[face]
         hair = np.flatnonzero(sides.is_hair[face])
         if len(hair):
             shades = known.hair.shades(face[hair], splats.columns["parameters/xyz"][hair])
             colors[hair] *= shades[:, None]
         plausible = ((colors - 0.5) / SH_C0).astype(np.float32)
-        inner = np.searchsorted(known.inner.face, face[is_inner])
-        plausible[is_inner] = known.inner.sh[inner, 0]
+        inner = np.searchsorted(known.inner.face, face[is_occluding])
+        plausible[is_occluding] = known.inner.sh[inner, 0]
         rows = np.flatnonzero((share > MIN_PULL) & ~is_pinned)
         color = splats.columns["parameters/color"][rows]
         color += share[rows, None] * (plausible[rows] - color)
@@ -297,16 +297,16 @@ class FlatSkin:
         return np.where(is_layer, np.where(hair > 0, hair, skin), 0.0)
 
 
-class FixedInnerLayer:
-    """Splats of the mouth's unseen inside, and behind lids and sides, stay as `inner_layer` placed
-    them: views would make them any size."""
+class FixedOcclusion:
+    """Splats of the mouth's unseen inside, and behind lids and sides, stay as `occluding_splats`
+    placed them: views would make them any size."""
 
     def __init__(self, known: _Known) -> None:
         self._inner = known.inner
         self._is_inside = known.sides.triangles & ~known.surface.outside
 
     def apply(self, splats: BoundSplats) -> None:
-        rows = np.flatnonzero(self._is_inside[splats.face] | splats.is_inner)
+        rows = np.flatnonzero(self._is_inside[splats.face] | splats.is_occluding)
         inner = self._inner.rows(np.searchsorted(self._inner.face, splats.face[rows]))
         kept = {name: getattr(inner, name) for name in INNER_PARAMETERS}
         splats.assign(rows, parameters_and_average(kept))
@@ -325,10 +325,10 @@ class FixedEnd:
 
     def apply(self, splats: BoundSplats) -> None:
         size = self._size
-        is_inner = splats.is_inner
-        count = np.bincount(splats.face[~is_inner], minlength=len(size))
+        is_occluding = splats.is_occluding
+        count = np.bincount(splats.face[~is_occluding], minlength=len(size))
         is_whole = (size > 0) & (count >= size)  # not where another lattice was chosen
-        rows = np.flatnonzero(is_whole[splats.face] & ~is_inner)
+        rows = np.flatnonzero(is_whole[splats.face] & ~is_occluding)
         rows = rows[np.argsort(splats.face[rows], kind="stable")]
         face = splats.face[rows]
         number = np.arange(len(rows)) - np.searchsorted(face, face)
@@ -383,7 +383,7 @@ PRIORS = (
     OpaqueSurface,
     ShortSteps,
     FlatSkin,
-    FixedInnerLayer,
+    FixedOcclusion,
     FixedEnd,
     SmallLining,
     SunkenEyes,

@@ -84,7 +84,8 @@ class Trainer:
     iteration      steps made so far
     visit          visits of frames so far, minus one: consecutive views of one timestep are one
                    visit
-    initial_count  splats of the whole lattice and hull points, which density control counts from
+    initial_count  splats of the whole lattice and visual-hull points, which density control counts
+                   from
     hooks          by name, what may edit the splats after a step, in this order
     """
 
@@ -118,7 +119,7 @@ class Trainer:
             state = start.state
             self.initial_count = len(state)
         self._backend = make_backend(device, settings, self.frames, state)
-        limits = self.frames.stray_limits(settings)
+        limits = self.frames.outlier_limits(settings)
         interval = settings.stray_reset_interval
         self.hooks: dict[str, StepHook] = {
             "outliers": OutlierReset(interval, limits, settings.stray_reset_share),
