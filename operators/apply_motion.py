@@ -344,5 +344,5 @@ class ApplyMotion(Edit, bpy.types.Operator, FileImport, MotionProperties):
     def _report_range(self, beyond: Mapping[str, np.ndarray]) -> None:
         for part, values in beyond.items():
             if values.any():
-                share = f"{100 * float((values > 0).mean()):.0f} % of the frames"
-                self.inform(f"{part}: {share} were outside the head's own recording")
+                fraction = f"{100 * float((values > 0).mean()):.0f} % of the frames"
+                self.inform(f"{part}: {fraction} were outside the head's own recording")

@@ -83,8 +83,8 @@ def describe_figures(figures: Mapping[str, float]) -> list[str]:
     before_db, after_db  of the region that is trained further, `describe_gain`
     psnr, psnr_unmatched   of the last evaluation, dB, the second one without fitting the exposure
                            of views
-    error_px, unexplained  of a tracked head: median distance from its landmarks, share of the face
-                           that images do not look like
+    error_px, unexplained  of a tracked head: median distance from its landmarks, fraction of the
+                           face that images do not look like
     """
     loss = ("loss", "loss {:.4f}")
     quality: tuple[tuple[tuple[str, str], ...], ...] = ((("psnr", "PSNR {:.2f} dB"), loss),)

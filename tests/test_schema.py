@@ -76,7 +76,7 @@ EVERYTHING = Drawing(
 )
 
 
-SHARES = "expected a tuple, each item a finite number from 0.0 up to 1.0"
+FRACTIONS = "expected a tuple, each item a finite number from 0.0 up to 1.0"
 SIDE = "expected a whole number from 1 up to 9"
 KINDS = "expected one of Circle, Square"
 
@@ -105,8 +105,8 @@ REFUSED = [
     ({"count": 1.0}, "setting count: expected a whole number from 0, got 1.0"),
     ({"count": True}, "setting count: expected a whole number from 0, got True"),
     ({"count": 13}, "13 is not drawn"),
-    ({"span": (0.0, 1.5)}, f"setting span: {SHARES}, got "),
-    ({"span": (0.0, math.nan)}, f"setting span: {SHARES}, got "),
+    ({"span": (0.0, 1.5)}, f"setting span: {FRACTIONS}, got "),
+    ({"span": (0.0, math.nan)}, f"setting span: {FRACTIONS}, got "),
     ({"span": (0.0,)}, "setting span: expected a tuple of 2, got "),
     ({"span": [0.0, 1.0]}, "setting span: expected a tuple of 2, got "),
     ({"steps": (1, 0)}, "setting steps: expected a tuple, each item a whole number above 0, got "),

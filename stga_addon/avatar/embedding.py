@@ -17,9 +17,9 @@ MIN_DIVISOR = 1e-30
 MAX_UNEVENNESS = 1e-6
 """Relative difference between a matrix's scales that is float32's rounding."""
 MIN_AREA_RATIO = 1e-4
-"""A triangle whose area is below this share of its longest edge's square counts as a line: vertices
-on a line, rounded to float32, have ratios of 1e-6 to 1e-5, and their normal and area are those of
-the rounding."""
+"""A triangle whose area is below this fraction of its longest edge's square counts as a line:
+vertices on a line, rounded to float32, have ratios of 1e-6 to 1e-5, and their normal and area are
+those of the rounding."""
 # from this z on, the perpendicular of a unit vector is sought in the x direction
 UPRIGHT_COSINE = 0.8
 """z component of a triangle's first axis above which x replaces z in the cross product that stands

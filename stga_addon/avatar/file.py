@@ -75,11 +75,11 @@ class AvatarLight:
                 (`light.harmonics.basis`) in the axes of the capture
     transfer    (V, 9) float32: irradiance is transfer @ radiance; with the head's own shadow
                 (`light.surface`)
-    occlusion   (V,) float32, 0…1: cosine-weighted share of the sky that the head leaves open
+    occlusion   (V,) float32, 0…1: cosine-weighted fraction of the sky that the head leaves open
     irradiance  (V, 3) float32: of the capture, with light that the head reflects onto itself, mean
                 over its timesteps; an albedo is π times linear color over this
     roughness   (V,) float32: of highlights; 0: skin, whose roughness the scene's lighting says
-    residual    how far recorded colors are from what `radiance` explains, as a share of them
+    residual    how far recorded colors are from what `radiance` explains, as a fraction of them
                 (robust deviation)
     damping     0…1 by which albedo is pulled to its mean, because the light is too hard to take
                 away
@@ -181,7 +181,8 @@ class Avatar:
     @property
     def with_limited_offsets(self) -> "Avatar":
         """With coefficients of 0 where they do not change a triangle's splats by MIN_COLOR_CHANGE,
-        MIN_SHIFT_M or a share of MIN_SCALE_CHANGE anywhere in `strain_range`, and with smaller ones
+        MIN_SHIFT_M or a fraction of MIN_SCALE_CHANGE anywhere in `strain_range`, and with smaller
+        ones
         where they would blow splats up somewhere in it (`limited_enlargement`)."""
         basis = self._strain
         kept = {}

@@ -36,7 +36,7 @@ class DrivenOffset:
     signal      what drives it, of SIGNALS
     target      POSITION: by a vector in the triangle's own axes and unit; SCALE: that unit, by the
                 exponential of the first component; COLOR: sRGB
-    rate, rate_share  learning rate: which of `Rates`, and a share of it
+    rate, rate_fraction  learning rate: which of `Rates`, and a fraction of it
     of_light    whether it is the capture's light, which other light takes the place of
     """
 
@@ -44,7 +44,7 @@ class DrivenOffset:
     signal: str
     target: str
     rate: str
-    rate_share: float
+    rate_fraction: float
     of_light: bool = False
 
 

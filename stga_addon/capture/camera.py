@@ -179,11 +179,11 @@ def turntable(
     angles: radians from `start`, from `covered_angles`; a full turn goes around once, less swings
     to both sides."""
     low, high = angles
-    shares = np.arange(count) / count
+    fractions = np.arange(count) / count
     if high - low >= 2 * np.pi:
-        turns = 2 * np.pi * shares
+        turns = 2 * np.pi * fractions
     else:
-        turns = (low + high) / 2 + (high - low) / 2 * np.sin(2 * np.pi * shares)
+        turns = (low + high) / 2 + (high - low) / 2 * np.sin(2 * np.pi * fractions)
     return [orbited(start, center, up, turn) for turn in turns]
 
 

@@ -35,8 +35,8 @@ SIDE_DEG = 90
 PICTURE_PX = 160
 """Side of the picture of directions."""
 HEAD_RADIUS = 0.3
-"""Radius of the head in that picture, as a share of half of its side; cells reach from there to its
-border."""
+"""Radius of the head in that picture, as a fraction of half of its side; cells reach from there to
+its border."""
 FILMED_COLOR = (0.16, 0.62, 0.34, 1.0)
 UNFILMED_COLOR = (0.3, 0.3, 0.3, 1.0)
 HEAD_COLOR = (0.75, 0.6, 0.5, 1.0)

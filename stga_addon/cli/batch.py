@@ -82,8 +82,8 @@ def run_batch_command(options: Namespace, head: object = None) -> None:
     chosen = EngineOptions(**given_options(options, EngineOptions))
     plan = batch_plan(options)
     is_here = chosen.engine == "local" and not options.commands
-    share = max(1, processors() // len(plan.jobs)) if is_here else 1
-    plan = with_threads(plan, chosen.threads or share)
+    fraction = max(1, processors() // len(plan.jobs)) if is_here else 1
+    plan = with_threads(plan, chosen.threads or fraction)
     if chosen.dry_run:
         print_plan(plan)
     elif options.commands:

@@ -108,7 +108,7 @@ class ProgressBar(ExitStack[None]):
         figures = self._clock.reported(progress)
         shown = [describe_left(figures), *describe_figures(figures), printable(progress.detail)]
         self._bar.set_postfix_str("; ".join(filter(None, shown)), refresh=False)
-        self._bar.update(progress.share - self._bar.n)
+        self._bar.update(progress.fraction - self._bar.n)
         return False
 
     def say(self, line: str) -> None:

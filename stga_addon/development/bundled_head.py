@@ -157,16 +157,16 @@ def with_lining(displacements: np.ndarray, neutral: np.ndarray, kept: np.ndarray
         _smooth_step((distance[:, 0] - low) / (high - low))
         for low, high in (LINING_FOLLOWS_CM, LINING_STAYS_CM)
     )
-    share = (begins * (1 - ceases))[:, None]
+    fraction = (begins * (1 - ceases))[:, None]
     found = displacements.copy()
-    found[:, lining] = share * followed + (1 - share) * displacements[:, lining]
+    found[:, lining] = fraction * followed + (1 - fraction) * displacements[:, lining]
     return found
 
 
-def _smooth_step(share: np.ndarray) -> np.ndarray:
+def _smooth_step(fraction: np.ndarray) -> np.ndarray:
     """From 0 to 1, without a slope at both ends."""
-    share = np.clip(share, 0, 1)
-    return np.asarray(share * share * (3 - 2 * share))
+    fraction = np.clip(fraction, 0, 1)
+    return np.asarray(fraction * fraction * (3 - 2 * fraction))
 
 
 def _within(part: tuple[int, int], ids: np.ndarray) -> np.ndarray:
@@ -176,8 +176,8 @@ def _within(part: tuple[int, int], ids: np.ndarray) -> np.ndarray:
 def _regions(moved: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     """Name -> the skin's vertices that shapes of the eyes and the lips move, as (V,) bool."""
 
-    def moves(share: float, *names: str) -> np.ndarray:
-        found = np.max([moved[name] / moved[name].max() for name in names], axis=0) > share
+    def moves(fraction: float, *names: str) -> np.ndarray:
+        found = np.max([moved[name] / moved[name].max() for name in names], axis=0) > fraction
         return np.asarray(found & _within(FACE, np.arange(len(found))))
 
     return {
@@ -318,11 +318,11 @@ def skinning_weights(template: np.ndarray, kept: np.ndarray) -> np.ndarray:
 
     Root, neck and eyeballs; the jaw is a shape.
     """
-    share = (_height(template) - NECK_BOTTOM_CM) / (NECK_TOP_CM - NECK_BOTTOM_CM)
-    share = np.where(_within(SKIN, kept), _smooth_step(share), 1.0)
+    fraction = (_height(template) - NECK_BOTTOM_CM) / (NECK_TOP_CM - NECK_BOTTOM_CM)
+    fraction = np.where(_within(SKIN, kept), _smooth_step(fraction), 1.0)
     weights = np.zeros((len(kept), len(JOINTS)))
-    weights[:, JOINTS.index("root")] = 1 - share
-    weights[:, JOINTS.index("neck")] = share
+    weights[:, JOINTS.index("root")] = 1 - fraction
+    weights[:, JOINTS.index("neck")] = fraction
     for joint, part in (("left_eye", LEFT_EYEBALL), ("right_eye", RIGHT_EYEBALL)):
         weights[_within(part, kept)] = np.eye(len(JOINTS))[JOINTS.index(joint)]
     return weights

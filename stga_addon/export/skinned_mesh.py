@@ -83,14 +83,14 @@ def _skin_attributes(weights: np.ndarray, accessors: Accessors, exact: bool) -> 
     sets = -(-max(1, int((weights > 0).sum(axis=1).max())) // 4)
     padded = np.pad(weights, ((0, 0), (0, max(0, 4 * sets - weights.shape[1]))))
     joints = np.argsort(-padded, axis=1, kind="stable")[:, : 4 * sets]
-    shares = np.take_along_axis(padded, joints, axis=1)
+    fractions = np.take_along_axis(padded, joints, axis=1)
     if exact:
-        shares = np.asarray(shares, np.float32)
+        fractions = np.asarray(fractions, np.float32)
     else:
-        steps = np.rint(shares * MAX_USHORT).astype(np.int64)
+        steps = np.rint(fractions * MAX_USHORT).astype(np.int64)
         steps[:, 0] += MAX_USHORT - steps.sum(axis=1)
-        shares = steps.astype(np.uint16)
-    joints = np.where(shares > 0, joints, 0)
+        fractions = steps.astype(np.uint16)
+    joints = np.where(fractions > 0, joints, 0)
     kind = np.uint8 if weights.shape[1] <= 256 else np.uint16
     attributes = {}
     for number in range(sets):
@@ -98,7 +98,7 @@ def _skin_attributes(weights: np.ndarray, accessors: Accessors, exact: bool) -> 
         own = np.ascontiguousarray(joints[four].astype(kind))
         attributes[f"JOINTS_{number}"] = accessors.add(own, VERTICES)
         normalized = {} if exact else {"normalized": True}
-        own = np.ascontiguousarray(shares[four])
+        own = np.ascontiguousarray(fractions[four])
         attributes[f"WEIGHTS_{number}"] = accessors.add(own, VERTICES, **normalized)
     return attributes
 

@@ -100,16 +100,16 @@ def read_splat(path: Path, say: Say = warn) -> Splats:
             f"of {SPLAT_ROW.itemsize}; expected {READ_FILES}"
         )
     table = np.frombuffer(data, SPLAT_ROW)
-    share = table["color"].astype(np.float32) / 255
+    fraction = table["color"].astype(np.float32) / 255
     with np.errstate(divide="ignore", invalid="ignore"):
         log_scale = np.log(table["scale"])
-        opacity = np.log(share[:, 3] / (1 - share[:, 3]))
+        opacity = np.log(fraction[:, 3] / (1 - fraction[:, 3]))
     return in_world(
         table["xyz"],
         (table["rotation"].astype(np.float32) - 128) / 128,
         log_scale,
         opacity,
-        ((share[:, :3] - 0.5) / SH_C0)[:, None],
+        ((fraction[:, :3] - 0.5) / SH_C0)[:, None],
     )
 
 

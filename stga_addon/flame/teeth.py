@@ -32,7 +32,7 @@ TEETH_STRIPS = {
     "lower back": ("LRB0 LEB1 LEB0 LRB0 LRB1 LEB1", "LRB0 LRB1 LEB0 LRB1 LEB1 LEB0"),
     "lower top": ("LEB0 LEB1 LE0 LEB1 LE1 LE0", "LEB0 LE1 LE0 LEB0 LEB1 LE1"),
 }
-# Sizes as shares of the width between the corners of the mouth, about 50 mm.
+# Sizes as fractions of the width between the corners of the mouth, about 50 mm.
 ARCH_WIDTH = 0.85
 """Width of the arch as a fraction of the mouth's."""
 CLEARANCE = 0.03

@@ -19,7 +19,7 @@ from ..training.run.folder import RUN
 from ..training.settings import PRESETS, TrainingSettings, make_settings
 from .train import Selected, Train
 
-SHARES = (0.1, 0.35, 0.65)  # Of an analysis that are over when each preset begins to be timed
+FRACTIONS = (0.1, 0.35, 0.65)  # Of an analysis that are over when each preset begins to be timed
 
 
 @dataclass(frozen=True)
@@ -115,9 +115,9 @@ def analyze(request: Analyze, report: Report, say: Say) -> Analyzed:
         from ..training.preset_timing import time_presets
 
         timings = time_presets(capture, device=device)
-        for share, preset in zip(SHARES, PRESETS, strict=True):
-            left_s = partial(dict[str, float], left_s=(monotonic() - begin) * (1 / share - 1))
-            report(Progress(share, "Timing the presets", figures=left_s))
+        for fraction, preset in zip(FRACTIONS, PRESETS, strict=True):
+            left_s = partial(dict[str, float], left_s=(monotonic() - begin) * (1 / fraction - 1))
+            report(Progress(fraction, "Timing the presets", figures=left_s))
             seconds[preset] = next(timings).seconds
     misfit = next((text for text in capture.warnings if REPAIR_OPTION in text), "")
     return Analyzed(plan, seconds, misfit, repaired is not None)

@@ -199,10 +199,10 @@ def findings(motion: Motion) -> list[str]:
         lines.append(f"{motion.lost} rows are missing and were interpolated")
     for part, beyond in motion.outside.items():
         if beyond.any():
-            share = float(np.mean(beyond > 0))
+            fraction = float(np.mean(beyond > 0))
             frame = int(beyond.argmax())
             lines.append(
-                f"{part}: {100 * share:.0f} % of the frames are outside the trained range, "
+                f"{part}: {100 * fraction:.0f} % of the frames are outside the trained range, "
                 f"by up to {beyond.max():.1f} of its half width (frame {frame})"
             )
     return lines

@@ -176,14 +176,14 @@ def _tracked_by_avatar(
             asked = Track(request.source, None, out, avatar=avatar, step=step, take="talk")
             track(asked, report, say)
         misfit = read_json(out / REPORT_FILE)["image_misfit"][AVATAR_MISFIT]
-        share = float(np.median(list(misfit.values())))
-        if share > MAX_MISFIT:
+        fraction = float(np.median(list(misfit.values())))
+        if fraction > MAX_MISFIT:
             say(
-                f"warning: the avatar does not explain {share:.0%} of the head's pixels: is it of "
-                "another person? The face networks detect the motion"
+                f"warning: the avatar does not explain {fraction:.0%} of the head's pixels: is it "
+                "of another person? The face networks detect the motion"
             )
             return None
-    say(f"avatar: does not explain {share:.0%} of the head's pixels (median)")
+    say(f"avatar: does not explain {fraction:.0%} of the head's pixels (median)")
     return open_capture(out, flame)
 
 

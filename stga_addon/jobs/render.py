@@ -215,7 +215,7 @@ def camera_views(request: Render, path: Path, say: Say) -> list[View]:
 class _Subject:
     """What is rendered.
 
-    image      view and share of the film, 0 to 1 -> image (3, H, W)
+    image      view and fraction of the film, 0 to 1 -> image (3, H, W)
     timesteps  of its motion, ascending; none where nothing moves
     center     of the head or splats at the first timestep, (3,) meters
     fps        at which it plays
@@ -371,9 +371,9 @@ def _pictured(
         behind = [PosedSplats(read_splats(path))]
     colors = None if request.light is None else _lit_colors(request, request.light, avatar)
 
-    def picture(view: View, share: float) -> np.ndarray:
+    def picture(view: View, fraction: float) -> np.ndarray:
         posed = mesh(view)
-        lit = None if colors is None else colors(posed, view, share)
+        lit = None if colors is None else colors(posed, view, fraction)
         layers = [posed_avatar(avatar, posed, lit), *behind]
         return render_layers(layers, view.camera, request.background, composer)
 
@@ -383,14 +383,14 @@ def _pictured(
 def _lit_colors(
     request: Render, source: Path, avatar: Avatar
 ) -> Callable[[np.ndarray, View, float], np.ndarray]:
-    """Mesh, view and share of the pictures -> colors (N, 3) under the asked light."""
+    """Mesh, view and fraction of the pictures -> colors (N, 3) under the asked light."""
     relighter = Relighter(avatar)
     lighting = read_lighting(source)
 
-    def colors(mesh: np.ndarray, view: View, share: float) -> np.ndarray:
+    def colors(mesh: np.ndarray, view: View, fraction: float) -> np.ndarray:
         light = lighting
         if request.light_turn:
-            light = turned(lighting, _middle(mesh), request.light_turn * share)
+            light = turned(lighting, _middle(mesh), request.light_turn * fraction)
         return relighter.colors(mesh, view.camera.position, light)
 
     return colors

@@ -128,7 +128,7 @@ class Track:
         metavar="COUNT",
     )
     size: float = option(
-        "of the images, as a share of the recorded size", 1.0, 0.1, 1.0, metavar="SHARE"
+        "of the images, as a fraction of the recorded size", 1.0, 0.1, 1.0, metavar="FRACTION"
     )
     offset: Mapping[str, int] | None = option(
         "frames by which a camera's recording is later; may be repeated",
@@ -238,7 +238,7 @@ WRITER = "tracking is writing this capture"
 """Who holds the lock of a capture that is being tracked."""
 MAX_MISFIT = 0.5
 """Median fraction of the head's pixels beyond which the avatar is another person's."""
-TRACKING_SHARE = 0.5
+TRACKING_FRACTION = 0.5
 """Of the progress, before an avatar tracks or is trained."""
 
 
@@ -302,7 +302,7 @@ def _track_by_avatar(request: Track, run: Path, report: Report) -> Written:
     from ..tracking.track import track as track_footage
     from ..training.run.recording import avatar_person, track_recording
 
-    steps = _Steps(report, TRACKING_SHARE)
+    steps = _Steps(report, TRACKING_FRACTION)
     out = request.out
     footage, messages = _open(request, steps)
     person, model = avatar_person(run)
@@ -314,9 +314,9 @@ def _track_by_avatar(request: Track, run: Path, report: Report) -> Written:
         tracked = track_recording(run, out, helpers, report_avatar, keeps_world)
     found = replace(found, median_px=report_errors(out, model))
     end_tracking(out)
-    share = float(np.median(tracked.misfit))
-    lines = [*messages, f"avatar: does not explain {share:.0%} of the head's pixels (median)"]
-    if share > MAX_MISFIT:
+    fraction = float(np.median(tracked.misfit))
+    lines = [*messages, f"avatar: does not explain {fraction:.0%} of the head's pixels (median)"]
+    if fraction > MAX_MISFIT:
         lines.append("warning: the avatar does not look like the person of this footage")
     return _written(out, found, report, lines)
 
@@ -396,10 +396,10 @@ def solve_again(request: SolveAgain, report: Report, say: Say) -> Written:
 class _Steps:
     """A tracking's steps as progress, with the time that is left and how well the head fits."""
 
-    def __init__(self, report: Report, tracking_share: float = 1.0) -> None:
+    def __init__(self, report: Report, tracking_fraction: float = 1.0) -> None:
         self._report = report
         self._time_left = TimeLeft()
-        self._share = tracking_share
+        self._fraction = tracking_fraction
         self._before = 0  # 1 where cameras are found before the head is tracked
         self._spans: Mapping[Stage, tuple[float, float]] = {}
         self._now = Progress()
@@ -420,10 +420,10 @@ class _Steps:
         begin, end = self._spans.get(stage, (stage.begin, stage.end))
         self._before = max(self._before, -math.floor(begin))
         at = begin + (end - begin) * done / max(total, 1)
-        share = (at + self._before) / (1 / self._share + self._before)
-        figures = {"left_s": self._time_left.after(share), **self._quality}
+        fraction = (at + self._before) / (1 / self._fraction + self._before)
+        figures = {"left_s": self._time_left.after(fraction), **self._quality}
         detail = f"{done} of {total}" if total > 1 else ""
-        self._now = Progress(share, stage.title, detail, lambda: figures)
+        self._now = Progress(fraction, stage.title, detail, lambda: figures)
         if self._report(self._now):
             raise Cancelled
 
@@ -441,15 +441,15 @@ def make_avatar(request: MakeAvatar, report: Report, say: Say) -> Written:
     run = request.train.run
 
     def report_tracking(progress: Progress) -> bool:
-        share = TRACKING_SHARE * progress.share
+        fraction = TRACKING_FRACTION * progress.fraction
         stage = f"Tracking: {progress.stage}"
         figures = {"left_s": math.nan, **progress.figures()}
         figures["left_s"] += (request.train.settings.seconds or 0.0) + AFTER_S
-        return report(replace(progress, share=share, stage=stage, figures=lambda: figures))
+        return report(replace(progress, fraction=fraction, stage=stage, figures=lambda: figures))
 
     def report_training(progress: Progress) -> bool:
-        share = TRACKING_SHARE + (1 - TRACKING_SHARE) * progress.share
-        return report(replace(progress, share=share))
+        fraction = TRACKING_FRACTION + (1 - TRACKING_FRACTION) * progress.fraction
+        return report(replace(progress, fraction=fraction))
 
     begin = perf_counter()
     check_inputs(request.track, request.takes)
@@ -502,8 +502,8 @@ def _track_takes(request: MakeAvatar, report: Report, say: Say) -> list[Path]:
         for number, own in enumerate(tracks):
 
             def report_take(progress: Progress, before: int = number) -> bool:
-                share = (before + progress.share) / len(tracks)
-                return report(replace(progress, share=share))
+                fraction = (before + progress.fraction) / len(tracks)
+                return report(replace(progress, fraction=fraction))
 
             if not is_written(own.out):
                 with hold_folder(own.out, LOCK_FILE, WRITER):
@@ -628,13 +628,13 @@ def extend(request: Extend, report: Report, say: Say) -> Written:
                     say(line)
     if captures == list(request.captures):
         return train_and_finish(request, report, say)
-    tell = partial(_tell_half, report, TRACKING_SHARE)
+    tell = partial(_tell_half, report, TRACKING_FRACTION)
     return train_and_finish(replace(request, captures=tuple(captures)), tell, say)
 
 
 def _tell_half(report: Report, begin: float, progress: Progress) -> bool:
     """Report a half of the progress."""
-    return report(replace(progress, share=begin + TRACKING_SHARE * progress.share))
+    return report(replace(progress, fraction=begin + TRACKING_FRACTION * progress.fraction))
 
 
 def is_footage(path: Path) -> bool:

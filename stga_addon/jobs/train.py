@@ -37,7 +37,7 @@ AFTERWARDS = (StgaError, Cancelled, MemoryError)
 """Exceptions that may end the work after a training; its avatar is complete without that work."""
 AFTER_S = 20.0
 """Seconds that light and world take after a training, about."""
-AFTER_SHARE = 0.05
+AFTER_FRACTION = 0.05
 """Fraction of the progress that they take."""
 Selection = Mapping[int, np.ndarray]  # timestep -> (F,) bool: triangles to train
 
@@ -114,11 +114,11 @@ class _Continue:
     parent: Path = option("folder of a run", flag="RUN")
     _: KW_ONLY
     growth: float = option(
-        "splats to add, as a share of those on the triangles that are trained",
+        "splats to add, as a fraction of those on the triangles that are trained",
         0.0,
         0,
         MAX_ADDED_RATIO,
-        metavar="SHARE",
+        metavar="FRACTION",
     )
     seconds: float | None = like(TrainingSettings, "seconds", help="training time")
     iterations: int | None = like(TrainingSettings, "iterations")
@@ -241,8 +241,8 @@ def train_and_finish(request: Training, report: Report, say: Say) -> Written:
         figures = {"left_s": math.nan, **latest.figures()}
         training_s = figures["left_s"] if progress is latest else 0.0
         figures["left_s"] = training_s + AFTER_S * (sum(after) - done)
-        share = latest.share * (1 - AFTER_SHARE * sum(after)) + AFTER_SHARE * done
-        return report(replace(progress, share=share, figures=lambda: figures))
+        fraction = latest.fraction * (1 - AFTER_FRACTION * sum(after)) + AFTER_FRACTION * done
+        return report(replace(progress, fraction=fraction, figures=lambda: figures))
 
     def report_training(progress: Progress) -> bool:
         nonlocal latest, is_stopped
@@ -252,10 +252,10 @@ def train_and_finish(request: Training, report: Report, say: Say) -> Written:
         return is_stopped
 
     def report_light(progress: Progress) -> bool:
-        return tell(progress, progress.share)
+        return tell(progress, progress.fraction)
 
     def report_world(progress: Progress) -> bool:
-        return tell(progress, after[0] + progress.share)
+        return tell(progress, after[0] + progress.fraction)
 
     trained = prepared.train_as_asked(report_training)
     avatar = trained.path

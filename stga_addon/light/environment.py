@@ -84,12 +84,12 @@ def split_environment(
 def _coarser(image: np.ndarray, step: int) -> np.ndarray:
     """Means (H', W', 3), float64, over squares of about `step` pixels. Where step does not divide
     height or width, pixels on the edge of two squares are shared, so that none is lost."""
-    rows, columns = (_share_of_pixels(size, size // step) for size in image.shape[:2])
+    rows, columns = (_fraction_of_pixels(size, size // step) for size in image.shape[:2])
     wide = rows @ image.reshape(len(image), -1)
     return np.einsum("cw,rwk->rck", columns, wide.reshape(len(rows), -1, 3), dtype=np.float64)
 
 
-def _share_of_pixels(size: int, count: int) -> np.ndarray:
+def _fraction_of_pixels(size: int, count: int) -> np.ndarray:
     """(count, size) float32: weights of pixels in means over `count` equal parts of them."""
     edges = np.linspace(0, size, count + 1)[:, None]
     place = np.arange(size)

@@ -337,11 +337,11 @@ def go_to_frame(frame: int) -> None:
     bpy.context.view_layer.update()
 
 
-def show_progress(share: float) -> None:
+def show_progress(fraction: float) -> None:
     """At the mouse pointer, between `progress_begin(0, 1)` and `progress_end`. Nothing without a
     display, where Blender crashes once a file has brought a window."""
     if not bpy.app.background:
-        bpy.context.window_manager.progress_update(share)
+        bpy.context.window_manager.progress_update(fraction)
 
 
 def iterate_frames(

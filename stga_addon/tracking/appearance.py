@@ -22,7 +22,7 @@ CHANNEL_WEIGHTS = np.array([0.5, 1.5, 0.7])
 NOISE_LEVELS = 6.0
 """Standard deviation, of 255, of a pixel from the texture on skin that is followed exactly."""
 LIGHT_PRIOR = 0.02
-"""Weight of the camera's mean lighting in a view's, as a share of the points' information."""
+"""Weight of the camera's mean lighting in a view's, as a fraction of the points' information."""
 LIGHT_ITERATIONS = 2
 """Reweighted least squares fits of the light."""
 TEXTURE_ITERATIONS = 4
@@ -48,7 +48,7 @@ MAX_DEVIATION_LEVELS = 60.0
 """Largest difference, in levels, that counts in a texture's mean deviation."""
 MAX_SAMPLES = 1 << 14
 """Samples of an image at a time: OpenCV takes fewer than 2^15."""
-POINT_SHARE = 0.25
+POINT_FRACTION = 0.25
 """Weight of a point in a view: neighboring points share pixels."""
 OUTLIER_SQUARED = 4.0, 4.0, 16.0, 16.0
 """Squared difference in NOISE_LEVELS at which a point is explained by half, for each level."""
@@ -58,7 +58,7 @@ FLOW_POINTS = 2
 """Level of the pyramid whose points optical flow moves."""
 FLOW_ITERATIONS = 4
 """Gauss–Newton steps with a flow."""
-FLOW_SHARE = 0.3
+FLOW_FRACTION = 0.3
 """Weight of a point's flow of 1 pixel."""
 FLOW_SCALE_PX = 2.0
 """Distance beyond which a point's flow is an outlier."""
@@ -304,8 +304,8 @@ def robust(residual: np.ndarray, scale: float) -> np.ndarray:
 
 def point_weights(residual: np.ndarray, level: int) -> np.ndarray:
     """(M,) weights of points whose channels differ from a view's by (M, 3) NOISE_LEVELS."""
-    share = residual**2 @ CHANNEL_WEIGHTS / OUTLIER_SQUARED[level]
-    return POINT_SHARE / (1 + share) ** 2
+    fraction = residual**2 @ CHANNEL_WEIGHTS / OUTLIER_SQUARED[level]
+    return POINT_FRACTION / (1 + fraction) ** 2
 
 
 def unexplained(
@@ -318,7 +318,7 @@ def unexplained(
 
 def flow_weights(miss: np.ndarray) -> np.ndarray:
     """(M,) weights of points that lie (M, 2) pixels from where optical flow moves them."""
-    return FLOW_SHARE * robust(np.linalg.norm(miss, axis=1), FLOW_SCALE_PX)
+    return FLOW_FRACTION * robust(np.linalg.norm(miss, axis=1), FLOW_SCALE_PX)
 
 
 def average_texture(samples: Sequence[Sample]) -> Texture:
@@ -354,11 +354,11 @@ def average_texture(samples: Sequence[Sample]) -> Texture:
     by_camera: dict[bytes, list[np.ndarray]] = {}
     for name in lights:  # what one camera sees, drawn to what all do
         rows = [row for row, own in enumerate(samples) if own.camera == name]
-        share = weight[rows].sum(0)[:, None]
+        fraction = weight[rows].sum(0)[:, None]
         by_camera[name] = []
         for level, every in enumerate(values):
             mean = _robust_mean([lit[row][level] for row in rows], weight[rows], every)
-            mean = (share * mean + OWN_VIEW_PRIOR * every) / (share + OWN_VIEW_PRIOR)
+            mean = (fraction * mean + OWN_VIEW_PRIOR * every) / (fraction + OWN_VIEW_PRIOR)
             by_camera[name].append(mean)
     return Texture(by_camera, lights, trust)
 
@@ -374,8 +374,8 @@ def _robust_mean(
         order = np.argsort(stacked, axis=0)
         ordered = np.take_along_axis(stacked, order, axis=0)
         weights = np.repeat(weight[..., None], stacked.shape[2], 2)
-        share = np.cumsum(np.take_along_axis(weights, order, axis=0), axis=0)
-        middle = np.minimum((share < 0.5 * share[-1:]).sum(0), len(values) - 1)
+        fraction = np.cumsum(np.take_along_axis(weights, order, axis=0), axis=0)
+        middle = np.minimum((fraction < 0.5 * fraction[-1:]).sum(0), len(values) - 1)
         mean = np.take_along_axis(ordered, middle[None], axis=0)[0]
     for _ in range(MEAN_ITERATIONS):
         used = weight * robust(np.abs(stacked - mean)[..., 1:].max(2), MEAN_SCALE)

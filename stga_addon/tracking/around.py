@@ -38,7 +38,7 @@ FRAMES = 40
 """Frames of a video that get a camera: some 5° apart in half a circle."""
 MIN_IMAGES = 8
 """Images with a camera, below which the take is not one of many cameras."""
-MIN_IMAGES_SHARE = 0.5
+MIN_IMAGES_FRACTION = 0.5
 """Of the images that were looked at."""
 MIN_ON_HEAD = 30
 """Points on the face, below which it was the room alone whose structure was found."""
@@ -209,11 +209,11 @@ def _with_cameras(footage: Footage, out: Path, workers: Workers) -> tuple[Footag
     _require_cameras(footage, structure, len(timesteps))
     cameras = _cameras(camera, structure)
     count = f"{len(cameras)} of {len(timesteps)} images"
-    share = structure.on_head / structure.points
+    fraction = structure.on_head / structure.points
     lens = f"focal length {structure.focal_px:.0f} px"
     lens += f", distortion {structure.distortion:.3f}" if structure.distortion else ""
     line = (
-        f"cameras of {count} found, {lens}, {structure.error_px:.2f} px; {share:.0%} of "
+        f"cameras of {count} found, {lens}, {structure.error_px:.2f} px; {fraction:.0%} of "
         f"{structure.points} points are on the face"
     )
     line += "; the room was left out, as it did not turn with the person" * structure.masked
@@ -274,7 +274,7 @@ def _chosen(camera: FootageCamera, workers: Workers) -> list[int]:
 def _require_cameras(footage: Footage, structure: Structure, count: int) -> None:
     """Raise CamerasNotFound where there are too few cameras, or where they show the room alone."""
     found = len(structure.timesteps)
-    least = max(MIN_IMAGES, round(MIN_IMAGES_SHARE * count))
+    least = max(MIN_IMAGES, round(MIN_IMAGES_FRACTION * count))
     if found < least:
         raise CamerasNotFound(
             f"{footage.root}: structure from motion places {found} of {count} images, expected at "

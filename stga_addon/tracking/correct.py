@@ -98,15 +98,15 @@ def corrected(
     for row, values in keys.items():
         change[row] = change_between(solved[row], values)
     near = np.flatnonzero(distance <= span + 2)
-    shares = trust[near] * (distance[near] / (span + 1)) ** 2
+    fractions = trust[near] * (distance[near] / (span + 1)) ** 2
     # The prior of a change: standard deviations of 1 for coefficients, 1 radian for joints, 1 meter
     # for translation.
     blocks = []
     posed = PosedPoints(model, points)
-    for row, share in zip(near, shares, strict=True):
+    for row, fraction in zip(near, fractions, strict=True):
         _, jacobian = posed.linearized(solved[row, :-RIGID_SIZE], solved[row, -RIGID_SIZE:])
         flat = jacobian.reshape(-1, size) @ by_change(solved[row]) / LANDMARK_SIGMA_M
-        blocks.append(share * (flat.T @ flat) + np.eye(size))
+        blocks.append(fraction * (flat.T @ flat) + np.eye(size))
     matrix = block_diag(blocks)
     # second differences of three rows that follow each other
     middle = 1 + np.flatnonzero((np.diff(near)[:-1] == 1) & (np.diff(near)[1:] == 1))
@@ -169,7 +169,9 @@ def _trust(path: Path, report: Any, timesteps: Sequence[int]) -> np.ndarray:
         if not np.isfinite(worst).all():
             raise ValueError
     except (ValueError, TypeError, AttributeError) as error:
-        raise StgaError(f"{path}: image_misfit: expected shares by region and timestep") from error
+        raise StgaError(
+            f"{path}: image_misfit: expected fractions by region and timestep"
+        ) from error
     return np.where(np.isin(timesteps, list(set(without))), 0.0, 1 - np.clip(worst, 0.0, 1.0))
 
 

@@ -54,7 +54,8 @@ MAX_SURFACE_DISTANCE = 0.02
 """Distance from the surface beyond which a landmark is not used, as a fraction of the head's extent
 (6 mm)."""
 MAX_RESIDUAL = 0.013
-"""Share of the head's extent: a landmark whose rays miss each other by more (4 mm) is not used."""
+"""Fraction of the head's extent: a landmark whose rays miss each other by more (4 mm) is not
+used."""
 CANDIDATES = 48  # Triangles of the nearest centers, among which the nearest one is looked for
 
 

@@ -395,7 +395,7 @@ class _Solver:
         by_images = np.where(shot.by_landmarks[self.head.region], 0.0, visible)
         curvature, slope = self.head.photo_term(shot.views, by_images, values, level)
         # a level weighs the same with fewer points
-        share = len(self.head.rows[0]) / len(jacobian)
+        fraction = len(self.head.rows[0]) / len(jacobian)
         flat = jacobian.reshape(-1, len(values))
         missed = self._missed(shot.landmarks, values)
         weight = shot.landmarks.weight.copy()
@@ -406,8 +406,8 @@ class _Solver:
             weight[own] *= np.where(self.head.inner[own], INNER_WEIGHT, LANDMARK_WEIGHT)
         weighted = replace(shot.landmarks, weight=weight)
         matrix, right = normal_equations(self.head.landmarks, values, weighted)
-        matrix = matrix + share * flat.T @ (curvature @ jacobian).reshape(flat.shape)
-        return matrix, right + share * flat.T @ slope.ravel(), jacobian
+        matrix = matrix + fraction * flat.T @ (curvature @ jacobian).reshape(flat.shape)
+        return matrix, right + fraction * flat.T @ slope.ravel(), jacobian
 
     def _missed(self, landmarks: Observation, values: np.ndarray) -> np.ndarray:
         """(L,) distance in meters of the landmarks from the head, as far as the cameras determine

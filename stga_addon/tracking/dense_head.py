@@ -42,7 +42,7 @@ REGION_EDGES = (0.4, 0.62, 0.735)
 """Edges of the REGIONS, in the landmarks' height on the neutral head."""
 UPPER_FACE = 2
 """Regions from this one on stay where they are when the mouth opens."""
-CHIN_SHARE = 0.12
+CHIN_FRACTION = 0.12
 """Landmarks in this lowest fraction of the landmarks' height are the chin's."""
 CHIN_DIRECTION = np.array([0.0, -1.0, -0.4])
 """Direction in which an opening jaw moves the chin, in the head's axes."""
@@ -121,7 +121,7 @@ class DenseHead:
         edges = low + (high - low) * np.array(REGION_EDGES)
         self.landmark_region = np.digitize(height, edges)
         self.region = np.digitize(self.points.on(template, faces)[:, 1], edges)
-        self._chin = reliable & (height < low + CHIN_SHARE * (high - low))
+        self._chin = reliable & (height < low + CHIN_FRACTION * (high - low))
         self._fixed = reliable & (self.landmark_region >= UPPER_FACE)
         rest = np.zeros(model.n_expression), np.zeros(RIGID_SIZE)
         smooth = unit(self.points.on(vertex_normals(template, faces), faces))
@@ -157,8 +157,8 @@ class DenseHead:
                 vertices = flame_forward(self.head.model, np.zeros(0), frame_of(values))
                 normals = self.points.on(vertex_normals(vertices, faces), faces)
                 cosine = facing(camera, at, unit(normals))
-                share = min(1.0, VISIBILITY_SIDE_PX / max(camera.width, camera.height))
-                shown = in_sight(camera.scaled(share), vertices, faces, at)
+                fraction = min(1.0, VISIBILITY_SIDE_PX / max(camera.width, camera.height))
+                shown = in_sight(camera.scaled(fraction), vertices, faces, at)
                 self._visible[key] = np.where((cosine > MIN_COSINE) & shown, cosine**2, 0.0)
             seen.append(self._visible[key])
         return np.stack(seen)
@@ -265,8 +265,8 @@ class DenseHead:
             known = self._texture.values[view.key][level][rows], basis, weight * shown
             lit = appearance.relit(found, *known, self._texture.lights[view.key])
             residual = (found - lit) / appearance.NOISE_LEVELS
-            share = np.where(shown, appearance.unexplained(residual, level), 1.0)
-            total += np.bincount(self.region[rows], weight * share, len(REGIONS))
+            fraction = np.where(shown, appearance.unexplained(residual, level), 1.0)
+            total += np.bincount(self.region[rows], weight * fraction, len(REGIONS))
             weights += np.bincount(self.region[rows], weight, len(REGIONS))
         regions = total / np.maximum(weights, 1e-9)
         return Misfit(float(total.sum() / max(weights.sum(), 1e-9)), regions)

@@ -34,7 +34,7 @@ ITERATIONS = 15
 """Reweighted least squares fits of a landmark's position."""
 OUTLIER_SCALE = 1.5
 """Distance from a ray, in the landmark's medians, at which its weight is a quarter."""
-MIN_DISTANCE_SHARE = 1e-5
+MIN_DISTANCE_FRACTION = 1e-5
 """Least scale of outliers as a fraction of the distance to the cameras; below is rounding."""
 RANK_GUARD = 1e-9
 """Weight of the first guess: a single ray leaves the position along it open."""
@@ -103,15 +103,15 @@ def triangulate(
     distance = np.zeros(confidence.shape)
     for _ in range(ITERATIONS):
         total = weights.sum(0)
-        share = weights / np.where(total > 0, total, 1.0)
-        information = np.einsum("cn,cnij->nij", share, across)
-        right = np.einsum("cn,cni->ni", share, offsets)
+        fraction = weights / np.where(total > 0, total, 1.0)
+        information = np.einsum("cn,cnij->nij", fraction, across)
+        right = np.einsum("cn,cni->ni", fraction, offsets)
         guard = RANK_GUARD * np.eye(3)  # a single ray leaves the position along it open
         position = np.linalg.solve(information + guard, (right + guess @ guard)[..., None])[..., 0]
         to_point = position[None] - origins[:, None]
         distance = np.linalg.norm(np.cross(to_point, directions), axis=2)
         scale = OUTLIER_SCALE * _median(distance, confidence > 0)
-        floor = MIN_DISTANCE_SHARE * np.linalg.norm(to_point, axis=2)
+        floor = MIN_DISTANCE_FRACTION * np.linalg.norm(to_point, axis=2)
         # a point without a ray may lie in a camera, at distance 0 from its ray
         typical = np.maximum(np.maximum(scale, floor), np.finfo(np.float64).tiny)
         weights = confidence / (1 + (distance / typical) ** 2) ** 2

@@ -123,7 +123,7 @@ def rounded(values: Mapping[str, Mapping[int, float]]) -> dict[str, dict[str, fl
 class TorsoMotion:
     """The motion of MOTIONS that the torso follows, and the evidence for it.
 
-    misfit    motion -> share of the points below the head, held out from fitting, that images do
+    misfit    motion -> fraction of the points below the head, held out from fitting, that images do
               not explain
     turn_deg  largest angle between torso and head
     shift_mm  largest distance of the torso from where the neck's joint holds it; 0 where a rotation

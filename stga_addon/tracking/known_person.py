@@ -83,7 +83,7 @@ def without_own_bias(take: RecordedTake, person: KnownPerson, workers: Workers) 
             *work, lambda steps: workers.report(Stage.FIT, 0, ROUNDS)
         )
         points = PosedPoints(fit.head.model, take.places)
-        shares: dict[str, list[np.ndarray]] = {}
+        fractions: dict[str, list[np.ndarray]] = {}
         for timestep, values in fit.parameters.items():
             own = take.landmarks[timestep]
             mesh = posed_mesh(fit, values)
@@ -94,8 +94,8 @@ def without_own_bias(take: RecordedTake, person: KnownPerson, workers: Workers) 
                 if len(faces) == 1:
                     found = landmark_bias.without_bias(faces[0], camera, neutral, take.reliable)
                     away = found - camera.project(head)[0]
-                    shares.setdefault(name, []).append(away / face_size(faces[0]))
-        bias = {name: np.median(found, axis=0) for name, found in shares.items()}
+                    fractions.setdefault(name, []).append(away / face_size(faces[0]))
+        bias = {name: np.median(found, axis=0) for name, found in fractions.items()}
         moved = {}
         for timestep, own in take.landmarks.items():
             seen = zip(own.names, own.points, strict=True)

@@ -130,7 +130,7 @@ def write_contact_sheet(
     """Write a PNG: a chart of the errors, cameras down and timesteps across, and the worst views
     with the mesh. What lies outside a view's mask is green.
 
-    misfit: region of the face -> timestep -> share of the images that is not explained; it is
+    misfit: region of the face -> timestep -> fraction of the images that is not explained; it is
     charted below, and counts as much as the reprojection error in which views are the worst. Raises
     StgaError where the file cannot be written or a frame cannot be read.
     """
@@ -185,8 +185,8 @@ def _chart(groups: Sequence[tuple[Errors, float]], timesteps: tuple[int, ...]) -
         _write(chart, (0, row * CELL_HEIGHT), name[-22:], CELL_HEIGHT - 3)
         cells = np.empty((1, len(timesteps), 3), np.uint8)
         for column, timestep in enumerate(timesteps):
-            share = own.get(timestep, 0.0) / median
-            color = [np.interp(share, stops, channel) for channel in ERROR_COLORS.T]
+            fraction = own.get(timestep, 0.0) / median
+            color = [np.interp(fraction, stops, channel) for channel in ERROR_COLORS.T]
             cells[0, column] = color if timestep in own else NO_FACE
         size = width - NAME_WIDTH, CELL_HEIGHT - 1
         strip = Image.fromarray(cells).resize(size, Image.Resampling.NEAREST)

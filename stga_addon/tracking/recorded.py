@@ -33,7 +33,7 @@ from .stages import Stage, Workers
 BUNDLED_PLACES = Path(__file__).parent / "networks/bundled_head_places.npz"
 """Landmarks on the bundled head, as `calibrate` finds them; made by
 `development/bundled_head.py`."""
-MIN_FACE_SHARE = 1 / 3  # Of the timesteps, at which a face has to be detected
+MIN_FACE_FRACTION = 1 / 3  # Of the timesteps, at which a face has to be detected
 FACE_REMEDY = "where the face is too small in the frame, crop the video to head and shoulders"
 MIN_FACE_PIXELS = 1.0  # Extent of the landmarks in an image, below which they are but a point
 
@@ -145,7 +145,7 @@ def _detected(
         unbiased = partial(without_bias, neutral=neutral, reliable=reliable)
         detected = detect_landmarks(footage, detector, unbiased, kept, workers)
         _check_faces(footage, detected)
-        _check_share(footage, detected)
+        _check_fraction(footage, detected)
     except StgaError:
         if not is_begun:  # what it holds is of no use for other footage
             workers.helpers.end()  # which may be writing frames
@@ -214,7 +214,7 @@ def _check_faces(footage: Footage, found: Mapping[str, CameraLandmarks]) -> None
         )
 
 
-def _check_share(footage: Footage, found: Mapping[str, CameraLandmarks]) -> None:
+def _check_fraction(footage: Footage, found: Mapping[str, CameraLandmarks]) -> None:
     """Raise StgaError where faces are detected at so few timesteps that the take would be a
     guess."""
     seen = {
@@ -223,11 +223,11 @@ def _check_share(footage: Footage, found: Mapping[str, CameraLandmarks]) -> None
         for timestep in camera.timesteps[camera.confidence.any(axis=1)].tolist()
     }
     total = len(footage.timesteps)
-    if len(seen) < MIN_FACE_SHARE * total:
+    if len(seen) < MIN_FACE_FRACTION * total:
         raise StgaError(
             f"{_first_frame(footage)}: a face, and one alone, is found at {len(seen)} of {total} "
-            f"timesteps, expected {MIN_FACE_SHARE:.0%} of them at least; {FACE_REMEDY}, or choose "
-            "the frames that show it"
+            f"timesteps, expected {MIN_FACE_FRACTION:.0%} of them at least; {FACE_REMEDY}, or "
+            "choose the frames that show it"
         )
 
 

@@ -61,8 +61,8 @@ class FittedHead:
     def show(self, workers: Workers, errors: Errors) -> None:
         """Draw the head over the footage, with figures of how well it fits."""
         quality = {"error_px": median_px(errors)}
-        shares = [share for own in self.misfits.values() for share in own.values()]
-        quality |= {"unexplained": float(np.mean(shares))} if shares else {}
+        fractions = [fraction for own in self.misfits.values() for fraction in own.values()]
+        quality |= {"unexplained": float(np.mean(fractions))} if fractions else {}
         workers.show(partial(picture_of_fit, self.fit, self.recorded.footage), quality)
 
 
@@ -178,8 +178,8 @@ def interpolated(
 def _misfits(dense: DenseFit | None) -> Misfits:
     if dense is None:
         return {}
-    shares = {t: own.tolist() for t, own in dense.misfit.items()}
-    return {name: {t: own[n] for t, own in shares.items()} for n, name in enumerate(REGIONS)}
+    fractions = {t: own.tolist() for t, own in dense.misfit.items()}
+    return {name: {t: own[n] for t, own in fractions.items()} for n, name in enumerate(REGIONS)}
 
 
 def _with_images(fitted: FittedHead) -> FittedHead:
@@ -228,13 +228,13 @@ def _warnings(fitted: FittedHead) -> tuple[str, ...]:
     fit = fitted.fit
     missing = [timestep for timestep in footage.timesteps if timestep not in fit.parameters]
     listed = ", ".join(map(str, missing[:20])) + (", …" if len(missing) > 20 else "")
-    share = f"{len(missing)} of {len(footage.timesteps)} timesteps"
+    fraction = f"{len(missing)} of {len(footage.timesteps)} timesteps"
     blind = recorded.blind_cameras
     single = len(footage.cameras) == 1
     scale = f"{fit.to_capture.scale:.4g}"
     is_scaled = recorded.opened.keeps_world and not recorded.take.metric
     own = {
-        f"no face at {share}, interpolated: {listed}": bool(missing),
+        f"no face at {fraction}, interpolated: {listed}": bool(missing),
         f"no face in any frame of: {', '.join(blind)}": bool(blind),
         "one camera: size and distance of the head, and its depth, are those of the average "
         "head": single and recorded.opened.options.person is None,

@@ -358,12 +358,12 @@ def _smooth_step(
     jump = second**2 * stiffness / JUMP_SCALE**2
     # a cut changes all parameters
     weight = stiffness / ((1 + jump) * (1 + jump.mean(axis=1, keepdims=True))) ** 2
-    for number, (difference, share) in enumerate(zip(second, weight, strict=True)):
+    for number, (difference, fraction) in enumerate(zip(second, weight, strict=True)):
         for row, first in enumerate((1.0, -2.0, 1.0)):
-            right[number + row] -= share * first * difference
+            right[number + row] -= fraction * first * difference
             for column, other in enumerate((1.0, -2.0, 1.0)[: row + 1]):
                 at = (number + column) * size
-                band[(row - column) * size, at : at + size] += share * first * other
+                band[(row - column) * size, at : at + size] += fraction * first * other
     return solveh_banded(band, right.ravel(), lower=True).reshape(count, size)
 
 
@@ -393,16 +393,18 @@ def prior_terms(head: HeadModel, values: np.ndarray) -> tuple[np.ndarray, np.nda
         precision[..., :-RIGID_SIZE] += (excess != 0) / WEIGHT_EXCESS_SIGMA**2
         right[..., :-RIGID_SIZE] -= excess / WEIGHT_EXCESS_SIGMA**2
         for side in ("Left", "Right"):
-            columns, shares = lid_shares(head.model, side)
-            beyond = np.maximum((weights[..., columns] * shares).sum(-1, keepdims=True) - 1, 0)
-            precision[..., columns] += (beyond > 0) * shares * shares.sum() / WEIGHT_EXCESS_SIGMA**2
-            right[..., columns] -= beyond * shares / WEIGHT_EXCESS_SIGMA**2
+            columns, fractions = lid_fractions(head.model, side)
+            beyond = np.maximum((weights[..., columns] * fractions).sum(-1, keepdims=True) - 1, 0)
+            precision[..., columns] += (
+                (beyond > 0) * fractions * fractions.sum() / WEIGHT_EXCESS_SIGMA**2
+            )
+            right[..., columns] -= beyond * fractions / WEIGHT_EXCESS_SIGMA**2
     return precision, right
 
 
-def lid_shares(model: FlameModel, side: str) -> tuple[list[int], np.ndarray]:
+def lid_fractions(model: FlameModel, side: str) -> tuple[list[int], np.ndarray]:
     """Columns (N,) of the expressions that close the eye on a side, "Left" or "Right", and their
-    shares (N,)."""
+    fractions (N,)."""
     names = model.expression_names
     known = [name for name in LID_SHAPES if name + side in names]
     columns = [names.index(name + side) for name in known]

@@ -14,7 +14,7 @@ class Stage(Enum):
     """What a tracking does, in order.
 
     title       what it is called
-    begin, end  of the progress: about its share of the time on two processors where one camera
+    begin, end  of the progress: about its part of the time on two processors where one camera
                 recorded a long video of 1080p (`stage_spans` knows of shorter ones); what precedes
                 it, where cameras are to be found, begins at -1, and what follows the capture at 1
     """
@@ -78,8 +78,8 @@ def stage_spans(images: int, absent: Collection[Stage]) -> dict[Stage, tuple[flo
     times = dict[Stage, float]()
     for stage in Stage:
         if stage.begin >= 0 and stage.end <= 1 and stage not in (*absent, Stage.CORRECTION):
-            share = stage.end - stage.begin
-            times[stage] = FIXED_S.get(stage, 0.0) + IMAGE_S * images * share
+            fraction = stage.end - stage.begin
+            times[stage] = FIXED_S.get(stage, 0.0) + IMAGE_S * images * fraction
     total = sum(times.values())
     spans = {}
     begin = 0.0

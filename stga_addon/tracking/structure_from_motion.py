@@ -38,7 +38,7 @@ LOOP_STEP = 4
 MIN_MODEL_IMAGES = 3
 """Images of the smallest model that COLMAP keeps."""
 LENS_GAIN = 0.03
-"""Least share by which a radial distortion lowers the residuals, for it to be believed."""
+"""Least fraction by which a radial distortion lowers the residuals, for it to be believed."""
 LENS_SHIFT_PX = 0.5
 """Least shift of an image's corners by a distortion that is believed."""
 LOSS_SCALE_PX = 1.0

@@ -45,19 +45,19 @@ SURFACE_POINTS = 2000
 """Points over the whole head."""
 SURFACE_TIMESTEPS = 6
 """Timesteps, spread over the take, whose surfaces identity and offsets are solved from."""
-LANDMARK_SHARE = 0.1
+LANDMARK_FRACTION = 0.1
 """Weight of landmarks beside surface points: a detector's errors are the same in every frame and
 stay."""
-TAKE_LANDMARK_SHARE = 0.2
+TAKE_LANDMARK_FRACTION = 0.2
 """The same once these errors are taken off, which takes several timesteps: where skin slides along
 itself, as brows do, only landmarks show it."""
-LIPS_LANDMARK_SHARE = 1.0
+LIPS_LANDMARK_FRACTION = 1.0
 """Weight of the lips' landmarks, beside which the surface does not show whether lips touch."""
 MIN_SEEN_POINTS = 150
 """Points of the surface that have to be found at a timestep; below it, landmarks are the better
 evidence."""
-MIN_SEEN_SHARE = 0.5
-"""Share of the timesteps in which a point must be found to be looked for at every timestep."""
+MIN_SEEN_FRACTION = 0.5
+"""Fraction of the timesteps in which a point must be found to be looked for at every timestep."""
 
 PART_TIMESTEPS = 24
 """Timesteps of a take that are searched at once, at most."""
@@ -122,7 +122,7 @@ def fit_surface(
             poses = np.stack([fit.parameters[t] for t in observed])
             poses = solve_take(found.head, take.places, list(observed.values()), poses, fit.ordered)
             return replace(found, parameters=dict(zip(observed, poses, strict=True)))
-    often = np.mean([own.weight > 0 for own in seen.values()], axis=0) >= MIN_SEEN_SHARE
+    often = np.mean([own.weight > 0 for own in seen.values()], axis=0) >= MIN_SEEN_FRACTION
     rows = np.flatnonzero(often)
     sought = []
     for sweep, count in TAKE_SWEEPS:
@@ -202,9 +202,9 @@ def _identity(
         if np.median([(own.weight > 0).sum() for own in seen.values()]) < MIN_SEEN_POINTS:
             return None
         base = with_offset(head, offset)
-        share = _landmark_shares(base, take.places)
+        fraction = _landmark_fractions(base, take.places)
         together = [
-            _joined(head_fit.landmarks_in_capture(take.landmarks[t], take, fit), share, own)
+            _joined(head_fit.landmarks_in_capture(take.landmarks[t], take, fit), fraction, own)
             for t, own in seen.items()
         ]
         starts = np.stack([fit.parameters[t][-RIGID_SIZE:] for t in seen])
@@ -264,11 +264,11 @@ def _whole_take(
     start[:, -RIGID_SIZE:] = [head_fit.rigid_start(at, own) for own in landmarks]
     start = solve_take(fit.head, take.places, landmarks, start, fit.ordered)
     rough = replace(fit, parameters=dict(zip(timesteps, start, strict=True)))
-    share = np.full(len(take.reliable), TAKE_LANDMARK_SHARE)
+    fraction = np.full(len(take.reliable), TAKE_LANDMARK_FRACTION)
     if len(fit.parameters) == 1:
-        share = _landmark_shares(fit.head, take.places)
+        fraction = _landmark_fractions(fit.head, take.places)
     parts = [
-        (*head_fit.excerpt(rough, take, part), [corrected[t] for t in part], share, sought)
+        (*head_fit.excerpt(rough, take, part), [corrected[t] for t in part], fraction, sought)
         for part in parts_of(timesteps, PART_TIMESTEPS)
     ]
     found, together = zip(*search(_found_part, parts), strict=True)
@@ -281,7 +281,7 @@ def _found_part(
     fit: HeadFit,
     take: RecordedTake,
     landmarks: Sequence[Observation],
-    share: np.ndarray,
+    fraction: np.ndarray,
     sought: Sequence[SurfaceSearch],
     step: Step,
 ) -> list[tuple[np.ndarray, Observation]]:
@@ -293,7 +293,7 @@ def _found_part(
         pictures = take.images(t), take.masks(t, MAX_OUTLINE_CAMERAS)
         for on, visible in zip(sought, visible_points, strict=True):
             rough = replace(fit, parameters={t: here})
-            joined = _joined(own, share, seen_surface(rough, t, on, *pictures, visible))
+            joined = _joined(own, fraction, seen_surface(rough, t, on, *pictures, visible))
             places = take.places + on.points
             (here,) = solve_take(fit.head, places, [joined], here[None], ordered=False)
         results.append((here, joined))
@@ -313,22 +313,23 @@ def _fitted_landmarks(fit: HeadFit, first: HeadFit, take: RecordedTake) -> dict[
     return found
 
 
-def _landmark_shares(head: HeadModel, places: SurfacePoints) -> np.ndarray:
-    """(N,) of the landmarks' weights: LIPS_LANDMARK_SHARE where the model's lips are, else
-    LANDMARK_SHARE."""
+def _landmark_fractions(head: HeadModel, places: SurfacePoints) -> np.ndarray:
+    """(N,) of the landmarks' weights: LIPS_LANDMARK_FRACTION where the model's lips are, else
+    LANDMARK_FRACTION."""
     lips = faces_within(head.model.faces, head.model.masks.get("lips", np.zeros(0, np.int64)))
-    return np.where(lips[places.face], LIPS_LANDMARK_SHARE, LANDMARK_SHARE)
+    return np.where(lips[places.face], LIPS_LANDMARK_FRACTION, LANDMARK_FRACTION)
 
 
-def _joined(landmarks: Observation, share: np.ndarray, surface: SeenSurface) -> Observation:
-    """Both as one observation, landmarks at shares (N,) of their weight; the surface counts along
+def _joined(landmarks: Observation, fraction: np.ndarray, surface: SeenSurface) -> Observation:
+    """Both as one observation, landmarks at fractions (N,) of their weight; the surface counts
+    along
     its normal."""
     along = surface.normal[:, :, None] * surface.normal[:, None, :]
     root = LANDMARK_SIGMA_M / SURFACE_SIGMA_M * along
     return Observation(
         np.concatenate([landmarks.position, surface.position]),
         np.concatenate([landmarks.root, root]),
-        np.concatenate([share * landmarks.weight, surface.weight]),
+        np.concatenate([fraction * landmarks.weight, surface.weight]),
     )
 
 
@@ -352,8 +353,8 @@ def smooth_offsets(
     rows = np.repeat(np.arange(len(points)), 3)
     places = rows, faces[points.face].ravel()
     at = coo_array((points.barycentric.ravel(), places), shape=(len(points), count)).tocsr()
-    share = np.linalg.norm(triangle_normals(vertices[faces]), axis=1) / 6
-    area = np.bincount(faces.ravel(), np.repeat(share, 3), count)
+    fraction = np.linalg.norm(triangle_normals(vertices[faces]), axis=1) / 6
+    area = np.bincount(faces.ravel(), np.repeat(fraction, 3), count)
     laplacian = _laplacian(vertices, faces, area)
     smooth = SMOOTHING_M**4 * laplacian.T @ diags_array(area) @ laplacian
     small = diags_array((SMOOTHING_M / OFFSET_SIGMA_M) ** 4 * np.maximum(area, 1e-9))

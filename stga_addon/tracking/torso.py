@@ -238,9 +238,9 @@ class _Follower:
         misfits = []
         for start in starts:
             at = self._posed(now.timestep, start)
-            share, shown = self.seen.unexplained(now, at, START_LEVEL)
+            fraction, shown = self.seen.unexplained(now, at, START_LEVEL)
             use = shown & self.seen.fitted
-            misfits.append(float(share[use].mean()) if use.any() else 1.0)
+            misfits.append(float(fraction[use].mean()) if use.any() else 1.0)
         best = starts[int(np.argmin(misfits))]
         found = self._descended(now, best, pose, FINE_STEPS)
         return found.points() + self._pivot(now.timestep)

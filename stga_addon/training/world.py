@@ -24,8 +24,8 @@ MAX_PLATE_VIEWS = 24
 """Views of a camera that its plate is the median of."""
 MAX_PLATE_PIXELS = 500_000
 """Larger images are read smaller."""
-MATTE_MARGIN_SHARE = 0.008
-"""Around the person, where a matte is uncertain; share of the image's height."""
+MATTE_MARGIN_FRACTION = 0.008
+"""Around the person, where a matte is uncertain; fraction of the image's height."""
 PERSON = 256
 """Value above every level of a pixel, so that it is sorted behind them."""
 RADII = 24
@@ -44,7 +44,7 @@ MIN_SHARED = 0.1
 distance."""
 MIN_SIMILARITY = 0.3
 """Correlation of what both plates show there at least."""
-DETAIL_SHARES = 0.003, 0.03
+DETAIL_FRACTIONS = 0.003, 0.03
 """Filters between which lie the details that plates are compared by; of the image's height."""
 LARGEST_BLOCK = 16
 """Side of the largest block of the image that one splat stands for, in pixels."""
@@ -58,7 +58,7 @@ SAME_LEVELS = 8.0
 """A block is left out whose color another plate shows there, to so many of 255 levels."""
 BLOCK_WIDTH = 0.8
 """Standard deviation of a block's splat, in sides of the block."""
-THICKNESS_SHARE = 0.2
+THICKNESS_FRACTION = 0.2
 """Thickness of a splat as a fraction of its block's side."""
 START_OPACITY = 5.0
 """Logit of the opacity that splats begin with."""
@@ -102,7 +102,7 @@ def clean_plates(capture: Capture, correct: Correction | None = None) -> list[Cl
             if correct is not None:
                 image = correct(view, image, None)
             assert mask is not None
-            margin = max(1, round(MATTE_MARGIN_SHARE * len(mask)))
+            margin = max(1, round(MATTE_MARGIN_FRACTION * len(mask)))
             person = binary_dilation(mask > 0, iterations=margin)
             stack.append(np.where(person[..., None], PERSON, image).astype(np.uint16))
         levels = np.sort(np.stack(stack, axis=-1), axis=-1)
@@ -189,7 +189,9 @@ def shell_radius(plates: Sequence[CleanPlate], center: np.ndarray) -> float:
     """Meters from the person's center (3,) to the shell on which plates look most alike."""
     details = []  # without coarse colors, which light and exposure change, and without noise
     for plate in plates:
-        sizes = [np.array([share, share, 0.0]) * len(plate.image) for share in DETAIL_SHARES]
+        sizes = [
+            np.array([fraction, fraction, 0.0]) * len(plate.image) for fraction in DETAIL_FRACTIONS
+        ]
         fine, coarse = (gaussian_filter(plate.image, size) for size in sizes)
         details.append(fine - coarse)
     distance = np.median([np.linalg.norm(plate.camera.position - center) for plate in plates])
@@ -257,7 +259,7 @@ def first_splats(plates: Sequence[CleanPlate], center: np.ndarray) -> Splats:
             points = points[new]
             count = int(new.sum())
             width = BLOCK_WIDTH * sides[new] * camera.project(points)[1] / camera.fl_x
-            log_scale = np.log(np.stack([width, width, THICKNESS_SHARE * width], axis=1))
+            log_scale = np.log(np.stack([width, width, THICKNESS_FRACTION * width], axis=1))
             turn = from_matrices(camera.world_to_camera[None, :3, :3].transpose(0, 2, 1))
             sh = np.zeros((count, (SH_DEGREE + 1) ** 2, 3), np.float32)
             sh[:, 0] = (colors[new] - 0.5) / SH_C0

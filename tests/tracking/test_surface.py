@@ -221,7 +221,7 @@ def test_one_timestep_does_not_tell_the_errors_of_landmarks(head, monkeypatch):
     first = fit_head(head, take)
     found = []
     for share in (0.2, 5.0):
-        monkeypatch.setattr("stga_addon.tracking.surface.TAKE_LANDMARK_SHARE", share)
+        monkeypatch.setattr("stga_addon.tracking.surface.TAKE_LANDMARK_FRACTION", share)
         found.append(fit_surface(head, first, take, Workers(Helpers(1))).parameters[0])
     assert np.abs(found[0] - first.parameters[0]).max() > 0.001
     assert np.array_equal(*found)

@@ -111,7 +111,7 @@ def test_the_capture_opens_and_projects_where_the_landmarks_were(recorded, head)
     vertices = np.array([line.split()[1:] for line in mesh if line.startswith("v ")], float)
     assert_allclose(vertices, capture.mesh(1), atol=2e-6)
     assert (folder / "out/contact_sheet.png").is_file()
-    shares = [progress.share for progress in told]
+    shares = [progress.fraction for progress in told]
     assert shares == sorted(shares)
     assert {progress.stage for progress in told} <= {*(stage.title for stage in Stage), "Tracked"}
     quality = {progress.stage: progress.figures().get("error_px") for progress in told}

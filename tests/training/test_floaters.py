@@ -99,7 +99,8 @@ def test_after_a_short_training(typical, toy):
 
 
 def test_a_pruning_comes_once(toy):
-    """Catches a look that is missed or made twice where steps take different shares of the budget,
+    """Catches a look that is missed or made twice where steps take different fractions of the
+    budget,
     or where a run is resumed between two steps."""
     shares = np.cumsum(np.random.default_rng(0).uniform(0.001, 0.05, 60))
     shares = shares[shares < 1]

@@ -352,13 +352,14 @@ def global_step(
 
 
 def two_regions(
-    splats: Splats, mesh: np.ndarray, faces: np.ndarray, share: float, head: str = "bundled"
+    splats: Splats, mesh: np.ndarray, faces: np.ndarray, fraction: float, head: str = "bundled"
 ) -> np.ndarray:
-    """(F,) bool: triangles nearest to two points on the front (an eye, the mouth), with `share` of
+    """(F,) bool: triangles nearest to two points on the front (an eye, the mouth), with `fraction`
+    of
     the splats."""
     center = mesh[faces].mean(1)
     away = np.minimum(*(np.linalg.norm(center - p, axis=1) for p in REGIONS[head]))
-    return np.asarray(away <= np.quantile(away[splats.face], share))
+    return np.asarray(away <= np.quantile(away[splats.face], fraction))
 
 
 def main() -> None:
@@ -397,10 +398,10 @@ def main() -> None:
 
     whole = measure(batch)
     print(f"{'whole iteration':<31}{whole:8.2f}")
-    for share in (0.05, 0.1, 0.2, 0.4):
-        selected = two_regions(splats, mesh, faces, share, options.head)
+    for fraction in (0.05, 0.1, 0.2, 0.4):
+        selected = two_regions(splats, mesh, faces, fraction, options.head)
         part = measure(replace(batch, selected=selected))
-        name = f"local, {share:4.0%} selected"
+        name = f"local, {fraction:4.0%} selected"
         print(f"{name:<31}{part:8.2f}   {part / whole:.2f} of a global one")
 
 

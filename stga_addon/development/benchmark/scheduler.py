@@ -81,8 +81,8 @@ def train_in_turns(
         for turn in range(1, rounds + 1):
             say(f"Training, turn {turn} of {rounds}")
             for number, worker in enumerate(rng.sample(workers, len(workers))):
-                share = (turn - 1 + number / len(workers)) / rounds
-                if report(Progress(share, "Training", f"Turn {turn} of {rounds}")):
+                fraction = (turn - 1 + number / len(workers)) / rounds
+                if report(Progress(fraction, "Training", f"Turn {turn} of {rounds}")):
                     raise Cancelled
                 worker.train_until(turn / rounds)
     finally:
@@ -122,13 +122,13 @@ class _Worker:
             )
         self._read_reply()
 
-    def train_until(self, share: float) -> None:
-        """Train up to a share of the budget; returns when that is done."""
+    def train_until(self, fraction: float) -> None:
+        """Train up to a fraction of the budget; returns when that is done."""
         if self._ready:
             assert self._process is not None
             assert self._process.stdin is not None
             with suppress(OSError):  # the process has ended, which reading its reply reports
-                self._process.stdin.write(f"{share!r}\n")
+                self._process.stdin.write(f"{fraction!r}\n")
                 self._process.stdin.flush()
             self._read_reply()
 
@@ -156,7 +156,7 @@ class _Worker:
         line = self._process.stdout.readline()
         log = self._run.out / "log.txt"
         reply = json.loads(line) if line else {"error": f"Worker exited unexpectedly. Log: {log}"}
-        self._ready = "share" in reply
+        self._ready = "fraction" in reply
         self.error = reply.get("error", "")
         # it ends: left unawaited, it would stay a process until the last run is trained
         if not self._ready:

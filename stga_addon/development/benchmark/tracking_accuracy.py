@@ -9,9 +9,9 @@ FLAME's open template (`v_template`, `shapedirs`, `faces`); without it, the bund
 millimeters, within 9 cm of the landmarks' center: how far what the cameras see of the capture's
 mesh, by its triangles' centers, is from the tracked surface and, where both have the same topology,
 vertices from each other. Of several timesteps with the bundled head, also how the true motion about
-its mean shows in the tracked one, the head held still: the share that is followed, correlation and
-median error of what moves by brows, lids, lips and jaw. Landmarks are detected, or read from the
-folder of --landmarks; --cameras: as many of those nearest to the middle, every second one.
+its mean shows in the tracked one, the head held still: the fraction that is followed, correlation
+and median error of what moves by brows, lids, lips and jaw. Landmarks are detected, or read from
+the folder of --landmarks; --cameras: as many of those nearest to the middle, every second one.
 """
 
 import argparse

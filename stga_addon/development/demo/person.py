@@ -308,8 +308,8 @@ def _scatter(
     density."""
     skin = np.flatnonzero((paint.faces < MOUTH_INSIDE[0]).all(1))
     corners = paint.at[paint.faces[skin]]
-    share = density(corners.mean(1)) * face_areas(paint.at, paint.faces[skin])
-    triangle = rng.choice(len(skin), 2 * count, p=share / share.sum())
+    fraction = density(corners.mean(1)) * face_areas(paint.at, paint.faces[skin])
+    triangle = rng.choice(len(skin), 2 * count, p=fraction / fraction.sum())
     inside = rng.dirichlet((1, 1, 1), len(triangle))
     kept = rng.random(len(triangle)) < density(np.einsum("nk,nka->na", inside, corners[triangle]))
     return skin[triangle[kept][:count]], inside[kept][:count]
@@ -325,7 +325,7 @@ class _Growth:
     rise       degrees over the skin at the root, which `lift` (roots -> (N,)) scales, and at the
                tip
     disorder   standard deviation of each hair's own direction
-    clump      share by which tips gather at that of one in HAIRS_PER_CLUMP hairs
+    clump      fraction by which tips gather at that of one in HAIRS_PER_CLUMP hairs
     clearance  meters that tips keep from the skin
     """
 
@@ -364,9 +364,9 @@ def _grow(
         along = growth.heading(root_cm, normal) + own
         along -= (along * normal).sum(1, keepdims=True) * normal
         along /= np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-9)
-        share = (number - 1) / (POINTS_PER_HAIR - 2)
+        fraction = (number - 1) / (POINTS_PER_HAIR - 2)
         rise = np.radians(
-            growth.rise[0] * growth.lift(root_cm) * (1 - share) + growth.rise[1] * share
+            growth.rise[0] * growth.lift(root_cm) * (1 - fraction) + growth.rise[1] * fraction
         )[:, None]
         at = at + step[:, None] * (np.cos(rise) * along + np.sin(rise) * normal)
         height = ((at - neutral[near]) * normal).sum(1)
@@ -430,8 +430,8 @@ def _all_strands(paint: _Paint, neutral: np.ndarray) -> tuple[Strands, ...]:
         """To the person's left over the top; down and back at the sides and behind."""
         crown = np.tile([1.0, 0.0, -0.3], (len(root), 1))
         falling = np.tile([0.0, -1.0, -0.45], (len(root), 1))
-        share = (top(root) * _step(normal[:, 1], 0.2, 0.7))[:, None]
-        return np.asarray(share * crown + (1 - share) * falling)
+        fraction = (top(root) * _step(normal[:, 1], 0.2, 0.7))[:, None]
+        return np.asarray(fraction * crown + (1 - fraction) * falling)
 
     hair = _Growth(
         combed,

@@ -172,8 +172,8 @@ def _body(neck: Vector) -> Any:
     torso = _painted(_placed("Torso", _lathe("Torso", RINGS)), (0.02, 0.07, 0.075), 0.9)
     torso.parent = armature
     heights = np.repeat([ring[0] for ring in RINGS], CORNERS)
-    share = np.clip((heights - RINGS[0][0]) / (-0.1 - RINGS[0][0]), 0, 1)
-    for name, weights in (("spine", 1 - share), ("chest", share)):
+    fraction = np.clip((heights - RINGS[0][0]) / (-0.1 - RINGS[0][0]), 0, 1)
+    for name, weights in (("spine", 1 - fraction), ("chest", fraction)):
         group = torso.vertex_groups.new(name=name)
         for index, weight in enumerate(weights.tolist()):
             group.add([index], weight, "REPLACE")

@@ -308,9 +308,11 @@ def eased(
     """The row through a low-pass filter of time constant `smoothing_s` after the one before."""
     if before is None or smoothing_s <= 0:
         return row
-    share = 1 - np.exp(-step_s / smoothing_s)
-    head = before.head + share * (row.head - before.head)
-    return replace(row, weights=before.weights + share * (row.weights - before.weights), head=head)
+    fraction = 1 - np.exp(-step_s / smoothing_s)
+    head = before.head + fraction * (row.head - before.head)
+    return replace(
+        row, weights=before.weights + fraction * (row.weights - before.weights), head=head
+    )
 
 
 @dataclass

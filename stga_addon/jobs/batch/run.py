@@ -58,7 +58,8 @@ class Entry:
 
     @property
     def left_s(self) -> float | None:
-        """Seconds until it is finished, by its share done, else by its forecast; None: unknown."""
+        """Seconds until it is finished, by its fraction done, else by its forecast; None:
+        unknown."""
         if self.state.is_over:
             return 0.0
         spent = self.status.seconds if self.state == JobState.RUNNING else 0.0

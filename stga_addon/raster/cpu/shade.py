@@ -46,7 +46,8 @@ raised."""
 
 @part_jit
 def ggx(facing, toward_eye, half, fresnel_cosine, square, reflectance):
-    """Reflected share per steradian and cosine of a GGX lobe with Smith's shadowing and Schlick's
+    """Reflected fraction per steradian and cosine of a GGX lobe with Smith's shadowing and
+    Schlick's
     Fresnel term.
 
     facing, toward_eye, half: cosines of the normal to light, eye and the direction half between

@@ -28,7 +28,7 @@ FOLD_M = 0.03
 """Skin that sees other skin within this, as in mouth, nostrils and between lids, throws none: below
 its surface is the other one."""
 LIFT_M = 1e-4
-TRANSLUCENT_SHARE = 1e-3
+TRANSLUCENT_FRACTION = 1e-3
 
 
 def _surface(nodes: Nodes, splats: Any, head: Any) -> bpy.types.NodeSocket:
@@ -76,7 +76,7 @@ def _lit_shader(nodes: Nodes) -> Any:
     skin = nodes.out("ShaderNodeBsdfPrincipled", surface)
     # Else Cycles' light tree leaves out lamps behind an ellipsoid, if not behind the mesh.
     shaders = [skin, nodes.out("ShaderNodeBsdfTranslucent")]
-    lit = nodes.out("ShaderNodeMixShader", {"Fac": TRANSLUCENT_SHARE, "Shader": shaders})
+    lit = nodes.out("ShaderNodeMixShader", {"Fac": TRANSLUCENT_FRACTION, "Shader": shaders})
     return _by_shadow(nodes, lit, None)
 
 

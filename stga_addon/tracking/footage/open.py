@@ -144,7 +144,7 @@ def _mask_views(frames: Frames) -> Mapping[int, View]:
 
 
 def sized(footage: Footage, size: float) -> Footage:
-    """The footage with images of a share of the recorded size."""
+    """The footage with images of a fraction of the recorded size."""
     cameras = []
     for own in footage.cameras:
         ideal = own.camera.scaled(size)

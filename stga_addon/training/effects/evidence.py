@@ -54,8 +54,8 @@ class Evidence:
         return math.sqrt(max(0.0, self.before**2 - self.after**2))
 
     @property
-    def share(self) -> float:
-        """Explained share of the error's variance."""
+    def fraction(self) -> float:
+        """Explained fraction of the error's variance."""
         return (self.gain / max(self.before, 1e-9)) ** 2
 
     @property

@@ -52,16 +52,16 @@ MESH_AS_MASK = (
     "makes masks)"
 )
 """Treatment of images without a mask."""
-MIN_UNCOVERED_SHARE = 0.003
-"""Share of the foreground that the mesh does not cover, from which splats are added for it."""
+MIN_UNCOVERED_FRACTION = 0.003
+"""Fraction of the foreground that the mesh does not cover, from which splats are added for it."""
 MIN_PIXELS_PER_SPLAT = 0.5
 """90th percentile over triangles, below which further splats have no detail to show."""
 MIN_LIP_GAP_MM = 1.5
 """Gap between the lips above which the inside of the mouth is visible."""
 MIN_JAW_ANGLE_DEG = 3.0
 """Rotation of the jaw above which it is visible."""
-MAX_OUTSIDE_SHARE = 0.001
-"""Share of the mesh outside of the masks above which the tracking is inaccurate."""
+MAX_OUTSIDE_FRACTION = 0.001
+"""Fraction of the mesh outside of the masks above which the tracking is inaccurate."""
 
 
 @dataclass(frozen=True)
@@ -89,7 +89,7 @@ def view_color(facts: CaptureFacts) -> Verdict:
     direction = facts.samples.direction
     folds = scattered_folds(np.arange(len(direction)))
     found = linear_evidence(facts.matched_colors, direction, folds, MAX_VIEW_ERROR_RATIO)
-    variance = f"({found.share:.1%} of the variance)"
+    variance = f"({found.fraction:.1%} of the variance)"
     reason = f"colors depend on the view by {found.gain:.1f} of 255 levels {variance}"
     return Verdict(found.gain >= MIN_VIEW_DEPENDENCE_LEVELS, reason)
 
@@ -163,7 +163,7 @@ def hull_points(facts: CaptureFacts) -> Verdict:
     reason = f"{uncovered:.1%} of the foreground lies beside the mesh"
     if facts.has_one_camera:
         reason += "; a single camera does not show how far away, so that it becomes a flat layer"
-    return Verdict(uncovered > MIN_UNCOVERED_SHARE, reason)
+    return Verdict(uncovered > MIN_UNCOVERED_FRACTION, reason)
 
 
 def depth_limits(facts: CaptureFacts) -> Verdict:
@@ -181,14 +181,14 @@ def density(facts: CaptureFacts) -> Verdict:
 
 def selection(facts: CaptureFacts) -> Verdict:
     threshold = 1000 * facts.settings.selection.threshold
-    if facts.selected_share == 0:
+    if facts.selected_fraction == 0:
         count = len(facts.sampled_timesteps)
         total = len(facts.capture.timesteps)
         reason = f"no triangle moves by more than {threshold:g} mm in any of {count} frames"
         return Verdict(False, reason, fixed=count == total)
-    share = f"{facts.selected_share:.0%}"
+    fraction = f"{facts.selected_fraction:.0%}"
     asked = facts.settings.strategy == "selective"
-    reason = f"a frame moves {share} of the triangles by more than {threshold:g} mm"
+    reason = f"a frame moves {fraction} of the triangles by more than {threshold:g} mm"
     return Verdict(asked, reason + ("" if asked else ", but training all of them measured best"))
 
 
@@ -303,7 +303,7 @@ def tracking(facts: CaptureFacts) -> Verdict | None:
     if np.isnan(outside):
         return Verdict(False, "without masks, the mesh cannot be compared with the images")
     reason = f"{outside:.2%} of the mesh sticks out of the masks"
-    return Verdict(outside > MAX_OUTSIDE_SHARE, reason)
+    return Verdict(outside > MAX_OUTSIDE_FRACTION, reason)
 
 
 RULES: dict[str, Rule] = {

@@ -88,7 +88,7 @@ def step_offsets(
         is_color = offset.target == COLOR
         arrays = (own.value, own.value, own.first, own.second, own.average)
         tables = [array.reshape(len(own.steps), 9) for array in arrays]
-        rate = np.full(9, offset.rate_share * rates[offset.rate], np.float32)
+        rate = np.full(9, offset.rate_fraction * rates[offset.rate], np.float32)
         step_offset(
             state.rows_by_triangle,
             stepped,

@@ -43,7 +43,7 @@ from ...light.harmonics import basis
 from ...progress import Cancelled
 from ...render.render import render_avatar, to_uint8
 from ...tracking import appearance, solve
-from ...tracking.appearance import NOISE_LEVELS, POINT_SHARE
+from ...tracking.appearance import NOISE_LEVELS, POINT_FRACTION
 from ...tracking.head_model import HeadModel
 from ...tracking.posed_points import PosedPoints
 from ...tracking.seen_surface import in_sight, surface_points
@@ -53,7 +53,7 @@ from .backend import RenderOptions
 from .cpu_backend import CpuBackend
 from .frames import FrameStore
 from .image_preparation import MAX_GAIN, image_preparation
-from .outlines import TOLERANCE_SHARE
+from .outlines import TOLERANCE_FRACTION
 from .state import state_of_avatar
 
 RENDERINGS = 7
@@ -69,7 +69,7 @@ PYRAMID_PX = (50, 100, 200)
 pattern on clothes misleads by more than its width."""
 PYRAMID_RENDERINGS = 20
 """Renderings at each height of the pyramid."""
-TRACKED_SHARE = 0.2
+TRACKED_FRACTION = 0.2
 """Images that the avatar tracks its head in while it trains, as a fraction of the run's iterations:
 a long take must not track for longer than it trains."""
 MIN_TRACKED_TIMESTEPS = 12
@@ -93,10 +93,10 @@ TRANSLATION_SIGMA_M = 0.02
 SCALE_SIGMA = 0.02
 """Standard deviation of the head's relative size from its start."""
 LEAST_GAIN = 1e-3
-"""Share of the loss by which a step has to lower it; one that does not is the last, but not where
-the first timestep of another recording is sought: it leads all others."""
+"""Fraction of the loss by which a step has to lower it; one that does not is the last, but not
+where the first timestep of another recording is sought: it leads all others."""
 FIRST_STEP = 0.01
-"""Length of the first step, as a share of the one down a loss as steep as the points say."""
+"""Length of the first step, as a fraction of the one down a loss as steep as the points say."""
 MAX_MOVE_M = 0.05
 """Mean distance of the mesh's vertices by which an avatar may move a tracked head at one timestep:
 2.5 standard deviations of its place. Farther, the image does not show the head that was trained."""
@@ -250,13 +250,13 @@ def tracked_timesteps(
     settings: TrainingSettings, capture: Capture, timesteps: Sequence[int]
 ) -> list[int]:
     """Timesteps, evenly spread, that an avatar tracks while it is trained for a number of
-    iterations: as many as TRACKED_SHARE allows. With a budget in seconds, all: time decides."""
+    iterations: as many as TRACKED_FRACTION allows. With a budget in seconds, all: time decides."""
     if settings.iterations is None:
         return list(timesteps)
     wanted = set(timesteps)
     shown = sum(view.timestep in wanted for view in capture.all_views)
     views = min(MAX_VIEWS, max(1.0, shown / max(1, len(timesteps))))
-    most = int(TRACKED_SHARE * settings.iterations / views)
+    most = int(TRACKED_FRACTION * settings.iterations / views)
     return evenly_spread(timesteps, max(MIN_TRACKED_TIMESTEPS, most))
 
 
@@ -318,11 +318,11 @@ def track_by_avatar(
 def normal_images(mesh: np.ndarray, faces: np.ndarray, shown: ArrayPair) -> ArrayPair:
     """Pixels (H, W) bool that show a mesh, and the surface's unit normals there (H, W, 3); shown:
     `rasterize` of the mesh."""
-    triangles, share = shown
+    triangles, fraction = shown
     seen = triangles >= 0
     found = np.zeros((*triangles.shape, 3))
     corners = vertex_normals(mesh, faces)[faces[triangles[seen]]]
-    own = np.einsum("nk,nkc->nc", share[seen], corners)
+    own = np.einsum("nk,nkc->nc", fraction[seen], corners)
     found[seen] = unit(own)
     return seen, found
 
@@ -502,7 +502,7 @@ class _Tracker:
         moved."""
         if not self._cuts or view.mask is not None:
             return image
-        margin = max(1, round(TOLERANCE_SHARE * len(image)))
+        margin = max(1, round(TOLERANCE_FRACTION * len(image)))
         inside = silhouette(self._mesh(view.timestep), self._capture.faces, view.camera)
         inside = binary_erosion(inside, iterations=margin)
         drawn = to_uint8(self._backend.render(view, self._options))
@@ -540,7 +540,7 @@ class _Tracker:
         self._values = values
         self._frames.clear()
         shots = [(view, self._cut(view, image)) for view, image in shots]
-        weights = [POINT_SHARE * image.size / 3 / (NOISE_LEVELS / 255) for _, image in shots]
+        weights = [POINT_FRACTION * image.size / 3 / (NOISE_LEVELS / 255) for _, image in shots]
         total, by_vertex = self._backend.mesh_gradient(shots, weights, self._options)
         offset = self._sequence.frame(shots[0][0].timestep).dynamic_offset
         return total, parameters_gradient(self._head.model, frame_of(values, offset), by_vertex)
@@ -563,7 +563,7 @@ class _Tracker:
             # (N, 3 channels, 2)
             slopes = np.stack(appearance.sampled(list(level.gradient), pixels), -1)
             moved = slopes @ appearance.projection_derivative(level.camera, at) / NOISE_LEVELS
-            weight = POINT_SHARE * (cosine * seen)[:, None] * appearance.CHANNEL_WEIGHTS
+            weight = POINT_FRACTION * (cosine * seen)[:, None] * appearance.CHANNEL_WEIGHTS
             curvature += np.einsum("nc,ncx,ncy->nxy", weight, moved, moved)
         _, jacobian = self._posed_points.linearized(values[:-RIGID_SIZE], values[-RIGID_SIZE:])
         flat = jacobian.reshape(-1, jacobian.shape[2])

@@ -72,9 +72,9 @@ class CpuBackend:
             )
         if settings.unseen_opacity_weight and state.has_unseen:
             weight = settings.unseen_opacity_weight / len(state)
-            share = state.unseen_share
+            fraction = state.unseen_share
             optimizer.opacity_weight(
-                rows, state.parameters.opacity, share, weight, gradients.opacity
+                rows, state.parameters.opacity, fraction, weight, gradients.opacity
             )
         if settings.distance_weight:
             limit = np.float32(settings.distance_limit) * self._frames.units

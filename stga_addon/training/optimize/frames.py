@@ -24,14 +24,14 @@ CACHE_BYTES = 256e6
 BYTES_PER_TRIANGLE = 170
 """Memory of a triangle's frame, deformation, signals and corners in a timestep."""
 
-UNSEEN_LIMIT_SHARE = 0.35
+UNSEEN_LIMIT_FRACTION = 0.35
 """Fraction of the scale limit that remains on triangles that face away from all cameras: a large
 splat that serves an outline floats in the air for other cameras."""
-BORDER_LIMIT_SHARE = 0.2
+BORDER_LIMIT_FRACTION = 0.2
 """Fraction of the scale limit that remains where the mesh ends."""
-BORDER_DISTANCE_SHARE = 0.6
+BORDER_DISTANCE_FRACTION = 0.6
 """Fraction of the distance limit that remains where the mesh ends."""
-LAYER_HEIGHT_SHARE = 0.8
+LAYER_HEIGHT_FRACTION = 0.8
 """Height of the middle of hair's outer layer as a fraction of the height of hair, before half of
 its thickness is taken off."""
 LAYER_VOXELS = 0.5
@@ -93,17 +93,19 @@ class FrameStore:
         """Largest scale (2, F) float32 of bound and of unbound splats, in local units."""
         unbound = settings.unbound_scale_limit * self.voxel / self.unit_lengths
         limits = np.stack([settings.scale_limit * self.units, unbound])
-        limits *= 1 - (1 - UNSEEN_LIMIT_SHARE) * self.surface.turned_away
-        limits[0, self.surface.border] *= BORDER_LIMIT_SHARE  # a torso's unbound splats follow it
+        limits *= 1 - (1 - UNSEEN_LIMIT_FRACTION) * self.surface.turned_away
+        limits[0, self.surface.border] *= (
+            BORDER_LIMIT_FRACTION  # a torso's unbound splats follow it
+        )
         limits[0] = np.maximum(limits[0], self.hair_layer_scale)
         return np.asarray(limits, np.float32)
 
     def outlier_limits(self, settings: TrainingSettings) -> np.ndarray:
         """How far (F,) float32 bound splats may lie from the middle of their triangle, in local
         units: on the scalp as far as hair reaches."""
-        share = np.where(self.surface.border, BORDER_DISTANCE_SHARE, 1.0)
+        fraction = np.where(self.surface.border, BORDER_DISTANCE_FRACTION, 1.0)
         hair = self.surface.hair_height / self.unit_lengths
-        return np.asarray(settings.stray_limit * self.units * share + hair, np.float32)
+        return np.asarray(settings.stray_limit * self.units * fraction + hair, np.float32)
 
     @cached_property
     def sides(self) -> UnseenSides:
@@ -117,7 +119,7 @@ class FrameStore:
     def layer_height(self) -> np.ndarray:
         """(F,) of the middle of hair's outer layer over each triangle, just below the surface on
         skin, in local units."""
-        inner = LAYER_HEIGHT_SHARE * self.surface.hair_height - LAYER_VOXELS * self.voxel
+        inner = LAYER_HEIGHT_FRACTION * self.surface.hair_height - LAYER_VOXELS * self.voxel
         skin = -SKIN_DEPTH * self.units
         return np.asarray(np.where(inner > 0, inner / self.unit_lengths, skin), np.float32)
 

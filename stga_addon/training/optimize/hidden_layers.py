@@ -26,7 +26,7 @@ OCCLUSION_OPACITY = 5.0
 """Logit of the opacity of the occlusion layer."""
 CELL_WIDTH = 0.6
 """Least standard deviation of the occlusion layer's splats, in cells."""
-BESIDE_LID_SHARE = 0.6
+BESIDE_LID_FRACTION = 0.6
 """Fraction of the scale of the layer under lids that it has at their edges and in the mouth, where
 it would stand out beside the eye and the lips."""
 BORDER_INSET = 0.6
@@ -122,9 +122,9 @@ def occluding_splats(frames: FrameStore, sh_degree: int = 0) -> Splats:
     )
     around = np.ones(len(capture.neutral), bool)
     around[capture.faces[~lids]] = False
-    share = np.where(around[capture.faces].all(1), 1.0, BESIDE_LID_SHARE)
+    fraction = np.where(around[capture.faces].all(1), 1.0, BESIDE_LID_FRACTION)
     layer.xyz[:, axis] = frames.layer_height
-    layer.log_scale[:] += np.log(share)[:, None]
+    layer.log_scale[:] += np.log(fraction)[:, None]
     layer.log_scale[:, axis] += np.log(HIDDEN_FLATNESS)
     behind = lattice_splats(
         occlusion.places, capture.faces, 0, sh_degree, OCCLUSION_OPACITY, frames.convention

@@ -40,16 +40,16 @@ DEPTH_VOXELS = 0.5
 """Step between the depths at which the layer may lie."""
 MAX_DEPTHS = 10
 """Depths that are tried; the first that lies within the masks is taken."""
-MARGIN_SHARE = 0.015
+MARGIN_FRACTION = 0.015
 """How far the layer must lie within the masks, as a fraction of their height."""
-BACK_MARGIN_SHARE = 0.03
+BACK_MARGIN_FRACTION = 0.03
 """The same of a torso's back, whose triangles are large."""
 SPLAT_REACH = 1.8
 """Three standard deviations of a splat, in sides of a square of two triangles, or in cells where
 these are larger."""
 BEHIND_DEG = (-30.0, 0.0, 30.0)
 """Directions from behind from which the inner side of a torso's front may show."""
-BACK_SHARE = 0.5
+BACK_FRACTION = 0.5
 """Depth of a back, an ellipse, as a fraction of half of the torso's width."""
 BACK_LEVELS = 0.5
 """Height over which a torso's width and color are measured, in distances of the eyes from the
@@ -120,7 +120,7 @@ def _behind_sides(
     depths = voxel * DEPTH_VOXELS * np.arange(1, MAX_DEPTHS + 1)
     offsets = np.zeros((len(rows), len(depths), 3))
     offsets[:, :, NORMAL_AXIS["stga"]] = -depths
-    fits = ~surface.beside_masks(rows, offsets, -MARGIN_SHARE)
+    fits = ~surface.beside_masks(rows, offsets, -MARGIN_FRACTION)
     large = clothes[rows]
     fits[large] &= ~_reaches_beside(surface, rows[large], offsets[large])
     deepest = np.zeros(len(neutral))
@@ -203,7 +203,7 @@ def _back(
     points = np.concatenate([center, center + reach], axis=1)
     away = points - neutral[faces[rows]].mean(1, keepdims=True)
     offsets = np.einsum("nji,nkj->nki", turned, away)
-    fits = ~surface.beside_masks(rows, offsets[:, :1], -BACK_MARGIN_SHARE)[:, 0]
+    fits = ~surface.beside_masks(rows, offsets[:, :1], -BACK_MARGIN_FRACTION)[:, 0]
     fits &= ~surface.beside_masks(rows, offsets[:, 1:]).any(1)
     front[rows] = fits
     return front, places, median_color[fits]
@@ -233,7 +233,7 @@ def _round_back(
     for row, (x, y) in enumerate((places[vertices] - at.eyes) @ np.stack([across, up], 1)):
         _, middle, half = around(y)
         beside = min(abs(x - middle) / half, 1)
-        behind[row] = BACK_SHARE * half * np.sqrt(1 - beside**2)
+        behind[row] = BACK_FRACTION * half * np.sqrt(1 - beside**2)
     behind += BACK_GAP_VOXELS * voxel_size(places)
     places[vertices] -= behind[:, None] * ahead
     median_color = np.empty((len(level), 3))

@@ -74,13 +74,13 @@ TONGUE_REACH = 0.5
 DEPTHS = (0.0, 0.25, 0.45, 0.75)
 """Distances from the visible lips at which the colors of a mouth's inside are given: it gets darker
 inward."""
-LIP_SHARE = 0.75
+LIP_FRACTION = 0.75
 """Brightness of the lining at the lips, as a fraction of theirs."""
-GUM_SHARES = np.array([[0.43, 0.24, 0.22], [0.22, 0.1, 0.09], [0.12, 0.04, 0.03]])
+GUM_FRACTIONS = np.array([[0.43, 0.24, 0.22], [0.22, 0.1, 0.09], [0.12, 0.04, 0.03]])
 """Color of gums and tongue at the later DEPTHS, as fractions of the eyes' white."""
 TOOTH_DEPTHS = (0.05, 0.15, 0.5)
 """Distances from the visible lips at which the brightness of teeth is given."""
-TOOTH_SHARES = (0.92, 0.74, 0.23)
+TOOTH_FRACTIONS = (0.92, 0.74, 0.23)
 """Brightness of teeth at TOOTH_DEPTHS, as fractions of the eyes' white."""
 WHITE_QUANTILE = 0.8
 """Quantile of the eyeballs' brightness above which triangles are white."""
@@ -164,8 +164,8 @@ def kinds_of(
     return {"scalp": scalp, "body": body}
 
 
-def hanging_share(at: HeadCoordinates) -> np.ndarray:
-    """(F,) share of its full distance from the neck that long hair has: 0 at the hairline and
+def hanging_fraction(at: HeadCoordinates) -> np.ndarray:
+    """(F,) fraction of its full distance from the neck that long hair has: 0 at the hairline and
     beside the neck, 1 behind it and further down."""
     angle = np.degrees(np.abs(at.azimuth))
     below = np.interp(angle, HAIRLINE_DEG, HAIRLINE) - at.level
@@ -226,10 +226,10 @@ def inside_colors(
     in_mouth = np.isin(part, part[~skin & (away < TONGUE_REACH)])
     within = inside & (in_mouth | lining_of(capture))
     depth = cKDTree(centers[lips]).query(centers[within])[0] / at.unit
-    colors = np.vstack([LIP_SHARE * np.median(color[lips], axis=0), GUM_SHARES * white])
+    colors = np.vstack([LIP_FRACTION * np.median(color[lips], axis=0), GUM_FRACTIONS * white])
     inner = np.stack([np.interp(depth, DEPTHS, channel) for channel in colors.T], axis=1)
     teeth = teeth_of(capture)[within]
-    inner[teeth] = np.interp(depth[teeth], TOOTH_DEPTHS, TOOTH_SHARES)[:, None] * white
+    inner[teeth] = np.interp(depth[teeth], TOOTH_DEPTHS, TOOTH_FRACTIONS)[:, None] * white
     found[within[inside]] = inner
     return np.asarray(found)
 

@@ -22,14 +22,14 @@ from ...capture.mesh_geometry import (
 from ...capture.model import Capture, View, evenly_spread, views_by_timestep
 from ...flame.model import torso_faces
 from ...flame.quaternions import unit
-from ...tracking.solve import lid_shares
+from ...tracking.solve import lid_fractions
 from .initial_splats import FEW_CAMERAS, SAMPLED_HEIGHT_PIXELS, mirrored, voxel_size
-from .outlines import TOLERANCE_SHARE, clear_of
+from .outlines import TOLERANCE_FRACTION, clear_of
 from .semantic_regions import (
     JAW_LEVEL,
     TORSO_HEIGHT,
     HeadCoordinates,
-    hanging_share,
+    hanging_fraction,
     head_coordinates,
     kinds_of,
     nearest_rows,
@@ -58,7 +58,7 @@ OUTSIDE_DISTANCE = 4.0
 """Their distance from the head's center, in its radius."""
 OUTSIDE_WIDTH = 2.2
 """Width of their images, in the head's radius."""
-OUTSIDE_PIXEL_SHARE = 0.7
+OUTSIDE_PIXEL_FRACTION = 0.7
 """Side of their pixels, in sides of a square as large as the median triangle."""
 OUTSIDE_SIDES_PX = (240, 2000)
 """Least and largest side of their images, however far a torso reaches."""
@@ -76,7 +76,7 @@ BLINKS = ("eyeBlinkLeft", "eyeBlinkRight")
 """Expressions that pull lids out of their folds."""
 LID_STRETCH = 1.8
 """Factor by which these lengthen a lid's triangle at least."""
-CLOSED_SHARE = 0.6
+CLOSED_FRACTION = 0.6
 """Weight of these expressions at which tracked eyes count as closed."""
 MIN_SQUARED_AREA = 1e-28
 """Squared area in m⁴ below which a triangle has none."""
@@ -92,9 +92,9 @@ HANGING_HEIGHT = 0.4
 """Height of long hair above the scalp, in distances of the eyes from the mouth."""
 MAX_APART_DEG = 8.0
 """Largest angle between the directions in which one camera sees a triangle, and their mean."""
-MAX_BESIDE_SHARE = 0.1
-"""Share of the masks in whose image a point lies, that it may lie outside of."""
-MAX_STICKING_SHARE = 0.05
+MAX_BESIDE_FRACTION = 0.1
+"""Fraction of the masks in whose image a point lies, that it may lie outside of."""
+MAX_STICKING_FRACTION = 0.05
 """Largest fraction of a torso's triangles that lie outside masks where images show a body."""
 STANDING_VOXELS = 1.5
 """Height from which hair or a collar stands out."""
@@ -147,7 +147,7 @@ class Surface:
         corners = neutral[self.capture.faces]
         normal = triangle_normals(corners)
         square = np.sqrt(np.median(np.linalg.norm(normal, axis=1)) / 2)
-        wanted = OUTSIDE_WIDTH * radius / max(OUTSIDE_PIXEL_SHARE * square, 1e-9)
+        wanted = OUTSIDE_WIDTH * radius / max(OUTSIDE_PIXEL_FRACTION * square, 1e-9)
         side = int(np.clip(wanted, *OUTSIDE_SIDES_PX))
         eye = center + OUTSIDE_DISTANCE * radius * direction
         focal_length = side * OUTSIDE_DISTANCE / OUTSIDE_WIDTH
@@ -214,14 +214,14 @@ class Surface:
         self,
         rows: np.ndarray,
         offsets: np.ndarray,
-        margin_share: float = TOLERANCE_SHARE,
+        margin_fraction: float = TOLERANCE_FRACTION,
     ) -> np.ndarray:
         """(N, K) bool: whether K points at each of the triangles `rows` (N,) lie outside of more
-        than MAX_BESIDE_SHARE of the masks in whose image they lie.
+        than MAX_BESIDE_FRACTION of the masks in whose image they lie.
 
         offsets       (N, K, 3) or (K, 3) of the points from the triangles' origins, meters along
                       the axes of their frames
-        margin_share  of the masks' height, which still counts as inside; negative: as outside
+        margin_fraction  of the masks' height, which still counts as inside; negative: as outside
         """
         offsets = np.broadcast_to(offsets, (len(rows), *offsets.shape[-2:]))
         seen, beside = np.zeros((2, *offsets.shape[:2]), int)
@@ -230,8 +230,10 @@ class Surface:
             points += frames.origin[rows, None]
             column, row, within = pixels_of(points.reshape(-1, 3), view.camera)
             seen += within.reshape(seen.shape)
-            beside += (within & clear_of(mask > 127, margin_share)[row, column]).reshape(seen.shape)
-        return np.asarray(beside > MAX_BESIDE_SHARE * np.maximum(seen, 1))
+            beside += (within & clear_of(mask > 127, margin_fraction)[row, column]).reshape(
+                seen.shape
+            )
+        return np.asarray(beside > MAX_BESIDE_FRACTION * np.maximum(seen, 1))
 
     @cached_property
     def masks(self) -> list[tuple[View, np.ndarray]]:
@@ -269,8 +271,8 @@ class Surface:
         timesteps = views_by_timestep(self.capture.views["train"])
         weights = np.array([flame.frame(timestep).expr for timestep in timesteps])
         for blink, own in self._lids.items():
-            columns, shares = lid_shares(flame.model, blink.removeprefix("eyeBlink"))
-            if (weights[:, columns] @ shares).max() < CLOSED_SHARE:
+            columns, fractions = lid_fractions(flame.model, blink.removeprefix("eyeBlink"))
+            if (weights[:, columns] @ fractions).max() < CLOSED_FRACTION:
                 found |= own
         return found
 
@@ -334,11 +336,11 @@ class Surface:
         near = measured[nearest_rows(sources, center[scalp], AROUND) % len(measured)]
         height[scalp] = np.median(self._measured_height[near], axis=1)
         if self.at is not None and self._has_long_hair:
-            share = hanging_share(self.at)
-            hanging = self._scalp & (share > 0)
+            fraction = hanging_fraction(self.at)
+            hanging = self._scalp & (fraction > 0)
             growing = self._scalp & ~hanging
             median = np.median(height[growing]) if growing.any() else 0.0
-            height[hanging] = median + share[hanging] * (HANGING_HEIGHT * self.at.unit - median)
+            height[hanging] = median + fraction[hanging] * (HANGING_HEIGHT * self.at.unit - median)
         # one side's hair may be higher than the other's, which it is mirrored from
         offsets = np.zeros((len(scalp), HEIGHTS + 1, 3))
         offsets[:, :, NORMAL_AXIS["stga"]] = height[scalp, None] * np.linspace(1, 0, HEIGHTS + 1)
@@ -364,7 +366,7 @@ class Surface:
         if self.capture.flame is not None:
             torso = torso_faces(self.capture.flame.model)
             sticking = np.count_nonzero(self.sticks_out & torso)
-            bare &= ~(torso & (sticking > MAX_STICKING_SHARE * np.count_nonzero(torso)))
+            bare &= ~(torso & (sticking > MAX_STICKING_FRACTION * np.count_nonzero(torso)))
         return np.asarray(bare | self.hidden)
 
     @cached_property

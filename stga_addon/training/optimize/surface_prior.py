@@ -29,10 +29,10 @@ DOUBT = 0.3
 halfway to what is plausible."""
 MIN_PULL = 0.02
 """Least fraction of that way that is worth a change."""
-LEAST_WIDTH_SHARE = 0.9
+LEAST_WIDTH_FRACTION = 0.9
 """Width below which splats of the hidden layer may not shrink, as a fraction of what the lattice
 begins with."""
-LINING_SHARE = 0.5
+LINING_FRACTION = 0.5
 """Largest scale behind closed lips, as a fraction of that of a triangle's only splat."""
 EYE_DEPTH_M = 0.0005
 """Least depth of splats below the eyeballs that they are on."""
@@ -192,7 +192,7 @@ class PlausibleColor:
         face = splats.face
         moments = splats.columns["second/color"]
         is_occluding = splats.is_occluding
-        share = doubt(moments, splats.reference["second/color"]) * ~sides.shown[face]
+        fraction = doubt(moments, splats.reference["second/color"]) * ~sides.shown[face]
         # the avatar is made of averages, which only steps move
         is_untouched = ~sides.shown[face] & ~moments.any(1)
         is_folded = known.surface.folded_lids[face] & ~sides.shown[face]
@@ -205,9 +205,9 @@ class PlausibleColor:
         plausible = ((colors - 0.5) / SH_C0).astype(np.float32)
         inner = np.searchsorted(known.inner.face, face[is_occluding])
         plausible[is_occluding] = known.inner.sh[inner, 0]
-        rows = np.flatnonzero((share > MIN_PULL) & ~is_pinned)
+        rows = np.flatnonzero((fraction > MIN_PULL) & ~is_pinned)
         color = splats.columns["parameters/color"][rows]
-        color += share[rows, None] * (plausible[rows] - color)
+        color += fraction[rows, None] * (plausible[rows] - color)
         splats.assign(rows, {"parameters/color": color})
         rows = np.flatnonzero(is_pinned)
         zeros = dict.fromkeys((f"{kind}/sh" for kind in PINNED_KINDS), 0.0)
@@ -227,20 +227,20 @@ class OpaqueSurface:
         surface = known.surface
         face = splats.face
         moments = splats.columns["second/opacity"]
-        share = doubt(moments[:, None], splats.reference["second/opacity"][:, None])
+        fraction = doubt(moments[:, None], splats.reference["second/opacity"][:, None])
         turned_away = np.where(surface.sticks_out, 0, surface.turned_away)
-        share = (share * turned_away[face]) ** 2  # little of what outlines show
+        fraction = (fraction * turned_away[face]) ** 2  # little of what outlines show
         # no view has stepped these: beyond images' edges also lies what faces cameras
         beyond = surface.outside & ~surface.sticks_out & ~known.sides.shown
-        share[beyond[face] & ~moments.astype(bool)] = 1
-        rows = np.flatnonzero(share > MIN_PULL)
-        share = share[rows]
+        fraction[beyond[face] & ~moments.astype(bool)] = 1
+        rows = np.flatnonzero(fraction > MIN_PULL)
+        fraction = fraction[rows]
         opacity = splats.columns["parameters/opacity"][rows]
-        opacity += share * (HIDDEN_OPACITY - opacity)
+        opacity += fraction * (HIDDEN_OPACITY - opacity)
         xyz = splats.columns["parameters/xyz"][rows]
         axis = known.normal_axis
         height = known.hair.height(face[rows], xyz)
-        xyz[:, axis] += share * (height - xyz[:, axis])
+        xyz[:, axis] += fraction * (height - xyz[:, axis])
         splats.assign(rows, parameters_and_average({"opacity": opacity, "xyz": xyz}))
 
 
@@ -293,7 +293,7 @@ class FlatSkin:
         frames = self._known.frames
         is_layer = surface.closed & (surface.facing < BEHIND_COSINE)
         hair = self._known.hair.least_width
-        skin = LEAST_WIDTH_SHARE * SCALE * frames.units / hidden_order(frames)
+        skin = LEAST_WIDTH_FRACTION * SCALE * frames.units / hidden_order(frames)
         return np.where(is_layer, np.where(hair > 0, hair, skin), 0.0)
 
 
@@ -350,7 +350,7 @@ class SmallLining:
         single = lattice_splats(
             capture.neutral, capture.faces, 0, 0, convention=known.frames.convention
         )
-        largest = single.log_scale.max(1) + np.log(LINING_SHARE)
+        largest = single.log_scale.max(1) + np.log(LINING_FRACTION)
         self._limits = np.where(lining, largest, np.inf).astype(np.float32)
 
     def apply(self, splats: BoundSplats) -> None:

@@ -65,7 +65,7 @@ class Strategy:
 
         iteration, visit  count iterations and visits of frames (consecutive views of one timestep)
                           from 0
-        progress          share of the budget spent
+        progress          fraction of the budget spent
         """
         settings = self._settings
         if self.region is not None:
@@ -155,7 +155,7 @@ class Trainer:
         """Train one view.
 
         target    (H, W, 3) uint8 over the settings' background
-        progress  share of the budget spent
+        progress  fraction of the budget spent
         mask      (H, W) uint8 coverage, with which the background may be randomized
         mesh      (V, 3) the capture's mesh of the view's timestep, if it has been read already
 
@@ -223,7 +223,7 @@ class Trainer:
     def _post_step(self, progress: float) -> None:
         """Call the hooks that are due after an optimizer step."""
         before = self._progress
-        if before is None:  # begun or resumed: as of steps that all take the same share
+        if before is None:  # begun or resumed: as of steps that all take the same fraction
             before = progress * (1 - 1 / max(1, self.iteration - 1))
         self._progress = progress
         region = self.strategy.region

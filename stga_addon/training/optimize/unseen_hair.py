@@ -18,7 +18,7 @@ STRAND_COSINE = -0.3
 strands are added: longer than the layer's splats, they would stand out in outlines."""
 STRANDS = 10000
 """Strands that a whole scalp would have."""
-STRAND_SHARE = 1.35
+STRAND_FRACTION = 1.35
 """Product of a strand's standard deviations along and across its direction, as a fraction of its
 part of the surface: strands hide what is below."""
 STRAND_SHAPE = (2.6, 0.38, 0.13)
@@ -98,7 +98,7 @@ class UnseenHair:
     def _strand_width(self) -> float:
         """Standard deviation in meters, geometric mean of along and across the growth."""
         area = face_areas(self._surface, self._frames.capture.faces[self.has_strands]).sum()
-        return float(np.sqrt(STRAND_SHARE * area / self._count))
+        return float(np.sqrt(STRAND_FRACTION * area / self._count))
 
     @property
     def _count(self) -> float:

@@ -29,7 +29,7 @@ SPREAD_VIEWS = 12
 """Training views, spread over all, whose colors are measured."""
 OPEN_VIEWS = 6
 """Views whose colors are measured of the timesteps in which the mouth is highest."""
-MIN_TEETH_SHARE = 0.04
+MIN_TEETH_FRACTION = 0.04
 """Least fraction of the mouth's pixels that teeth fill; with fewer, in a slit between the lips, all
 teeth count as hidden."""
 SOURCE_COSINE = 0.25
@@ -39,9 +39,9 @@ WELL_SHOWN_COSINE = 0.5
 """The same above which a view shows a face better than its mirror image does."""
 FRINGE_COSINE = 0.2
 """The same for the scalp, which takes the color of a fringe where it is not visible itself."""
-FRINGE_SHARE = 0.2
+FRINGE_FRACTION = 0.2
 """Highest fraction of the visible triangles above the brows; they show hair if there is any."""
-MIN_SHOWN_SHARE = 0.1
+MIN_SHOWN_FRACTION = 0.1
 """Fraction of the median of the pixels that show as much of the surface, below which it is not
 visible: a folded eyelid has less."""
 NEAREST = 24
@@ -105,7 +105,7 @@ def unseen_sides(surface: Surface) -> UnseenSides:
     density = pixels / np.maximum(face_areas(capture.neutral, capture.faces), MIN_DIVISOR)
     facing = density[cosine > WELL_SHOWN_COSINE]
     median = np.median(facing[facing > 0]) if facing.any() else 0.0
-    shown = density > MIN_SHOWN_SHARE * median
+    shown = density > MIN_SHOWN_FRACTION * median
     is_source = (pixels > 0) & is_outside & (cosine > SOURCE_COSINE) & ~surface.lids
     if not is_source.any():
         none = np.zeros_like(shown)
@@ -159,19 +159,19 @@ def plausible_off_axis(splats: Splats, along: np.ndarray, sides: UnseenSides) ->
     hang in front of it. A hair-colored splat on skin that turns away belongs to hair behind it:
     off-axis it is skin."""
     face = splats.face
-    share = OFF_AXIS_WEIGHT * sides.view_dependence[face]
-    share[splats.unbound & ~sides.is_hair[face]] = 0
-    share[sides.triangles[face]] = 0  # they have one color from everywhere, and hair its locks
+    fraction = OFF_AXIS_WEIGHT * sides.view_dependence[face]
+    fraction[splats.unbound & ~sides.is_hair[face]] = 0
+    fraction[sides.triangles[face]] = 0  # they have one color from everywhere, and hair its locks
     plausible = sides.off_axis[face]
     steepness = np.ones(len(face))
     if sides.is_hair.any():
         shown = sh_color(splats.sh, along[face])
         hair = np.median(sides.off_axis[sides.is_hair], axis=0)
         from_hair, from_skin = (np.linalg.norm(shown - own, axis=1) for own in (hair, plausible))
-        is_behind = (share > 0) & ~sides.is_hair[face] & (from_hair < from_skin)
-        share[is_behind] = 1
+        is_behind = (fraction > 0) & ~sides.is_hair[face] & (from_hair < from_skin)
+        fraction[is_behind] = 1
         steepness[is_behind] = BEHIND_STEEPNESS
-    return colored_off_axis(splats, along[face], share, plausible, steepness)
+    return colored_off_axis(splats, along[face], fraction, plausible, steepness)
 
 
 def _hair(
@@ -287,7 +287,7 @@ def _lid_colors(
 def _fringe(at: HeadCoordinates, shown: np.ndarray) -> np.ndarray:
     """The highest of the triangles (F,) bool that are shown above the brows."""
     above = np.flatnonzero(shown & (at.level > BROWS_LEVEL))
-    return above[np.argsort(at.level[above])][int(len(above) * (1 - FRINGE_SHARE)) :]
+    return above[np.argsort(at.level[above])][int(len(above) * (1 - FRINGE_FRACTION)) :]
 
 
 def _color_views(capture: Capture) -> list[View]:
@@ -326,6 +326,6 @@ def _unseen_teeth(capture: Capture, pixels: np.ndarray, shown: np.ndarray) -> np
     """(F,) bool: teeth that the pixels (F,) do not show well, or all where lips hide them."""
     teeth = teeth_of(capture)
     in_mouth = pixels[capture.regions.get("mouth", teeth)].sum()
-    if pixels[teeth].sum() < MIN_TEETH_SHARE * in_mouth:
+    if pixels[teeth].sum() < MIN_TEETH_FRACTION * in_mouth:
         return teeth
     return np.asarray(teeth & ~shown)

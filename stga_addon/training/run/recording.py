@@ -92,7 +92,7 @@ def track_recording(
 
     Exposure and white balance of each camera, where they drift of each timestep, are fitted to the
     avatar's colors first, as are the scale of the world and, unless it is kept, how it is turned.
-    The timesteps' parameter files are replaced, and the report says what share of the images is
+    The timesteps' parameter files are replaced, and the report says what fraction of the images is
     left unexplained. Raises StgaError, and what `report` raises.
     """
     timesteps = open_capture(root, read_run(run).flame).timesteps
@@ -122,9 +122,9 @@ def track_recording(
             tracked = tracked.smoothed(sequence.model)
         _replace_heads(root, sequence, tracked)
     stored = read_json(root / REPORT_FILE)  # which scaling changes
-    shares = zip(timesteps, tracked.misfit.tolist(), strict=True)
+    fractions = zip(timesteps, tracked.misfit.tolist(), strict=True)
     stored["avatar"] = avatar_version(run)
-    misfit = {str(timestep): round(share, 3) for timestep, share in shares}
+    misfit = {str(timestep): round(fraction, 3) for timestep, fraction in fractions}
     stored["image_misfit"][tracking_folder.AVATAR_MISFIT] = misfit
     write_json(root / REPORT_FILE, stored)
     return tracked
