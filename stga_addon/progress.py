@@ -45,7 +45,7 @@ class Progress:
 
 Report = Callable[[Progress], bool]
 """Called now and then; returns True to stop and keep what there is."""
-Say = Callable[[str], None]  # Called with a line for people
+Log = Callable[[str], None]  # Called with a line for people
 
 
 def warn(sentence: str) -> None:
@@ -85,7 +85,7 @@ class TimeLeft:
         return (1 - fraction) * seconds / done if done >= PACE_FRACTION / 10 else math.nan
 
 
-MAX_TOLD_FRACTION = 0.99
+MAX_REPORTED_FRACTION = 0.99
 """Before the end: 100 % is said of what is done."""
 
 
@@ -105,7 +105,7 @@ class Clock:
         say,
         else as before, is the least so far, and `longer` 1 where that is, or the work knows it to
         be, too little."""
-        self.fraction = max(self.fraction, min(progress.fraction, MAX_TOLD_FRACTION))
+        self.fraction = max(self.fraction, min(progress.fraction, MAX_REPORTED_FRACTION))
         figures = {"left_s": self._by_fraction.after(progress.fraction), **progress.figures()}
         figures = {name: value for name, value in figures.items() if math.isfinite(value)}
         asked_s = figures.get("left_s", self._left_s)

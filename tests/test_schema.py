@@ -212,7 +212,7 @@ def test_the_python_interface_takes_names_as_paths(tmp_path, kind):
     api.write_avatar(kind(avatar), api.read_avatar(path=kind(avatar)))
     api.write_ply(kind(tmp_path / "a.ply"), splats)
     assert len(api.read_splats(kind(tmp_path / "a.ply"))) == len(splats)
-    api.perform(api.Export(kind(avatar), kind(tmp_path / "b.ply"), "ply"), say=lambda _: None)
+    api.perform(api.Export(kind(avatar), kind(tmp_path / "b.ply"), "ply"), log=lambda _: None)
     assert (tmp_path / "b.ply").stat().st_size > 1000
     with refusal("'a.x00b' is not a usable path"):
         api.read_splats("a\0b")

@@ -159,7 +159,7 @@ def carry_out_plan(plan: Plan, engine_name: str = "local", address: str = "") ->
         engine = make_engine(engine_name, address)
         table = LiveTable(sys.stderr, shutil.get_terminal_size().columns)
         try:
-            BatchRun(batch, engine, lease, table, table.say).run()
+            BatchRun(batch, engine, lease, table, table.log).run()
         finally:
             print("\n".join(ended_lines(batch)))
     failures = batch.failures

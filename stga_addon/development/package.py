@@ -197,15 +197,15 @@ def build_editions(options: argparse.Namespace) -> Iterator[Path]:
     if not (options.blender or options.all):
         targets = [target for target in targets if target.platform == here]
     demo = options.out / DEMO_FOLDER
-    say = partial(print, flush=True)
+    log = partial(print, flush=True)
     for target in [replace(target, cuda=options.allow_cuda) for target in targets]:
-        collect_wheels(wheel_folder(target), target, say)
+        collect_wheels(wheel_folder(target), target, log)
         unpack_capture(demo)
-        say(f"{target.name}: compiling kernels, minutes where they are not there")
+        log(f"{target.name}: compiling kernels, minutes where they are not there")
         kernels = compile_kernels(target, wheel_folder(target), shlex.split(options.blender))
         if not kernels:
-            say(f"{target.name}: no Python of it is here; kernels are compiled when first used")
-        say(f"{target.name}: writing the zip")
+            log(f"{target.name}: no Python of it is here; kernels are compiled when first used")
+        log(f"{target.name}: writing the zip")
         yield build_zip(options.out, edition=complete(target), demo=demo, kernels=kernels)
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from ..avatar.splats import SH_C0, Splats, in_world
 from ..errors import StgaError
 from ..files import is_folder, read_bytes
-from ..progress import Say, warn
+from ..progress import Log, warn
 from .ply import MAX_SPLAT_BYTES, READ_FILES, read_ply
 from .spz import read_spz
 
@@ -61,21 +61,21 @@ def latest_iteration(folder: Path) -> Path | None:
     return found[max(found)] if found else None
 
 
-def read_splats(path: Path, say: Say = warn) -> Splats:
+def read_splats(path: Path, log: Log = warn) -> Splats:
     """World-space splats of a .ply, .spz or .splat file, with harmonics of degree 0 to 3.
 
-    Rows that hold a value that is not finite are left out. `say` gets a sentence about what was
+    Rows that hold a value that is not finite are left out. `log` gets a sentence about what was
     left out or repaired. Raises StgaError naming the file, also for other kinds of files.
     """
     latest = latest_iteration(path)
     if latest is not None:
-        say(f"{path}: {latest.relative_to(path).as_posix()} is used")
+        log(f"{path}: {latest.relative_to(path).as_posix()} is used")
         path = latest
     suffix = path.suffix.lower()
     if suffix not in READERS:
         kind = UNREAD_SUFFIXES.get(suffix, f"files named {suffix}")
         raise StgaError(f"{path}: {kind} {CONVERTED}; expected {READ_FILES}")
-    splats = READERS[suffix](path, say)
+    splats = READERS[suffix](path, log)
     if not len(splats):
         raise StgaError(f"{path}: holds no splats")
     finite = np.ones(len(splats), bool)
@@ -87,11 +87,11 @@ def read_splats(path: Path, say: Say = warn) -> Splats:
     lost = f"{len(finite) - finite.sum()} of {len(finite)} splats hold values that are not finite"
     if not finite.any():
         raise StgaError(f"{path}: {lost}")
-    say(f"{path}: left out splats: {lost}")
+    log(f"{path}: left out splats: {lost}")
     return splats.rows(finite)
 
 
-def read_splat(path: Path, say: Say = warn) -> Splats:
+def read_splat(path: Path, log: Log = warn) -> Splats:
     """The splats of a .splat file, without harmonics above degree 0. Raises StgaError."""
     data = read_bytes(path, MAX_SPLAT_BYTES)
     if not data or len(data) % SPLAT_ROW.itemsize:
@@ -113,7 +113,7 @@ def read_splat(path: Path, say: Say = warn) -> Splats:
     )
 
 
-READERS: dict[str, Callable[[Path, Say], Splats]] = {
+READERS: dict[str, Callable[[Path, Log], Splats]] = {
     ".ply": read_ply,
     ".spz": read_spz,
     ".splat": read_splat,

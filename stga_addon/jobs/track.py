@@ -15,7 +15,7 @@ from ..errors import StgaError, shorten
 from ..files import read_json, usable_path, write_json
 from ..format import format_duration
 from ..options import option
-from ..progress import Cancelled, Progress, Report, Say, TimeLeft, Written
+from ..progress import Cancelled, Log, Progress, Report, TimeLeft, Written
 from ..report import CURVE
 from ..tracking.folder import (
     KEPT_FOLDER,
@@ -259,7 +259,7 @@ def untracked(request: Track) -> Track | Written:
     return Written(request.out) if is_written(request.out) else request
 
 
-def track(request: Track, report: Report, say: Say) -> Written:
+def track(request: Track, report: Report, log: Log) -> Written:
     """Track the head into a capture; cancelled, the same request continues. Raises StgaError, also
     while another process writes the capture."""
     with hold_folder(request.out, LOCK_FILE, WRITER):
@@ -384,7 +384,7 @@ def _written(
     return Written(out, (*lines, f"capture: {out}"))
 
 
-def solve_again(request: SolveAgain, report: Report, say: Say) -> Written:
+def solve_again(request: SolveAgain, report: Report, log: Log) -> Written:
     """Solve the capture again around the keys. Raises StgaError as `track` does."""
     from ..tracking.correct import correct_capture
 
@@ -435,7 +435,7 @@ class _Steps:
 # From footage to an avatar
 
 
-def make_avatar(request: MakeAvatar, report: Report, say: Say) -> Written:
+def make_avatar(request: MakeAvatar, report: Report, log: Log) -> Written:
     """Track unless that is done, then train or continue. Raises StgaError for other inputs."""
     capture = request.track.out
     run = request.train.run
@@ -453,11 +453,11 @@ def make_avatar(request: MakeAvatar, report: Report, say: Say) -> Written:
 
     begin = perf_counter()
     check_inputs(request.track, request.takes)
-    captures = _track_takes(request, report_tracking, say)
+    captures = _track_takes(request, report_tracking, log)
     tracked = perf_counter()
     flame = request.track.model if is_flame(capture) else None
     new = replace(request.train, flame=flame, takes=tuple(captures[1:]))
-    trained = train_and_finish(resumed(new), report_training, say)
+    trained = train_and_finish(resumed(new), report_training, log)
     tracking = tracked - begin
     training = perf_counter() - tracked
     lines = [""]
@@ -490,7 +490,7 @@ def _tracking_lines(capture: Path) -> list[str]:
     return [*lines, f"tracking: reprojection error {median}"]
 
 
-def _track_takes(request: MakeAvatar, report: Report, say: Say) -> list[Path]:
+def _track_takes(request: MakeAvatar, report: Report, log: Log) -> list[Path]:
     """The captures of all takes, that of CAPTURE_FOLDER first; those that are not there are
     tracked."""
     out = request.out
@@ -498,7 +498,7 @@ def _track_takes(request: MakeAvatar, report: Report, say: Say) -> list[Path]:
     if not (out / INPUTS).exists():
         write_json(out / INPUTS, _inputs(request.track, request.takes))
     try:
-        tracks = _planned(request, report, say)
+        tracks = _planned(request, report, log)
         for number, own in enumerate(tracks):
 
             def report_take(progress: Progress, before: int = number) -> bool:
@@ -508,7 +508,7 @@ def _track_takes(request: MakeAvatar, report: Report, say: Say) -> list[Path]:
             if not is_written(own.out):
                 with hold_folder(own.out, LOCK_FILE, WRITER):
                     for line in _track_head(own, report_take).lines:
-                        say(line)
+                        log(line)
     except (StgaError, OSError):
         # nothing was tracked yet, so that the inputs may be mended
         if not any(path.name != INPUTS for path in out.iterdir()):
@@ -519,14 +519,14 @@ def _track_takes(request: MakeAvatar, report: Report, say: Say) -> list[Path]:
     return sorted((own.out for own in tracks), key=lambda path: path != request.track.out)
 
 
-def _planned(request: MakeAvatar, report: Report, say: Say) -> list[Track]:
+def _planned(request: MakeAvatar, report: Report, log: Log) -> list[Track]:
     """The takes in the order in which they are tracked: one around a still head first, the others
     with its head. The first talk is in CAPTURE_FOLDER: it is what the avatar plays."""
     track = request.track
     if not request.takes:
         return [track]
     footage = [track.footage, *request.takes]
-    kinds = _kinds(request, report, say)
+    kinds = _kinds(request, report, log)
     shown = kinds.index("talk") if "talk" in kinds else 0
     person = kinds.index("around") if "around" in kinds else 0
     folders = [f"{CAPTURE_FOLDER}_{number + 1}" for number in range(1, len(footage))]
@@ -545,7 +545,7 @@ def _planned(request: MakeAvatar, report: Report, say: Say) -> list[Track]:
     ]
 
 
-def _kinds(request: MakeAvatar, report: Report, say: Say) -> list[str]:
+def _kinds(request: MakeAvatar, report: Report, log: Log) -> list[str]:
     """What each take is, "around" or "talk": found out once and kept, or as given for the first, of
     which the others are none."""
     from ..tracking.around import take_of
@@ -569,7 +569,7 @@ def _kinds(request: MakeAvatar, report: Report, say: Say) -> list[str]:
                 kind, why = take_of(own, Workers(helpers, steps.report, steps.show))
                 kinds.append(kind)
                 what = "around a still head" if kind == "around" else "a head that moves"
-                say(f"take: {path.name}: {what} ({why})")
+                log(f"take: {path.name}: {what} ({why})")
     write_json(request.out / INPUTS, {**stored, KINDS: kinds})
     return kinds
 
@@ -613,7 +613,7 @@ def _inputs(track: Track, takes: Sequence[Path] = ()) -> dict[str, Any]:
 # Further takes of an avatar
 
 
-def extend(request: Extend, report: Report, say: Say) -> Written:
+def extend(request: Extend, report: Report, log: Log) -> Written:
     """Extend a run. Takes that are footage are tracked by its avatar first, into captures beside
     the new run; those that are there already are used. Raises StgaError."""
     captures = list[Path]()
@@ -621,18 +621,18 @@ def extend(request: Extend, report: Report, say: Say) -> Written:
         captures.append(path)
         if is_footage(path):
             out = captures[-1] = request.run.with_name(f"{request.run.name}_{path.stem}")
-            say(f"take: {path.name} is tracked by the avatar of {request.parent} into {out}")
+            log(f"take: {path.name} is tracked by the avatar of {request.parent} into {out}")
             if not is_written(out):
                 asked = Track(footage=path, model=None, out=out, avatar=request.parent)
-                for line in track(asked, partial(_tell_half, report, 0.0), say).lines:
-                    say(line)
+                for line in track(asked, partial(_report_half, report, 0.0), log).lines:
+                    log(line)
     if captures == list(request.captures):
-        return train_and_finish(request, report, say)
-    tell = partial(_tell_half, report, TRACKING_FRACTION)
-    return train_and_finish(replace(request, captures=tuple(captures)), tell, say)
+        return train_and_finish(request, report, log)
+    report_half = partial(_report_half, report, TRACKING_FRACTION)
+    return train_and_finish(replace(request, captures=tuple(captures)), report_half, log)
 
 
-def _tell_half(report: Report, begin: float, progress: Progress) -> bool:
+def _report_half(report: Report, begin: float, progress: Progress) -> bool:
     """Report a half of the progress."""
     return report(replace(progress, fraction=begin + TRACKING_FRACTION * progress.fraction))
 

@@ -106,7 +106,7 @@ def test_a_slice_is_stopped_and_goes_on(toy, tmp_path, monkeypatch):
     assert (tmp_path / "benchmark.csv").read_text().startswith("variant,seed,iteration,seconds,")
     assert (tmp_path / "benchmark.png").stat().st_size > 1000
     said.clear()
-    perform(request, say=said.append)
+    perform(request, log=said.append)
     assert [text for text in said if "Starting" in text] == []
     with refusal("holds a run with other settings"):
         perform(replace(request, seconds=3.0))
