@@ -102,9 +102,8 @@ class Clock:
 
     def reported(self, progress: Progress) -> dict[str, float]:
         """The finite figures of some progress; `left_s`, by the fraction where the work does not
-        say,
-        else as before, is the least so far, and `longer` 1 where that is, or the work knows it to
-        be, too little."""
+        say, else as before, is the least so far, and `longer` 1 where that is, or the work knows it
+        to be, too little."""
         self.fraction = max(self.fraction, min(progress.fraction, MAX_REPORTED_FRACTION))
         figures = {"left_s": self._by_fraction.after(progress.fraction), **progress.figures()}
         figures = {name: value for name, value in figures.items() if math.isfinite(value)}

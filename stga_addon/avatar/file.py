@@ -182,8 +182,7 @@ class Avatar:
     def with_limited_offsets(self) -> "Avatar":
         """With coefficients of 0 where they do not change a triangle's splats by MIN_COLOR_CHANGE,
         MIN_SHIFT_M or a fraction of MIN_SCALE_CHANGE anywhere in `strain_range`, and with smaller
-        ones
-        where they would blow splats up somewhere in it (`limited_enlargement`)."""
+        ones where they would blow splats up somewhere in it (`limited_enlargement`)."""
         basis = self._strain
         kept = {}
         if basis is None:

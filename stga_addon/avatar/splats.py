@@ -208,9 +208,9 @@ def colored_off_axis(
     steepness: np.ndarray | float = 1.0,
 ) -> Splats:
     """Splats of degree 0 that look as they do along a unit direction (N, 3) from the eye, and the
-    more it turns from there, as a color (N, 3), sRGB: by a fraction (N,) of the way times
-    (1 - c) (1 + steepness c), where c is the cosine of the angle and steepness (N,); the squared
-    sine where that is 1. Of degree 2, which holds just that."""
+    more it turns from there, as a color (N, 3), sRGB: by a fraction (N,) of the way times (1 - c)
+    (1 + steepness c), where c is the cosine of the angle and steepness (N,); the squared sine where
+    that is 1. Of degree 2, which holds just that."""
     directions = unit(np.random.default_rng(0).normal(size=(64, 3)))
     cosine = directions @ direction.T
     way = (1 - cosine) * (1 + steepness * cosine)

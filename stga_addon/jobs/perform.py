@@ -92,9 +92,9 @@ def _read(path: Path, kinds: Any) -> Any:
 def perform(request: Request, report: Report = ignore, log: Log = print) -> Result:
     """Carry out a request; returns what it found.
 
-    log: called with lines about what was decided and found.
-    Raises what the work raises: StgaError for mistakes and damaged files; Cancelled where the
-    report stopped work that has nothing to keep; KeyboardInterrupt after Ctrl-C.
+    log: called with lines about what was decided and found. Raises what the work raises: StgaError
+    for mistakes and damaged files; Cancelled where the report stopped work that has nothing to
+    keep; KeyboardInterrupt after Ctrl-C.
     """
     refuse_useless(request)
     validate(request)

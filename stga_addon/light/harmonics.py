@@ -48,8 +48,7 @@ def uniform(radiance: object) -> np.ndarray:
 
 def least_squares(rows: np.ndarray, values: np.ndarray, ridge: float) -> np.ndarray:
     """(9,) light with which rows (M, 9) come nearest to values (M,), drawn to 0 by `ridge`, a
-    fraction
-    of the mean of the normal equations' diagonal: some harmonics may give no light."""
+    fraction of the mean of the normal equations' diagonal: some harmonics may give no light."""
     matrix = rows.T @ rows
     matrix[np.diag_indices(COUNT)] += ridge * np.trace(matrix) / COUNT + DARK**2
     return np.linalg.solve(matrix, rows.T @ values)

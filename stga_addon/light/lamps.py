@@ -148,8 +148,7 @@ class ShadowMap:
 
 def kernels(name: str) -> Any:
     """`raster.cpu.shade` (`add_lights`) or `.shadow` (`add_depths`, `lit_fractions`), three times
-    as
-    fast, where Numba's kernels are compiled, else NumPy's."""
+    as fast, where Numba's kernels are compiled, else NumPy's."""
     if prefers_numba():
         return import_module(f"...raster.cpu.{name}", __name__)
     return array_kernels

@@ -156,8 +156,7 @@ def show_heat_map(
 ) -> None:
     """Color the head's triangles by values (F,) from 0 to `largest` (None: the largest value),
     stored as `attribute` (FRACTION or RESIDUAL): as the active color attribute, for solid shading,
-    and
-    by a modifier with a material, for EEVEE and Cycles; its own materials stay."""
+    and by a modifier with a material, for EEVEE and Cycles; its own materials stay."""
     hide_heat_map(head)
     whole = values.max(initial=0.0) if largest is None else largest
     scaled = np.minimum(values / max(whole, 1e-9), 1.0)

@@ -52,8 +52,8 @@ side; one that is too short by half makes another person."""
 INTERVAL = (0.05, 0.95)
 """Quantiles of the posterior that are reported."""
 MAX_SCALE_DIFFERENCE = 0.043
-"""Largest relative difference between a camera's scale and the median of all cameras. An error of
-5 % in focal length is found."""
+"""Largest relative difference between a camera's scale and the median of all cameras. A 5 % error
+of focal length is found."""
 MAX_SIDE_DEG = 60.0
 """Largest angle between the direction that the head faces and a camera whose landmarks are
 compared: on the path-traced head, scales of single views have a standard deviation of 0.01 up to

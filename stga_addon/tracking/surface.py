@@ -322,8 +322,7 @@ def _landmark_fractions(head: HeadModel, places: SurfacePoints) -> np.ndarray:
 
 def _joined(landmarks: Observation, fraction: np.ndarray, surface: SeenSurface) -> Observation:
     """Both as one observation, landmarks at fractions (N,) of their weight; the surface counts
-    along
-    its normal."""
+    along its normal."""
     along = surface.normal[:, :, None] * surface.normal[:, None, :]
     root = LANDMARK_SIGMA_M / SURFACE_SIGMA_M * along
     return Observation(

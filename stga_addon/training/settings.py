@@ -113,11 +113,10 @@ class TrainingSettings:
                    avatar is made of; 1: no averaging
     stray_reset_interval, stray_limit, stray_reset_share   every so many iterations (0: never), a
                    splat farther than the limit from its triangle's origin is put back to this
-                   fraction
-                   of the limit; 0: onto the origin, as in the paper. On the scalp, the height of
-                   hair is added. All limits but
-                   `unbound_scale_limit` are multiples of sqrt(2·triangle area) for "stga", of the
-                   triangle's own unit of length for "gaussian_avatars"
+                   fraction of the limit; 0: onto the origin, as in the paper. On the scalp, the
+                   height of hair is added. All limits but `unbound_scale_limit` are multiples of
+                   sqrt(2·triangle area) for "stga", of the triangle's own unit of length for
+                   "gaussian_avatars"
     sh_degree, sh_steps   highest SH degree, and the fractions of the budget at which the degree
                           rises by one
     hull_points    add visual-hull points for what the mesh does not cover

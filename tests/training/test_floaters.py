@@ -100,8 +100,7 @@ def test_after_a_short_training(typical, toy):
 
 def test_a_pruning_comes_once(toy):
     """Catches a look that is missed or made twice where steps take different fractions of the
-    budget,
-    or where a run is resumed between two steps."""
+    budget, or where a run is resumed between two steps."""
     shares = np.cumsum(np.random.default_rng(0).uniform(0.001, 0.05, 60))
     shares = shares[shares < 1]
     begun = Trainer(toy, quick_settings("global", lattice=0), {})

@@ -355,8 +355,7 @@ def two_regions(
     splats: Splats, mesh: np.ndarray, faces: np.ndarray, fraction: float, head: str = "bundled"
 ) -> np.ndarray:
     """(F,) bool: triangles nearest to two points on the front (an eye, the mouth), with `fraction`
-    of
-    the splats."""
+    of the splats."""
     center = mesh[faces].mean(1)
     away = np.minimum(*(np.linalg.norm(center - p, axis=1) for p in REGIONS[head]))
     return np.asarray(away <= np.quantile(away[splats.face], fraction))

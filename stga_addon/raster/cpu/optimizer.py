@@ -72,10 +72,10 @@ def adam_rows(work, rows, steps, parameters, options):
 
     parameters: tuple of AdamTables; steps (N,) int32; options: AdamOptions. The stepped value
     enters its exponential moving average with the fraction `ema_share`, or 4 / (steps + 3) where
-    that
-    is more, because the first steps are long. Rows that are not listed are not touched at all. A
-    row whose gradient is not finite, or beyond MAX_GRADIENT, keeps that parameter, its moments and
-    its average. All parameters at once: every further parallel loop waits for its slowest thread.
+    that is more, because the first steps are long. Rows that are not listed are not touched at all.
+    A row whose gradient is not finite, or beyond MAX_GRADIENT, keeps that parameter, its moments
+    and its average. All parameters at once: every further parallel loop waits for its slowest
+    thread.
     """
     call_helpers(work)
     corrections = np.empty((3, ROWS_PER_BLOCK), np.float32)
@@ -308,8 +308,7 @@ def _excess_scale(rows, log_scale, face, unbound, limits, scales):
 @parallel(lambda rows, *_: len(rows), piece=16_384)
 def opacity_weight(work, rows, opacity, fraction, weight, gradient):
     """weight · Σ fraction · sigmoid(opacity) over the listed rows; its gradient is added to
-    gradient
-    (N,).
+    gradient (N,).
 
     fraction (N,) float32.
     """

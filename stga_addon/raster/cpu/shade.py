@@ -47,8 +47,7 @@ raised."""
 @part_jit
 def ggx(facing, toward_eye, half, fresnel_cosine, square, reflectance):
     """Reflected fraction per steradian and cosine of a GGX lobe with Smith's shadowing and
-    Schlick's
-    Fresnel term.
+    Schlick's Fresnel term.
 
     facing, toward_eye, half: cosines of the normal to light, eye and the direction half between
     them. square: α².

@@ -1,8 +1,8 @@
 """Running kernels on several threads, which works because kernels release the GIL.
 
-Helpers stay in compiled code: the first kernel of an iteration wakes them, and until the
-last they find the next one, and its next stage, by themselves. Nobody waits for a helper that has
-not begun, so more threads than processors do no harm.
+Helpers stay in compiled code: the first kernel of an iteration wakes them, and until the last they
+find the next one, and its next stage, by themselves. Nobody waits for a helper that has not begun,
+so more threads than processors do no harm.
 
 Numba's parallel loops would compile every kernel four times over (7 s instead of 2 for the image
 loss), hold the lock while they run, so that Blender's window waits for a picture rendered in its

@@ -31,8 +31,7 @@ SECONDS = 0.3
 @dataclass(frozen=True)
 class Trial:
     """error: largest difference of a parameter's gradient from the CPU's, as a fraction of its
-    length;
-    times in s."""
+    length; times in s."""
 
     error: float
     device_s: float

@@ -259,8 +259,7 @@ class RelitScene(NamedTuple):
 
 def relit_scene(layers: Sequence[SceneLayer]) -> RelitScene:
     """Pack poses and light of all layers; a fraction of 0: not relit. Lights beyond MAX_MAPS throw
-    no
-    shadow."""
+    no shadow."""
     head = np.zeros((len(layers), RELIT_TEXELS, 4), np.float32)
     vertices = [np.zeros((0, 4), np.float32)]
     maps = list[ShadowView]()

@@ -64,8 +64,7 @@ def is_xmp(path: Path) -> bool:
 def read_realitycapture_csv(path: Path, image_size: ImageSize) -> Calibrated:
     """One shot a line, labelled with the image's name. Columns: name, x, y, alt, heading, pitch,
     roll (degrees), f (35 mm film), and, where they are there, px, py (fractions of the longer
-    side),
-    k1 to k4, t1, t2; or `OTHER_SPELLINGS`. Raises StgaError that names file and line."""
+    side), k1 to k4, t1, t2; or `OTHER_SPELLINGS`. Raises StgaError that names file and line."""
     rows = read_table(path)
     first = _row_of_names(rows)
     columns = _columns(rows[first][1]) if rows else []

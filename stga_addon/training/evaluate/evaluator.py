@@ -32,8 +32,7 @@ RENDERING_COST = 0.5
 @dataclass(frozen=True)
 class Spent:
     """Trained so far: fraction of the budget (may exceed 1), seconds without evaluations, steps;
-    the
-    seconds of training that are left, at the speed so far, NaN before the first step."""
+    the seconds of training that are left, at the speed so far, NaN before the first step."""
 
     fraction: float
     seconds: float

@@ -13,8 +13,7 @@ class OutlierReset:
     """Moves bound splats farther than a limit from their triangle's origin to a fraction of it.
 
     The paper moves them onto the origin: fraction = 0. Adam's first moment of the position is
-    reset.
-    The second moment is kept: with it at zero and the step count of the row, which all its
+    reset. The second moment is kept: with it at zero and the step count of the row, which all its
     parameters share, in the thousands, the bias correction would make the next step 3.2 times as
     long as the learning rate (0.1 / √0.001).
 
