@@ -34,7 +34,7 @@ LAST_FRAME = 1_048_574
 PART_OF_SHAPES = {"face": "expression", "jaw": "jaw", "eyes": "eyes", "head": "neck"}
 """Part of a face performance -> that of the head which it moves."""
 FIRST_OPTIONS = ("start", "strength", "neutral", "place")
-"""Of the dialog; the others unfold."""
+"""First options of the dialog; the others unfold."""
 NEUTRAL_LABELS = {"none": "As Recorded", "quiet": "Quiet Face", "first": "First Frame"}
 
 
@@ -344,5 +344,5 @@ class ApplyMotion(Edit, bpy.types.Operator, FileImport, MotionProperties):
     def _report_range(self, beyond: Mapping[str, np.ndarray]) -> None:
         for part, values in beyond.items():
             if values.any():
-                share = f"{100 * float((values > 0).mean()):.0f} % of the frames"
-                self.inform(f"{part}: {share} were outside the head's own recording")
+                fraction = f"{100 * float((values > 0).mean()):.0f} % of the frames"
+                self.inform(f"{part}: {fraction} were outside the head's own recording")

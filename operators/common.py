@@ -32,7 +32,7 @@ TAB = "STGA"
 MAX_REPORT_CHARACTERS = 90
 """Length of what popup and status bar show of a report."""
 UNSAVED = "has not been saved yet"
-"""In messages that saving the file makes void."""
+"""Part of messages that saving the file makes obsolete."""
 PARENT_FOLDERS = re.compile(r"(?:[A-Za-z]:)?[\\/](?:[^\\/:;,()]+[\\/])+")
 
 Poll = Callable[[Any, Any], bool]
@@ -76,10 +76,10 @@ class Action:
             with telling_refusals():
                 return self.run(context) or {"FINISHED"}
         except StgaError as error:
-            self.tell("ERROR", str(error))
+            self.notify("ERROR", str(error))
             return {"CANCELLED"}
         except Cancelled as error:
-            self.tell("WARNING", str(error) or "Cancelled")
+            self.notify("WARNING", str(error) or "Cancelled")
             return {"CANCELLED"}
         finally:
             if window is not None:
@@ -90,9 +90,9 @@ class Action:
         self.report({"INFO"}, sentence)
 
     def warn(self, sentence: str) -> None:
-        self.tell("WARNING", sentence)
+        self.notify("WARNING", sentence)
 
-    def tell(self: Any, kind: str, sentence: str) -> None:
+    def notify(self: Any, kind: str, sentence: str) -> None:
         """Report "ERROR" or "WARNING": as a whole without a window, else briefly, and as a whole in
         the panel, there after the warnings of before."""
         brief = short_sentence(sentence)
@@ -192,9 +192,9 @@ class Stepwise(Action):
             if str(error):
                 self.report({"WARNING"}, str(error))
         except StgaError as error:
-            self.tell("ERROR", str(error))
+            self.notify("ERROR", str(error))
         except Exception as error:
-            self.tell("ERROR", f"Ended by an unexpected {describe(error)}")
+            self.notify("ERROR", f"Ended by an unexpected {describe(error)}")
         return {"CANCELLED"}
 
     def cancel(self, context: Any) -> None:

@@ -68,7 +68,7 @@ from .options import ONCE
 from .training_python import training_python
 
 Read = Callable[[], Any]
-"""What is exported of the open scene at its frame."""
+"""Function that reads the part of the open scene, at its frame, that is exported."""
 Write = Callable[[Iterable[tuple[int, Any]]], Any]
 STEP_INTERVAL_S = 0.005
 MAX_WAITING_FRAMES = 2

@@ -61,9 +61,10 @@ from .pose import begin_sliders
 from .windows import show_panel
 
 FOLDERS_ABOVE_FILE = 3
-"""In which the capture of an image, mask, mesh or parameter file is looked for."""
+"""Number of folders above an image, mask, mesh or parameter file in which its capture is looked
+for."""
 DEMO = Path(__file__).parents[1] / "demo_capture"
-"""In the complete edition; the others have none."""
+"""Demo of the complete edition; the other editions have none."""
 DEMO_MINUTES = 1.0
 
 USER_AVATARS = "stga_avatars"

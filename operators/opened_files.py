@@ -93,11 +93,11 @@ def _after_load(_: Any) -> None:
     rebase_file(bpy.data.filepath, moved_first=True)
     _read_older(bpy.data.objects)
     _choose_head()
-    _say(replace_native_splats(bpy.data.objects))
+    _log(replace_native_splats(bpy.data.objects))
     monitor.start_timer()
 
 
-def _say(sentence: str) -> None:
+def _log(sentence: str) -> None:
     """Print a sentence, if it is not empty, and show it in the panel."""
     if sentence:
         print(f"STGA: {sentence}")
@@ -111,7 +111,7 @@ def _after_append(imported: Any) -> None:
     scene = bpy.context.scene
     layer = bpy.context.view_layer
     appended = [item.id for item in imported.import_items if item.id is not None]
-    _say(replace_native_splats(appended))
+    _log(replace_native_splats(appended))
     for item in imported.import_items:
         thing = item.id
         if thing is None or tags.KIND not in thing:

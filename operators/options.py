@@ -16,7 +16,7 @@ from ..stga_addon.schema import MAX_COUNT, alternatives, type_hints
 ONCE = {"SKIP_SAVE"}
 """Options of a property that holds for one call: Blender does not remember it for the next."""
 DEFAULT = re.compile(r" \(default:? ([^)]*)\)")
-"""What a help says of the default, which Blender shows by itself, or for which 0 or nothing
+"""Statement of the default in a help, which Blender shows by itself, or for which 0 or nothing
 stands."""
 
 

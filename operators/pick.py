@@ -19,7 +19,7 @@ from .common import is_head
 from .windows import push_undo
 
 NEAR_PX = 12.0
-"""From the vertices of a head, or the splats of a file: on it."""
+"""Largest distance from the vertices of a head, or the splats of a file, that is a hit."""
 PARTS = (tags.HEAD, tags.SPLATS)
 
 

@@ -193,8 +193,8 @@ class RenderVideo(Stepwise, bpy.types.Operator, FileExport):
                         if is_new or any(layer.relit for layer in layers):
                             posed = [layer.posed(seen.camera.position) for layer in layers]
                         recorder.add([in_range(each, seen) for each in posed], seen.camera)
-                    share = (number + 1) / len(frames)
-                    if status.report(Progress(share, "Recording", figures=lambda: left)):
+                    fraction = (number + 1) / len(frames)
+                    if status.report(Progress(fraction, "Recording", figures=lambda: left)):
                         raise Cancelled(f"{output}: cancelled")
                     yield
                 while is_rendering():  # Blender has one render at a time
@@ -211,10 +211,10 @@ class RenderVideo(Stepwise, bpy.types.Operator, FileExport):
                 kept.pop_all()
 
 
-def _while_rendering(status: Any, share: float, output: Path) -> StepGenerator:
+def _while_rendering(status: Any, fraction: float, output: Path) -> StepGenerator:
     """Wait while Blender renders: it sets frames itself, and would get ours."""
     while is_rendering():
-        if status.report(Progress(share, "Waiting for the render")):
+        if status.report(Progress(fraction, "Waiting for the render")):
             raise Cancelled(f"{output}: cancelled")
         yield
 

@@ -79,7 +79,7 @@ def start(
 
 def _show(progress: Any) -> bool:
     """Show at the pointer how far a request is that Blender's own Python carries out."""
-    show_progress(progress.share)
+    show_progress(progress.fraction)
     return False
 
 

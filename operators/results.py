@@ -36,7 +36,7 @@ from ..stga_addon.worker.status import WorkerState
 from .common import capture_source, is_head
 
 Answer = SliceBuilt | Shown | None
-"""What a function of `SHOW` returns; None: the result is still being read."""
+"""Result of a function of `SHOW`; None: the result is still being read."""
 
 
 def _operate(scene: Any, operator: Any, **options: Any) -> Shown:
@@ -343,7 +343,7 @@ CAPTURES = {
     Kind.TRACKING: lambda state: state.place,
     Kind.AVATAR: lambda state: state.place / CAPTURE_FOLDER,
 }
-"""Where the request of a kind tracks a head."""
+"""Kind of request -> where it tracks a head."""
 
 
 def show_tracked(scene: Any, capture: Path, picture: Path) -> None:
@@ -389,7 +389,8 @@ def _apply_performance(scene: Any, state: RequestState) -> Answer:
 
 
 ADDS = {Kind.LIGHT: splat_object.store_light, Kind.EXACT: splat_object.store_linear_base}
-"""What requests add to a run's avatar, stored in the object that shows it."""
+"""Kind of request -> function that stores what it adds to a run's avatar in the object that shows
+it."""
 SHOW = {
     Kind.TRAINING: _show_avatar,
     Kind.TRACKING: _import,

@@ -65,11 +65,11 @@ class Select(Edit, bpy.types.Operator):
         head[tags.KEY_REGIONS] = "\n".join(names)
         count_selected(context.scene, head)
         if groups.has_heat_map(head) and not groups.shows_residuals(head):
-            groups.show_heat_map(head, _shares(head))
+            groups.show_heat_map(head, _fractions(head))
         moving = [faces.mean() for faces in selection.values() if faces.any()]
-        share = 100 * sum(moving) / len(moving) if moving else 0.0
+        fraction = 100 * sum(moving) / len(moving) if moving else 0.0
         counted = f"{len(moving)} of {len(selection)} frames select triangles"
-        self.inform(f"{counted}, {share:.0f} % of the head on average")
+        self.inform(f"{counted}, {fraction:.0f} % of the head on average")
 
 
 class ToggleRegion(Edit, bpy.types.Operator):
@@ -136,12 +136,12 @@ class HeatMap(Edit, bpy.types.Operator):
             groups.show_heat_map(head, residual, groups.RESIDUAL, largest)
             self.inform(f"Red: a mean error of {100 * largest:.1f} % of full brightness or more")
         else:
-            share = _shares(head)
-            if not share.any():
+            fraction = _fractions(head)
+            if not fraction.any():
                 problem = "no frame selects a triangle yet; select moving triangles first"
                 raise StgaError(f"{head.name}: {problem}")
-            groups.show_heat_map(head, share)
-            often = f"{share.max():.0%} of the frames"
+            groups.show_heat_map(head, fraction)
+            often = f"{fraction.max():.0%} of the frames"
             self.inform(f"The most selected triangle is selected in {often}")
         in_view = context.view_layer.objects
         if splats is not None and all(in_view.get(each.name) is each for each in (splats, head)):
@@ -190,6 +190,6 @@ def count_selected(scene: Any, head: Any) -> None:
         row.splats = int(counted)
 
 
-def _shares(head: Any) -> np.ndarray:
-    """(F,) share of the frames that select each triangle."""
+def _fractions(head: Any) -> np.ndarray:
+    """(F,) fraction of the frames that select each triangle."""
     return np.mean(list(groups.read_selection(head).values()), axis=0)

@@ -34,7 +34,7 @@ from .errors import StgaError, shorten
 MAX_FILE_BYTES = 1 << 30
 MAX_JSON_BYTES = 256 << 20
 MAX_TOML_BYTES = 16 << 20
-STRAY_BYTES = 1 << 10
+PROBED_BYTES = 1 << 10
 DAMAGE_BYTES = 1 << 20
 WEB_PAGE = re.compile(rb"(<\?xml[^>]*>|<!--.*?-->|\s)*<(!doctype html|html|head|body)\b", re.DOTALL)
 CHANGED_LINE_ENDS = (
@@ -44,15 +44,17 @@ CHANGED_LINE_ENDS = (
 MAX_ARRAYS_BYTES = 1 << 30
 """Largest sum of the arrays that are read from an npz: an avatar of four million splats."""
 MAX_CHECKPOINT_BYTES = 4 << 30
-"""The same of a checkpoint, which has an avatar's arrays three times over."""
+"""The same for a checkpoint, which holds an avatar's arrays three times."""
 MIN_UNPACKED_BYTES = 32 << 20
 """Bytes to which any file of packed splats may unpack."""
 MAX_UNPACKED_RATIO = 16
-"""How many times its size a larger one may unpack to; splats reach 3, without harmonics 10."""
+"""Largest ratio of unpacked to packed size of larger files; splats reach 3, without harmonics
+10."""
 MIN_ARRAYS_BYTES = 384 << 20
 """Bytes to which any npz may unpack besides."""
 MIN_NUMBER_BYTES = 4
-"""What a number of an npz counts for at least, as readers make floats of small ones."""
+"""Least number of bytes that a number of an npz counts for, because readers convert small ones to
+floats."""
 BLOCK_BYTES = 1 << 20
 """Bytes of an array that are looked at together."""
 MAX_NAME_BYTES = 255
@@ -62,13 +64,13 @@ PARTIAL_NAME = re.compile(
 )
 """Name of a temporary file: .NAME.HOST-PROCESS-RANDOM.partial"""
 RENAME_PATIENCE_S = 5.0
-"""How long a rename is tried again while another program has the file open, on Windows."""
+"""Time for which a rename is retried on Windows while another program has the file open."""
 RENAME_INTERVAL_S = 0.1
 """Interval of these attempts."""
 WINDOWS_SHARING_ERRORS = (5, 32)
 """ERROR_ACCESS_DENIED and ERROR_SHARING_VIOLATION of an open file."""
 NO_FILE = (errno.ENOENT, errno.ENOTDIR, errno.ELOOP, errno.ENAMETOOLONG, errno.EINVAL)
-"""What the system answers where there is nothing under a name."""
+"""Errors of the system where no file has a name."""
 NewFile = Callable[[Path], AbstractContextManager[Path]]
 SEQUENCE_FILE = ".stga_sequence"
 BYTE_ORDER_MARKS = {
@@ -446,15 +448,15 @@ def read_bytes(path: Path, limit: int = MAX_FILE_BYTES) -> bytes:
         raise StgaError(f"{path}: has {size} bytes, more than the {limit} allowed")
     with naming(path, "read"):
         data = path.read_bytes()
-    if unexpected := stray_content(data):
+    if unexpected := unexpected_content(data):
         raise StgaError(f"{path}: {unexpected}")
     return data
 
 
-def stray_content(data: bytes) -> str | None:
+def unexpected_content(data: bytes) -> str | None:
     """What stands in the place of a file whose download or checkout went wrong, and what to do, to
     follow its name in a message; None where it is neither a Git LFS pointer nor a web page."""
-    start = data[:STRAY_BYTES].removeprefix(b"\xef\xbb\xbf").lstrip().lower()
+    start = data[:PROBED_BYTES].removeprefix(b"\xef\xbb\xbf").lstrip().lower()
     if start.startswith(b"version https://git-lfs.github.com/"):
         return "is a Git LFS pointer, not the file; fetch the file with git lfs pull"
     if WEB_PAGE.match(start):
@@ -708,7 +710,7 @@ def damage_of(path: Path) -> str | None:
         return None
     with naming(path, "read"), path.open("rb") as stream:
         start = stream.read(DAMAGE_BYTES)
-    return stray_content(start) or (CHANGED_LINE_ENDS if line_ends_changed(start) else None)
+    return unexpected_content(start) or (CHANGED_LINE_ENDS if line_ends_changed(start) else None)
 
 
 def _read_array(stream: IO[bytes], size: int) -> np.ndarray:

@@ -46,8 +46,8 @@ QUALITIES_DB = {"Good": 30.0, "Usable": 25.0, "Rough": -math.inf}
 
 MIN_SEEN_GAIN_DB = 0.1
 """Gains that nobody sees are smaller."""
-MORE_GAIN = "what may help: Growth, which adds splats there, or footage that shows it larger"
-"""What there is to do where training a region further gains nothing that is seen."""
+MORE_GAIN = "what may help: More Splats (--growth), or footage that shows it larger"
+"""Advice where training a region further gains nothing visible."""
 
 
 def describe_gain(before_db: float, after_db: float) -> str:
@@ -83,8 +83,8 @@ def describe_figures(figures: Mapping[str, float]) -> list[str]:
     before_db, after_db  of the region that is trained further, `describe_gain`
     psnr, psnr_unmatched   of the last evaluation, dB, the second one without fitting the exposure
                            of views
-    error_px, unexplained  of a tracked head: median distance from its landmarks, share of the face
-                           that images do not look like
+    error_px, unexplained  of a tracked head: median distance from its landmarks, fraction of the
+                           face that images do not look like
     """
     loss = ("loss", "loss {:.4f}")
     quality: tuple[tuple[tuple[str, str], ...], ...] = ((("psnr", "PSNR {:.2f} dB"), loss),)

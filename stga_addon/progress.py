@@ -13,17 +13,19 @@ import numpy as np
 
 Item = TypeVar("Item")
 
-PACE_SHARE = 0.1  # Share of the work, the last that was done, whose pace says how much time is left
+PACE_FRACTION = (
+    0.1  # Fraction of the work, the last that was done, whose pace says how much time is left
+)
 MAX_OVERRUN_RATIO = 1.25  # Times what was said to be left, from which on that was too little
 MIN_PACE_S = 5.0  # For which the work's own forecast is watched before it is corrected
-MAX_STEP_SHARE = 0.05  # Of a step; beyond, an interrupted call had done it before
+MAX_STEP_FRACTION = 0.05  # Of a step; beyond, an interrupted call had done it before
 
 
 @dataclass(frozen=True)
 class Progress:
     """How far the work is.
 
-    share     0 to 1
+    fraction  0 to 1
     stage     what is being done; detail: more about it
     figures   gives named numbers that depend on the kind of work, NaN where one is not known yet
     preview   writes the result so far into a file; None before there is one
@@ -32,7 +34,7 @@ class Progress:
     metrics   of a training: its evaluations so far, the lines of metrics.jsonl
     """
 
-    share: float = 0.0
+    fraction: float = 0.0
     stage: str = ""
     detail: str = ""
     figures: Callable[[], Mapping[str, float]] = dict
@@ -43,7 +45,7 @@ class Progress:
 
 Report = Callable[[Progress], bool]
 """Called now and then; returns True to stop and keep what there is."""
-Say = Callable[[str], None]  # Called with a line for people
+Log = Callable[[str], None]  # Called with a line for people
 
 
 def warn(sentence: str) -> None:
@@ -60,7 +62,7 @@ class Written:
 
 
 class TimeLeft:
-    """Seconds that are left of work, as its share grows."""
+    """Seconds that are left of work, as its fraction grows."""
 
     def __init__(self, clock: Callable[[], float] = monotonic) -> None:
         self._clock = clock
@@ -68,22 +70,22 @@ class TimeLeft:
         # Seconds and fractions of the steps that tell the pace
         self._steps: deque[tuple[float, float]] = deque()
 
-    def after(self, share: float) -> float:
-        """Once `share` of the work is done; NaN where the pace is not known yet."""
+    def after(self, fraction: float) -> float:
+        """Once `fraction` of the work is done; NaN where the pace is not known yet."""
         now = self._clock()
         (before, begun) = self._last
-        self._last = now, share
-        if 0 <= share - begun <= MAX_STEP_SHARE:
-            self._steps.append((now - before, share - begun))
+        self._last = now, fraction
+        if 0 <= fraction - begun <= MAX_STEP_FRACTION:
+            self._steps.append((now - before, fraction - begun))
         seconds, done = map(sum, zip(*self._steps, strict=True)) if self._steps else (0.0, 0.0)
-        while done > PACE_SHARE and done - self._steps[0][1] >= PACE_SHARE:
+        while done > PACE_FRACTION and done - self._steps[0][1] >= PACE_FRACTION:
             first = self._steps.popleft()
             seconds = seconds - first[0]
             done = done - first[1]
-        return (1 - share) * seconds / done if done >= PACE_SHARE / 10 else math.nan
+        return (1 - fraction) * seconds / done if done >= PACE_FRACTION / 10 else math.nan
 
 
-MAX_TOLD_SHARE = 0.99
+MAX_REPORTED_FRACTION = 0.99
 """Before the end: 100 % is said of what is done."""
 
 
@@ -91,19 +93,19 @@ class Clock:
     """How far work is and how long it takes, as it is reported: neither ever goes back."""
 
     def __init__(self, clock: Callable[[], float] = monotonic) -> None:
-        self.share = 0.0
+        self.fraction = 0.0
         self._clock = clock
-        self._by_share = TimeLeft(clock)
+        self._by_fraction = TimeLeft(clock)
         self._left_s = math.inf
         # When work lately reported how many seconds are left, and how many
         self._asked: deque[tuple[float, float]] = deque()
 
     def reported(self, progress: Progress) -> dict[str, float]:
-        """The finite figures of some progress; `left_s`, by the share where the work does not say,
-        else as before, is the least so far, and `longer` 1 where that is, or the work knows it to
-        be, too little."""
-        self.share = max(self.share, min(progress.share, MAX_TOLD_SHARE))
-        figures = {"left_s": self._by_share.after(progress.share), **progress.figures()}
+        """The finite figures of some progress; `left_s`, by the fraction where the work does not
+        say, else as before, is the least so far, and `longer` 1 where that is, or the work knows it
+        to be, too little."""
+        self.fraction = max(self.fraction, min(progress.fraction, MAX_REPORTED_FRACTION))
+        figures = {"left_s": self._by_fraction.after(progress.fraction), **progress.figures()}
         figures = {name: value for name, value in figures.items() if math.isfinite(value)}
         asked_s = figures.get("left_s", self._left_s)
         if math.isfinite(asked_s):

@@ -32,8 +32,8 @@ if TYPE_CHECKING:
 
 CURVE = "curve.png"
 
-MAX_DRAWING_SHARE = 0.01
-"""Largest share of the time that drawing the curve may take while a run trains."""
+MAX_DRAWING_FRACTION = 0.01
+"""Largest fraction of the time that drawing the curve may take while a run trains."""
 
 FIRST_DRAWING_S = 30.0  # Until the first: loading the library takes a few
 
@@ -55,7 +55,7 @@ class CurveUpdater:
                 write_curve(self._folder, metrics)
             self._drawn_count = len(metrics)
         spent = perf_counter() - now
-        self._next_update = now + spent / MAX_DRAWING_SHARE
+        self._next_update = now + spent / MAX_DRAWING_FRACTION
 
 
 def write_curve(folder: Path, metrics: Sequence[Mapping[str, Any]]) -> None:
@@ -130,8 +130,8 @@ def summarize_run(metrics: Sequence[Mapping[str, Any]], settings: TrainingSettin
     if checked:
         lines.append(f"forecasts: {held} of {checked} held within their error")
     memory = f", peak memory {last['peak_memory_mb']:,.0f} MB" if last.get("peak_memory_mb") else ""
-    share = f"{evaluation_share(metrics):.1%} of the training time"
-    return [*lines, f"evaluation took {share}, in addition to it{memory}"]
+    fraction = f"{evaluation_fraction(metrics):.1%} of the training time"
+    return [*lines, f"evaluation took {fraction}, in addition to it{memory}"]
 
 
 def summarize_continuation(metrics: Sequence[Mapping[str, Any]]) -> list[str]:
@@ -156,7 +156,7 @@ def summarize_continuation(metrics: Sequence[Mapping[str, Any]]) -> list[str]:
     return lines
 
 
-def evaluation_share(lines: Sequence[Mapping[str, Any]]) -> float:
+def evaluation_fraction(lines: Sequence[Mapping[str, Any]]) -> float:
     """Seconds of evaluation during training, the final one left out, over those of training."""
     spent: float = sum(line["evaluation_s"] for line in lines[:-1])
     return spent / max(float(lines[-1]["seconds"]), 1e-9)
@@ -288,8 +288,8 @@ def curve_image(lines: Sequence[Mapping[str, Any]]) -> tuple[np.ndarray, str, st
     detail_range = ""
     if len(detail) > 1:
         lowest = min(float(np.interp(when[-1] / 10, when, detail)), float(detail[-1]))
-        share = (detail - lowest) / max(float(detail.max()) - lowest, 1e-9)
-        plot.line(when, low + share * (high - low), DETAIL_COLOR)
+        fraction = (detail - lowest) / max(float(detail.max()) - lowest, 1e-9)
+        plot.line(when, low + fraction * (high - low), DETAIL_COLOR)
         worst = 10 ** (-lowest / 20)
         best = min(value for _, value in curve_of(lines, DETAIL))
         detail_range = f"Detail difference {worst:.3f} to {best:.3f} (green)"

@@ -76,7 +76,7 @@ EVERYTHING = Drawing(
 )
 
 
-SHARES = "expected a tuple, each item a finite number from 0.0 up to 1.0"
+FRACTIONS = "expected a tuple, each item a finite number from 0.0 up to 1.0"
 SIDE = "expected a whole number from 1 up to 9"
 KINDS = "expected one of Circle, Square"
 
@@ -105,8 +105,8 @@ REFUSED = [
     ({"count": 1.0}, "setting count: expected a whole number from 0, got 1.0"),
     ({"count": True}, "setting count: expected a whole number from 0, got True"),
     ({"count": 13}, "13 is not drawn"),
-    ({"span": (0.0, 1.5)}, f"setting span: {SHARES}, got "),
-    ({"span": (0.0, math.nan)}, f"setting span: {SHARES}, got "),
+    ({"span": (0.0, 1.5)}, f"setting span: {FRACTIONS}, got "),
+    ({"span": (0.0, math.nan)}, f"setting span: {FRACTIONS}, got "),
     ({"span": (0.0,)}, "setting span: expected a tuple of 2, got "),
     ({"span": [0.0, 1.0]}, "setting span: expected a tuple of 2, got "),
     ({"steps": (1, 0)}, "setting steps: expected a tuple, each item a whole number above 0, got "),
@@ -212,7 +212,7 @@ def test_the_python_interface_takes_names_as_paths(tmp_path, kind):
     api.write_avatar(kind(avatar), api.read_avatar(path=kind(avatar)))
     api.write_ply(kind(tmp_path / "a.ply"), splats)
     assert len(api.read_splats(kind(tmp_path / "a.ply"))) == len(splats)
-    api.perform(api.Export(kind(avatar), kind(tmp_path / "b.ply"), "ply"), say=lambda _: None)
+    api.perform(api.Export(kind(avatar), kind(tmp_path / "b.ply"), "ply"), log=lambda _: None)
     assert (tmp_path / "b.ply").stat().st_size > 1000
     with refusal("'a.x00b' is not a usable path"):
         api.read_splats("a\0b")

@@ -24,7 +24,7 @@ CLASSES = (
     motion_panel.CoefficientsPanel,
     show_panel.RenderPanel,
 )
-"""In the order of the tab."""
+"""Classes in the order of the tab."""
 
 
 def register(at_end: AtEnd) -> None:

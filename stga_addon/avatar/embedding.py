@@ -17,9 +17,9 @@ MIN_DIVISOR = 1e-30
 MAX_UNEVENNESS = 1e-6
 """Relative difference between a matrix's scales that is float32's rounding."""
 MIN_AREA_RATIO = 1e-4
-"""A triangle whose area is below this share of its longest edge's square counts as a line: vertices
-on a line, rounded to float32, have ratios of 1e-6 to 1e-5, and their normal and area are those of
-the rounding."""
+"""A triangle whose area is below this fraction of its longest edge's square counts as a line:
+vertices on a line, rounded to float32, have ratios of 1e-6 to 1e-5, and their normal and area are
+those of the rounding."""
 # from this z on, the perpendicular of a unit vector is sought in the x direction
 UPRIGHT_COSINE = 0.8
 """z component of a triangle's first axis above which x replaces z in the cross product that stands
@@ -120,7 +120,7 @@ def frame_backward(
     """
     force = by_frame[:, :3]
     torque = by_frame[:, 3:6]
-    growth = by_frame[:, 6]
+    enlargement = by_frame[:, 6]
     corners = (np.asarray(vertices, np.float64)[faces] - frames.origin[:, None]) @ frames.rotation
     x = corners[..., 0]
     y = corners[..., 1]
@@ -136,9 +136,9 @@ def frame_backward(
     # The first axis points from the origin to p0.
     spin = np.where(flat, 0.0, torque[:, 2] / np.where(flat, 1.0, x[:, 0]))
     pull = np.repeat(force[:, None] / 3, 3, axis=1)
-    pull[..., 0] += growth[:, None] / 2 * slope_x
+    pull[..., 0] += enlargement[:, None] / 2 * slope_x
     turn = np.array([2 / 3, -1 / 3, -1 / 3])
-    pull[..., 1] += growth[:, None] / 2 * slope_y + spin[:, None] * turn
+    pull[..., 1] += enlargement[:, None] / 2 * slope_y + spin[:, None] * turn
     pull[..., 2] += torque[:, :1] * slope_y - torque[:, 1:2] * slope_x
     pull = (pull @ frames.rotation.transpose(0, 2, 1)).reshape(-1, 3)
     return np.stack([np.bincount(faces.ravel(), column, len(vertices)) for column in pull.T], -1)

@@ -21,7 +21,7 @@ from .offsets import (
     POSITION,
     SCALE,
     SIGNALS,
-    limited_growth,
+    limited_enlargement,
     moved_frames,
     offset_of,
 )
@@ -43,7 +43,7 @@ _HEADER = {
 """Field of the avatar -> what JSON holds of it; of the regions their names."""
 
 SOURCES = "estimated", "gray_card", "file"
-"""Where an avatar's light can come from."""
+"""Origins of an avatar's light."""
 _LIGHT_ARRAYS = {
     "radiance": (9, 3),
     "transfer": (-1, 9),
@@ -58,9 +58,9 @@ _OPTIONAL_ARRAYS = "strain_range", "linear_base", "filmed_along"
 MIN_COLOR_CHANGE = 1 / 255
 """Offsets of colors that never change them by as much are not stored."""
 MIN_SHIFT_M = 2e-4
-"""The same of positions."""
+"""The same for positions."""
 MIN_SCALE_CHANGE = 0.02
-"""The same of scales, relative."""
+"""The same for scales, relative."""
 
 
 UNSEEN_REGION = "unseen"
@@ -75,11 +75,11 @@ class AvatarLight:
                 (`light.harmonics.basis`) in the axes of the capture
     transfer    (V, 9) float32: irradiance is transfer @ radiance; with the head's own shadow
                 (`light.surface`)
-    occlusion   (V,) float32, 0…1: cosine-weighted share of the sky that the head leaves open
+    occlusion   (V,) float32, 0…1: cosine-weighted fraction of the sky that the head leaves open
     irradiance  (V, 3) float32: of the capture, with light that the head reflects onto itself, mean
                 over its timesteps; an albedo is π times linear color over this
     roughness   (V,) float32: of highlights; 0: skin, whose roughness the scene's lighting says
-    residual    how far recorded colors are from what `radiance` explains, as a share of them
+    residual    how far recorded colors are from what `radiance` explains, as a fraction of them
                 (robust deviation)
     damping     0…1 by which albedo is pulled to its mean, because the light is too hard to take
                 away
@@ -181,8 +181,8 @@ class Avatar:
     @property
     def with_limited_offsets(self) -> "Avatar":
         """With coefficients of 0 where they do not change a triangle's splats by MIN_COLOR_CHANGE,
-        MIN_SHIFT_M or a share of MIN_SCALE_CHANGE anywhere in `strain_range`, and with smaller ones
-        where they would blow splats up somewhere in it (`limited_growth`)."""
+        MIN_SHIFT_M or a fraction of MIN_SCALE_CHANGE anywhere in `strain_range`, and with smaller
+        ones where they would blow splats up somewhere in it (`limited_enlargement`)."""
         basis = self._strain
         kept = {}
         if basis is None:
@@ -201,7 +201,7 @@ class Avatar:
             offset = OFFSETS[name]
             if offset.target == SCALE:
                 signals = np.stack([SIGNALS[offset.signal](basis, end) for end in ends])
-                coefficients = limited_growth(coefficients, signals, size)
+                coefficients = limited_enlargement(coefficients, signals, size)
             signal = np.abs(SIGNALS[offset.signal](basis, frames))
             change = offset_of(np.abs(coefficients), signal).max(1)
             if not signal.any():  # it does not come from the deformation

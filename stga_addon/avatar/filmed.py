@@ -11,11 +11,11 @@ from ..flame.quaternions import unit
 from .file import UNSEEN_REGION, Avatar
 
 SECTOR_DEG = 10
-"""Of directions around the head that are filmed or not as a whole."""
+"""Width of a sector of directions around the head, which is filmed or not as a whole."""
 MAX_SLOPE = 0.5
-"""Of surfaces that count, up or down: others look to no side."""
+"""Largest slope, up or down, of surfaces that count: steeper ones face no side."""
 SEEN_TO_DEG = 90
-"""How far from a camera's direction a surface is seen."""
+"""Largest angle from a camera's direction at which it sees a surface."""
 FROM_ALL_SIDES = "filmed from all sides"
 
 

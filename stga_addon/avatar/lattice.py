@@ -12,7 +12,7 @@ SCALE = 0.6
 FLATNESS = 0.5
 """Standard deviation along the normal per that in the triangle's plane."""
 INSET = 0.1
-"""Share of the way to the centroid by which points lie inside their triangle: neighbors' points
+"""Fraction of the way to the centroid by which points lie inside their triangle: neighbors' points
 must not coincide."""
 MIN_SPACING_M = 1e-6  # the scale of splats on a triangle without area still needs a logarithm
 

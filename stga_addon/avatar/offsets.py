@@ -13,19 +13,19 @@ SIGNALS: dict[str, Callable[[StrainBasis, FaceFrames], np.ndarray]] = {
     "smoothed_strain": lambda basis, frames: smoothed_strain(basis, frames.deformation),
     "normal": lambda basis, frames: frames.deformation[:, STRAIN_COMPONENTS:],
 }
-"""By name: (F, 3) float32 of a posed mesh's triangles, from the neutral mesh's basis and the
-frames; 0 where it is at rest. "normal": the change of the unit normal, world axes."""
+"""Name -> (F, 3) float32 of a posed mesh's triangles, from the neutral mesh's basis and the frames;
+0 where it is at rest. "normal": the change of the unit normal, world axes."""
 POSITION = "position"
 SCALE = "scale"
 COLOR = "color"
 TARGETS = (POSITION, SCALE, COLOR)
 
-MAX_GROWTH = 3.0
+MAX_ENLARGEMENT = 3.0
 """Factor by which a signal may enlarge any splat: 99 % of the triangles of one `studio_head` run
 changed their splats' size by less in filmed poses."""
-MAX_GROWN_M = 0.015
-"""Standard deviation (m) up to which a signal may enlarge a splat by more than MAX_GROWTH. A splat
-of `studio_head` would reach .2 m without this limit, costing unseen expressions .01 dB."""
+MAX_ENLARGED_M = 0.015
+"""Standard deviation (m) up to which a signal may enlarge a splat by more than MAX_ENLARGEMENT. A
+splat of `studio_head` would reach .2 m without this limit, costing unseen expressions .01 dB."""
 
 
 @dataclass(frozen=True)
@@ -36,7 +36,7 @@ class DrivenOffset:
     signal      what drives it, of SIGNALS
     target      POSITION: by a vector in the triangle's own axes and unit; SCALE: that unit, by the
                 exponential of the first component; COLOR: sRGB
-    rate, rate_share  learning rate: which of `Rates`, and a share of it
+    rate, rate_fraction  learning rate: which of `Rates`, and a fraction of it
     of_light    whether it is the capture's light, which other light takes the place of
     """
 
@@ -44,7 +44,7 @@ class DrivenOffset:
     signal: str
     target: str
     rate: str
-    rate_share: float
+    rate_fraction: float
     of_light: bool = False
 
 
@@ -56,9 +56,9 @@ _ROWS = (
 )
 
 OFFSETS: dict[str, DrivenOffset] = {offset.name: offset for offset in _ROWS}
-"""By name. Everything that trains, stores or poses avatars goes by this table. Skin that is
-compressed bulges and darkens, and splats on what is stretched grow; skin that turns in a light that
-stays gets brighter or darker."""
+"""Name -> driven offset. Everything that trains, stores or poses avatars uses this table.
+Compressed skin bulges and darkens, splats on stretched skin become larger, and skin that turns in a
+fixed light becomes brighter or darker."""
 
 
 def offset_of(coefficients: np.ndarray, signal: np.ndarray) -> np.ndarray:
@@ -66,7 +66,9 @@ def offset_of(coefficients: np.ndarray, signal: np.ndarray) -> np.ndarray:
     return np.einsum("fk,fkc->fc", signal, coefficients)
 
 
-def limited_growth(coefficients: np.ndarray, signals: np.ndarray, size: np.ndarray) -> np.ndarray:
+def limited_enlargement(
+    coefficients: np.ndarray, signals: np.ndarray, size: np.ndarray
+) -> np.ndarray:
     """Coefficients (F, S, 3) of a SCALE offset, made smaller where a pose that was never filmed
     could blow a splat up.
 
@@ -74,11 +76,11 @@ def limited_growth(coefficients: np.ndarray, signals: np.ndarray, size: np.ndarr
     others may combine all of the extremes. size (F,) meters: the largest standard deviation of a
     triangle's splats at rest.
     """
-    growth = np.maximum(*(signals * coefficients[..., 0])).sum(1)
-    limit = np.log(np.maximum(MAX_GROWTH, MAX_GROWN_M / np.maximum(size, 1e-9)))
-    return (coefficients * np.minimum(1, limit / np.maximum(growth, limit))[:, None, None]).astype(
-        coefficients.dtype
-    )
+    enlargement = np.maximum(*(signals * coefficients[..., 0])).sum(1)
+    limit = np.log(np.maximum(MAX_ENLARGEMENT, MAX_ENLARGED_M / np.maximum(size, 1e-9)))
+    return (
+        coefficients * np.minimum(1, limit / np.maximum(enlargement, limit))[:, None, None]
+    ).astype(coefficients.dtype)
 
 
 def moved_frames(

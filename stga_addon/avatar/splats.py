@@ -76,9 +76,9 @@ class Splats:
 
 def logits(opacity: np.ndarray) -> np.ndarray:
     """`Splats.opacity`, float32, of opacities 0 to 1: of these two −∞ and ∞."""
-    share = opacity.astype(np.float64)
+    fraction = opacity.astype(np.float64)
     with np.errstate(divide="ignore"):
-        return np.asarray(np.log(share / (1 - share)), np.float32)
+        return np.asarray(np.log(fraction / (1 - fraction)), np.float32)
 
 
 @dataclass(frozen=True)
@@ -203,18 +203,18 @@ def sh_color(sh: np.ndarray, direction: np.ndarray) -> np.ndarray:
 def colored_off_axis(
     splats: Splats,
     direction: np.ndarray,
-    share: np.ndarray,
+    fraction: np.ndarray,
     color: np.ndarray,
     steepness: np.ndarray | float = 1.0,
 ) -> Splats:
     """Splats of degree 0 that look as they do along a unit direction (N, 3) from the eye, and the
-    more it turns from there, as a color (N, 3), sRGB: by a share (N,) of the way times
-    (1 - c) (1 + steepness c), where c is the cosine of the angle and steepness (N,); the squared
-    sine where that is 1. Of degree 2, which holds just that."""
+    more it turns from there, as a color (N, 3), sRGB: by a fraction (N,) of the way times (1 - c)
+    (1 + steepness c), where c is the cosine of the angle and steepness (N,); the squared sine where
+    that is 1. Of degree 2, which holds just that."""
     directions = unit(np.random.default_rng(0).normal(size=(64, 3)))
     cosine = directions @ direction.T
     way = (1 - cosine) * (1 + steepness * cosine)
     terms = np.linalg.pinv(_basis(directions, 9)) @ way
-    change = share[:, None] * (color - sh_color(splats.sh, direction))
+    change = fraction[:, None] * (color - sh_color(splats.sh, direction))
     sh = at_degree(splats, 2).sh + terms.T[:, :, None] * change[:, None]
     return replace(splats, sh=sh.astype(np.float32))

@@ -18,7 +18,7 @@ MIN_COMPRESSION = 0.2
 """Compression that colors do not follow yet (E = 0.04): coefficients fitted to so little are mostly
 noise."""
 MAX_NORMAL_CHANGE = 2.0
-"""Of a unit normal, in each component."""
+"""Largest change of a unit normal, in each component."""
 TRAINED_RANGE = np.array(
     [
         [-MAX_STRAIN, -MAX_STRAIN, -MAX_STRAIN, *3 * [-MAX_NORMAL_CHANGE]],
@@ -30,11 +30,11 @@ TRAINED_RANGE = np.array(
 shadows come with compression and shear; what is fitted to compression is not to be continued into
 stretch. Within this range, a mesh at rest has a strain of −MIN_COMPRESSION, not 0."""
 RANGE_MARGIN = 1.2
-"""How far from rest splats follow a triangle's strain, as a multiple of what was seen in training:
-other expressions are a little stronger now and then."""
+"""Largest strain that splats follow, as a multiple of the largest strain in training: other
+expressions are sometimes a little stronger."""
 AVERAGING_ROUNDS = 3
-"""How often `smoothed_strain` averages over triangles that share an edge: a bulge moves more than
-one triangle."""
+"""Rounds in which `smoothed_strain` averages over triangles that share an edge: a bulge moves more
+than one triangle."""
 MIN_SQUARED_NORMAL = 1e-24
 """Squared normal (m⁴) of a neutral triangle with edges of a micrometer; a smaller one counts as
 having no area."""

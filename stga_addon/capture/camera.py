@@ -8,7 +8,8 @@ import numpy as np
 from ..flame.quaternions import from_axis_angle, to_matrices, unit
 
 MAX_IMAGE_PIXELS = 1 << 26
-"""Of the largest machine-vision sensors; a small file that claims more could fill the memory."""
+"""Pixels of the largest machine-vision sensors; a small file that claims more could fill the
+memory."""
 MAX_FOCAL_PIXELS = 1e7
 """Largest focal length."""
 MAX_COORDINATE_M = 1e5
@@ -178,11 +179,11 @@ def turntable(
     angles: radians from `start`, from `covered_angles`; a full turn goes around once, less swings
     to both sides."""
     low, high = angles
-    shares = np.arange(count) / count
+    fractions = np.arange(count) / count
     if high - low >= 2 * np.pi:
-        turns = 2 * np.pi * shares
+        turns = 2 * np.pi * fractions
     else:
-        turns = (low + high) / 2 + (high - low) / 2 * np.sin(2 * np.pi * shares)
+        turns = (low + high) / 2 + (high - low) / 2 * np.sin(2 * np.pi * fractions)
     return [orbited(start, center, up, turn) for turn in turns]
 
 

@@ -22,7 +22,8 @@ GAMMAS = {4: 2.2, 5: 2.8}
 """Code of transfer characteristics -> exponent. Codes that are not named here are sRGB's curve."""
 
 REFERENCE_WHITE_CD_M2 = 203.0
-"""Of diffuse white in HDR (ITU-R BT.2408), which becomes sRGB's; what is brighter is clipped."""
+"""Luminance of diffuse white in HDR (ITU-R BT.2408), which becomes sRGB's; brighter values are
+clipped."""
 HLG_PEAK = 1000.0 / REFERENCE_WHITE_CD_M2
 HLG_SYSTEM_GAMMA = 1.2
 BT2020_LUMINANCE = np.array([0.2627, 0.6780, 0.0593])

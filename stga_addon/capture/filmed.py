@@ -23,7 +23,7 @@ FACE = ("left_eye", "right_eye", "nose", "mouth")
 STILL_MM = 1.0
 """Difference between timesteps of how far the face moves, below which it has one expression."""
 ONE_EXPRESSION = "one expression"
-"""What is said of a face that does not move."""
+"""Description of a face that does not move."""
 SECTOR_DEG = 15
 """Width of the cells into which directions around a head are divided."""
 SECTORS = 360 // SECTOR_DEG
@@ -31,12 +31,12 @@ SECTORS = 360 // SECTOR_DEG
 BANDS_DEG = (-90.0, -12.0, 25.0, 90.0)
 """Bounds of the cells' elevations: from below, level, from above."""
 SIDE_DEG = 90
-"""How far around a head is to be filmed to both sides: to behind the ears."""
+"""Angle up to which a head is to be filmed on both sides: to behind the ears."""
 PICTURE_PX = 160
 """Side of the picture of directions."""
 HEAD_RADIUS = 0.3
-"""Radius of the head in that picture, as a share of half of its side; cells reach from there to its
-border."""
+"""Radius of the head in that picture, as a fraction of half of its side; cells reach from there to
+its border."""
 FILMED_COLOR = (0.16, 0.62, 0.34, 1.0)
 UNFILMED_COLOR = (0.3, 0.3, 0.3, 1.0)
 HEAD_COLOR = (0.75, 0.6, 0.5, 1.0)

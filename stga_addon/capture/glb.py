@@ -26,7 +26,7 @@ MIN_NUMBERS_ALLOWANCE = 1 << 20
 MAX_NUMBERS_PER_BYTE = 8
 """Numbers that they may have for each byte of a larger one."""
 UNREADABLE = LookupError, TypeError, ValueError, AttributeError, ArithmeticError, RecursionError
-"""What reading a damaged document raises."""
+"""Exceptions that reading a damaged document raises."""
 
 
 def glb_chunks(data: bytes) -> tuple[Json, bytes]:

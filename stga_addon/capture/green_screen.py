@@ -2,7 +2,7 @@
 
 import numpy as np
 
-SPILL_REACH_SHARE = 0.15
+SPILL_REACH_FRACTION = 0.15
 """Distance from a person's outline at which no light of the screen is taken away any more, as a
 fraction of the image's height; it is taken away wholly up to half of that."""
 SCREEN_STEP_PX = 8
@@ -11,7 +11,7 @@ MIN_SCREEN_PIXELS = 50
 """Least number of these pixels that show the backdrop."""
 SCREEN_LEVELS = 50
 """Largest difference of a pixel's channels from the screen's color, of 255."""
-MIN_SCREEN_SHARE = 0.6
+MIN_SCREEN_FRACTION = 0.6
 """Fraction of the backdrop's pixels that have the screen's color at least; others show its edges,
 or bars beside the picture."""
 MIN_SCREEN_LEVELS = 40
@@ -28,7 +28,7 @@ def without_spill(image: np.ndarray, mask: np.ndarray) -> np.ndarray:
         return image
     whole = cv2.inRange(mask, 255, 255)
     distance = cv2.distanceTransform(whole, cv2.DIST_L2, 3)
-    fraction = np.clip(2 - 2 / (SPILL_REACH_SHARE * len(image)) * distance, 0, 1)
+    fraction = np.clip(2 - 2 / (SPILL_REACH_FRACTION * len(image)) * distance, 0, 1)
     channels = list(cv2.split(image))
     others = [own for number, own in enumerate(channels) if number != key]
     excess = cv2.bitwise_and(cv2.subtract(channels[key], cv2.max(*others)), whole)
@@ -45,7 +45,7 @@ def screen_channel(image: np.ndarray, mask: np.ndarray) -> int | None:
     key = int(color.argmax())
     even = np.abs(clear - color).max(axis=1) < SCREEN_LEVELS
     is_screen = key > 0 and color[key] - np.delete(color, key).max() > MIN_SCREEN_LEVELS
-    return key if is_screen and even.mean() > MIN_SCREEN_SHARE else None
+    return key if is_screen and even.mean() > MIN_SCREEN_FRACTION else None
 
 
 def limited_channel(colors: np.ndarray, key: int) -> np.ndarray:

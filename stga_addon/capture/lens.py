@@ -10,7 +10,8 @@ from ..errors import StgaError
 from .camera import Camera
 
 MIN_RADIUS = 1e-9
-"""Below it, an angle and its tangent are the same number; and parameters have no effect."""
+"""Radius below which an angle and its tangent are the same number, and parameters have no
+effect."""
 ZOOM_RANGE = (0.5, 2.0)
 """Range of the pinhole's focal length over the lens's: a fisheye's rim leaves few pixels inside."""
 ZOOM_STEPS = 30
@@ -35,7 +36,7 @@ class Lens:
     tangential  p1, p2 as OpenCV counts them: x += 2 p1 x y + p2 (r² + 2 x²), y += p1 (r² + 2 y²) +
                 2 p2 x y
     prism       s1 to s4: x += s1 r² + s2 r⁴, y += s3 r² + s4 r⁴
-    affine      b1, b2 as shares of the focal length: x += b1 x + b2 y
+    affine      b1, b2 as fractions of the focal length: x += b1 x + b2 y
     """
 
     projection: str = "perspective"

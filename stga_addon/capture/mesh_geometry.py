@@ -17,7 +17,7 @@ CHUNK_PIXELS = 1 << 21
 """Candidate pixels that are tested at a time, to bound the memory."""
 LIPS_AHEAD = np.radians(12.4)
 """Radians between straight down and where the lips are, seen from between the eyes."""
-MIN_EYE_HEIGHT_SHARE = 0.1  # Of the eyes' distance from each other, over the mouth
+MIN_EYE_HEIGHT_FRACTION = 0.1  # Of the eyes' distance from each other, over the mouth
 MIN_DEPTH_M = 0.01  # Triangles nearer to the camera's plane, or behind it, are not drawn
 
 
@@ -113,10 +113,10 @@ def without_head_motion(mesh: np.ndarray, neutral: np.ndarray) -> np.ndarray:
 def weighted_procrustes(source: np.ndarray, target: np.ndarray, weights: np.ndarray) -> ArrayPair:
     """Rotation (3, 3) and translation (3,) with least Σ w·|R·source + t − target|² (Kabsch); points
     (N, 3)."""
-    share = (weights / weights.sum())[:, None]
-    source_center = (share * source).sum(0)
-    target_center = (share * target).sum(0)
-    u, _, vt = np.linalg.svd((target - target_center).T @ (share * (source - source_center)))
+    fraction = (weights / weights.sum())[:, None]
+    source_center = (fraction * source).sum(0)
+    target_center = (fraction * target).sum(0)
+    u, _, vt = np.linalg.svd((target - target_center).T @ (fraction * (source - source_center)))
     rotation = u @ np.diag([1, 1, np.sign(np.linalg.det(u @ vt))]) @ vt
     return rotation, target_center - rotation @ source_center
 
@@ -299,7 +299,7 @@ def head_axes(
     up = eyes - mouth
     up = up - (up @ across) * across
     height = float(np.linalg.norm(up))
-    if not height > MIN_EYE_HEIGHT_SHARE * np.linalg.norm(left - right):
+    if not height > MIN_EYE_HEIGHT_FRACTION * np.linalg.norm(left - right):
         return None
     # The inside of the mouth is in some heads' regions only; lips are in the front half of all.
     depth = centers[found[2]] @ np.cross(across, up)

@@ -166,10 +166,10 @@ def summarize_capture(capture: Capture) -> list[tuple[str, str]]:
         ("mesh", f"{len(capture.neutral)} vertices, {len(capture.faces)} triangles"),
         ("regions", ", ".join(regions) + " triangles" if regions else "none"),
     ]
-    shares = [float(np.mean(selected)) for selected in capture.given_selection.values()]
-    if shares:
-        share = f"{np.mean(shares):.1%} of the triangles on average"
-        lines.append(("given selection", f"{len(shares)} timesteps, {share}"))
+    fractions = [float(np.mean(selected)) for selected in capture.given_selection.values()]
+    if fractions:
+        fraction = f"{np.mean(fractions):.1%} of the triangles on average"
+        lines.append(("given selection", f"{len(fractions)} timesteps, {fraction}"))
     if capture.flame is not None:
         first = capture.flame.frame(capture.flame.timesteps[0])
         offsets = (("static", capture.flame.static_offset), ("dynamic", first.dynamic_offset))
@@ -255,7 +255,7 @@ def require_same_head(first: Capture, other: Capture) -> None:
 def require_same_scale(first: Capture, other: Capture) -> None:
     """Raise StgaError where `other`, a take of the same head, has meshes or cameras in another unit
     of length. Its tracked meshes must be as large as the neutral one, and the head must take a
-    similar share of the images."""
+    similar fraction of the images."""
     posed = [_extent(other.mesh(timestep)) for timestep in evenly_spread(other.timesteps, COMPARED)]
     factor = float(np.median(posed)) / _extent(other.neutral)
     if not 1 / MAX_SCALE_FACTOR <= factor <= MAX_SCALE_FACTOR:
@@ -263,7 +263,7 @@ def require_same_scale(first: Capture, other: Capture) -> None:
             f"{other.root}: its tracked meshes are {factor:.3g} times as large as the neutral "
             "mesh; expected meters"
         )
-    factor = _share_of_images(first) / _share_of_images(other)
+    factor = _fraction_of_images(first) / _fraction_of_images(other)
     if not 1 / MAX_SCALE_FACTOR <= factor <= MAX_SCALE_FACTOR:
         apart = f"{factor:.3g} times smaller" if factor > 1 else f"{1 / factor:.3g} times larger"
         apart += f" in the images than in those of {first.root}"
@@ -277,15 +277,17 @@ def _extent(vertices: np.ndarray) -> float:
     return float(np.ptp(vertices, axis=0).max())
 
 
-def _share_of_images(take: Capture) -> float:
+def _fraction_of_images(take: Capture) -> float:
     """Size of the head in pixels by that of the image, the median of some training views."""
-    shares = []
+    fractions = []
     for view in evenly_spread(take.views["train"], COMPARED):
         camera = view.camera
         mesh = take.mesh(view.timestep)
         distance = float(np.linalg.norm(mesh.mean(0) - camera.position))
-        shares.append(camera.fl_x * _extent(mesh) / (distance * max(camera.width, camera.height)))
-    return float(np.median(shares))
+        fractions.append(
+            camera.fl_x * _extent(mesh) / (distance * max(camera.width, camera.height))
+        )
+    return float(np.median(fractions))
 
 
 def _renumbered(take: Capture, start: int, first: Capture, taken: set[int]) -> Views:

@@ -74,14 +74,14 @@ TYPICAL_HEAD_EXTENT_M = 0.3
 MAX_HEAD_EXTENT_M = 3.0
 """Largest extent of a neutral mesh in meters."""
 NO_FOLDER = "is not a folder; expected that of a capture"
-"""What messages say of a path that is neither a capture nor anything else."""
+"""Message for a path that is neither a capture nor anything else."""
 NEUTRAL = ("neutral", "canonical")
 """Names of a mesh without expression."""
 MAX_COMPARED_VIEWS = 4
 """Views whose images or masks are read to check a capture."""
 NAMES_IN_WARNING = 3
 """Files that a warning names at most."""
-MIN_SHARE_DIFFERENCE = 0.01
+MIN_FRACTION_DIFFERENCE = 0.01
 """Fraction of the vertices by which a convention must be worse than another to be doubted."""
 CANONICAL_NAME = "canonical_flame_param.npz"
 PARAMETERS = "flame_param"
@@ -257,20 +257,20 @@ def _principal_point_warning(
     for view, cameras in evenly_spread(apart, MAX_COMPARED_VIEWS):
         if (mask := read_mask(view)) is not None:
             points = mesh(view.timestep)
-            shares = []
+            fractions = []
             for camera in cameras:
                 column, row, seen = pixels_of(points, camera)
-                shares.append(1 - float((seen & (mask[row, column] > 127)).mean()))
-            outside.append(shares)
+                fractions.append(1 - float((seen & (mask[row, column] > 127)).mean()))
+            outside.append(fractions)
     if not outside:
         return None
-    share = dict(zip(PRINCIPAL_POINTS, np.mean(outside, axis=0).tolist(), strict=True))
-    best = min(share, key=lambda convention: share[convention])
-    if share[chosen] < 2 * share[best] + MIN_SHARE_DIFFERENCE:
+    fraction = dict(zip(PRINCIPAL_POINTS, np.mean(outside, axis=0).tolist(), strict=True))
+    best = min(fraction, key=lambda convention: fraction[convention])
+    if fraction[chosen] < 2 * fraction[best] + MIN_FRACTION_DIFFERENCE:
         return None
     return (
-        f"{share[chosen]:.1%} of the mesh falls outside the masks with the principal point "
-        f"read as {chosen!r}, but {share[best]:.1%} with {best!r}: the capture was probably "
+        f"{fraction[chosen]:.1%} of the mesh falls outside the masks with the principal point "
+        f"read as {chosen!r}, but {fraction[best]:.1%} with {best!r}: the capture was probably "
         "written that way"
     )
 

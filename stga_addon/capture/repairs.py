@@ -17,7 +17,8 @@ from .transforms import Frame, Transforms
 REPAIR_OPTION = "--repair"
 """Option that has a capture read in the way that fits; sentences name it."""
 REPAIRS_FILE = "stga_repairs.json"
-"""In the folder of a capture: how it is read other than it is written."""
+"""File in a capture's folder that holds how the capture is read differently from how it is
+written."""
 MAX_MEASURED_VIEWS = 4
 """Views that are measured."""
 MEASURED_HEIGHT_PX = 160

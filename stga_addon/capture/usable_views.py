@@ -17,7 +17,7 @@ from .model import Capture, View, evenly_spread, views_by_camera
 
 COMPARED_HEIGHT_PX = 160
 """Height of the small images that are looked at."""
-MIN_COVERAGE_SHARE = 0.05
+MIN_COVERAGE_FRACTION = 0.05
 """Fraction of its camera's median coverage, up to which a matte counts as empty: specks stay."""
 MIN_COVERAGE = 1e-3
 """Fraction of the image up to which a matte counts as empty, whatever its camera's others hold."""
@@ -26,7 +26,7 @@ MAX_ONE_COLOR_LEVELS = 4
 which it is black."""
 MAX_VIEWS_READ = 64
 """Number of views up to which all are read."""
-SMALL_FILE_SHARE = 0.5
+SMALL_FILE_FRACTION = 0.5
 """Fraction of the median file size, below which a file is read among more views than that: what
 shows nothing compresses to little."""
 SAMPLED_VIEWS = 24
@@ -106,10 +106,10 @@ def _found(views: Sequence[View]) -> tuple[set[Path], set[Path]]:
     empty = set[Path]()
     for own in views_by_camera(views).values():
         known = {view.image: contents[view.image].coverage for view in own}
-        covered = {path: share for path, share in known.items() if share is not None}
-        median = statistics.median([share for share in covered.values() if share] or [0.0])
-        least = max(MIN_COVERAGE, MIN_COVERAGE_SHARE * median)
-        empty |= {path for path, share in covered.items() if share <= least}
+        covered = {path: fraction for path, fraction in known.items() if fraction is not None}
+        median = statistics.median([fraction for fraction in covered.values() if fraction] or [0.0])
+        least = max(MIN_COVERAGE, MIN_COVERAGE_FRACTION * median)
+        empty |= {path for path, fraction in covered.items() if fraction <= least}
     return empty, {path for path, content in contents.items() if content.is_one_color}
 
 
@@ -119,7 +119,7 @@ def _small_files(views: Sequence[View]) -> set[Path]:
     for own in views_by_camera(views).values():
         for files in ([view.image for view in own], [view.mask for view in own]):
             sizes = [path.stat().st_size if path and path.is_file() else 0 for path in files]
-            least = SMALL_FILE_SHARE * statistics.median(sizes)
+            least = SMALL_FILE_FRACTION * statistics.median(sizes)
             pairs = zip(own, sizes, strict=True)
             small |= {view.image for view, size in pairs if size < least}
     return small

@@ -82,8 +82,8 @@ def run_batch_command(options: Namespace, head: object = None) -> None:
     chosen = EngineOptions(**given_options(options, EngineOptions))
     plan = batch_plan(options)
     is_here = chosen.engine == "local" and not options.commands
-    share = max(1, processors() // len(plan.jobs)) if is_here else 1
-    plan = with_threads(plan, chosen.threads or share)
+    fraction = max(1, processors() // len(plan.jobs)) if is_here else 1
+    plan = with_threads(plan, chosen.threads or fraction)
     if chosen.dry_run:
         print_plan(plan)
     elif options.commands:
@@ -159,7 +159,7 @@ def carry_out_plan(plan: Plan, engine_name: str = "local", address: str = "") ->
         engine = make_engine(engine_name, address)
         table = LiveTable(sys.stderr, shutil.get_terminal_size().columns)
         try:
-            BatchRun(batch, engine, lease, table, table.say).run()
+            BatchRun(batch, engine, lease, table, table.log).run()
         finally:
             print("\n".join(ended_lines(batch)))
     failures = batch.failures

@@ -75,7 +75,7 @@ def carry_out(request: Request, with_bar: bool = True) -> Result:
     from ..jobs.perform import perform
 
     with ProgressBar() as bar:
-        result = perform(request, bar.report if with_bar else ignore, bar.say)
+        result = perform(request, bar.report if with_bar else ignore, bar.log)
     for line in getattr(result, "lines", ()):
         print(printable(line))
     return result
@@ -108,10 +108,10 @@ class ProgressBar(ExitStack[None]):
         figures = self._clock.reported(progress)
         shown = [describe_left(figures), *describe_figures(figures), printable(progress.detail)]
         self._bar.set_postfix_str("; ".join(filter(None, shown)), refresh=False)
-        self._bar.update(progress.share - self._bar.n)
+        self._bar.update(progress.fraction - self._bar.n)
         return False
 
-    def say(self, line: str) -> None:
+    def log(self, line: str) -> None:
         """Print a line above the bar."""
         line = printable(line)
         if self._bar is None:
@@ -484,11 +484,11 @@ def _perform(options: Namespace, head: OpenHead | None) -> None:
     # without a terminal started by Blender, which reads the status in the folder
     with ProgressBar() as bar:
         report = bar.report if sys.stderr.isatty() else ignore
-        perform_in_folder(options.folder, bar.say, report, bool(options.resume))
+        perform_in_folder(options.folder, bar.log, report, bool(options.resume))
 
 
 TRACKED_AS = [s.name for s in option_fields(Track) if s.name not in ("footage", "out", "avatar")]
-"""What `stga avatar` takes of `stga track`."""
+"""Options of `stga track` that `stga avatar` takes."""
 COMMANDS = {
     "avatar": Command(
         "Make an avatar from footage: track, train, and write a report and a .blend file. Called "

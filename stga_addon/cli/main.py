@@ -37,8 +37,8 @@ LIBRARY_FAILURES = (
     AttributeError,
     NameError,
 )
-"""What libraries raise where they get no memory, while they load or later; the last two are raised
-by a library of which a part was not loaded."""
+"""Exceptions that libraries raise when they get no memory, while they load or later; a library of
+which a part was not loaded raises the last two."""
 DROPPED_INTERRUPT_S = 0.05  # After which an interrupt that was dropped is raised again
 
 

@@ -18,9 +18,10 @@ from ..tracking.face_networks import FaceNetworks
 from ..tracking.head_model import linear_model
 
 METERS_PER_UNIT = 0.01
+"""ICT-FaceKit's unit is the centimeter."""
 BOTH_SIDES = ("browInnerUp", "cheekPuff")
-"""Shapes that ICT-FaceKit splits in left and right. Its cheekRaiser, beside cheekSquint, is none of
-ARKit's."""
+"""Shapes of ARKit that ICT-FaceKit splits in left and right. ICT-FaceKit's cheekRaiser, which is
+beside cheekSquint, is not one of ARKit's."""
 
 
 def main(source: Path) -> None:

@@ -24,8 +24,8 @@ from ..tracking.landmarks import write_places
 from ..tracking.recorded import BUNDLED_PLACES
 from .arkit_shapes import METERS_PER_UNIT, ict_names
 
-# First and last vertex of the model's parts, and how many triangles of each are kept. Its second
-# shells of the eyeballs, tear films and lashes are left out.
+# First and last vertex of the model's parts. Its second shells of the eyeballs, tear films and
+# lashes are left out.
 FACE = (0, 9409)
 HEAD = (9409, 11248)
 MOUTH_INSIDE = (11248, 13294)
@@ -35,40 +35,52 @@ GUMS = (14062, 17039)
 TEETH = (17039, 21451)
 LEFT_EYEBALL = (21451, 22221)
 RIGHT_EYEBALL = (23021, 23791)
+
 KEPT_TRIANGLES = {SKIN: 19000, GUMS: 900, TEETH: 2500, LEFT_EYEBALL: 500, RIGHT_EYEBALL: 500}
-# Factors of the skin's geometric error, by which triangles are distributed over it.
+"""Part -> how many of its triangles are kept."""
 DETAIL = {FACE: 1.0, HEAD: 0.3, MOUTH_INSIDE: 0.03, EYE_SOCKETS: 0.03}
+"""Part of the skin -> factor of its geometric error, by which triangles are distributed."""
 FEATURE_DETAIL = 8.0
-"""Around eyes and mouth, which expressions fold."""
+"""The same factor around eyes and mouth, which expressions fold."""
 IDENTITIES = 100
+"""Identity components of ICT-FaceKit that are kept."""
 MIN_FLIP_COSINE = 0.3
-"""Between a triangle's normals before and after a collapse, below which it would fold over."""
+"""Least cosine between a triangle's normals before and after a collapse; below it, the triangle
+would fold over."""
 EDGE_WEIGHT = 10.0
-"""Of a mesh's open edges in the quadrics."""
+"""Weight of a mesh's open edges in the quadrics."""
 
 NECK_JOINT_CM = (0.0, 0.4, 0.0)
+"""Where the skull turns on the spine, between the ears' canals."""
 ROOT_JOINT_CM = (0.0, -13.2, -2.7)
-"""Where the skull turns on the spine, between the ears' canals; where the neck leaves the torso."""
+"""Where the neck leaves the torso."""
 JOINT_BAND_CM = 1.5
 """Half height of the band of skin whose average is a joint."""
 NECK_SLOPE = 0.35
-"""Of the planes that divide the neck: it leans forward, and its nape ends higher than its front."""
+"""Slope of the planes that divide the neck, which leans forward and whose nape ends higher than its
+front."""
 NECK_BOTTOM_CM = -13.7
+"""Height on the axis below which skin follows the root joint alone."""
 NECK_TOP_CM = -4.7
-"""Heights on the axis between which skin follows root and neck joint in part."""
+"""Height on the axis above which skin follows the neck joint alone."""
 EYEBALL_SETBACK_CM = 0.07
+"""How far eyeballs lie behind ICT-FaceKit's: other identities' eyeballs would otherwise poke
+through their lids, which move along straight lines."""
 EYEBALL_RETRACTION_CM = 0.1
-"""How far eyeballs lie behind ICT-FaceKit's, and how far lids that close push them back, as they do
-in life (Evinger et al. 1984): else, eyeballs of other identities poke through their lids, which
-move along straight lines."""
+"""How far closing lids push eyeballs back, as they do in life (Evinger et al. 1984)."""
 LINING_NEIGHBORS = 12
+"""Nearest vertices of the face that a vertex of the mouth's lining follows."""
 LINING_FOLLOWS_CM = (0.25, 0.6)
+"""Distances from the face between which the mouth's lining begins to move with it: ICT-FaceKit's,
+which pursed lips push forward, comes out of the chin of small faces."""
 LINING_STAYS_CM = (1.2, 1.8)
-"""Distances from the face between which the mouth's lining begins to move with it, and ceases to:
-ICT-FaceKit's, which is pushed forward by pursed lips, comes out of the chin of small faces."""
-MIN_EYE_SHARE = 0.15
-MIN_LIPS_SHARE = 0.45
-"""Of a shape's largest displacement, at the edge of the region that it moves."""
+"""Distances from the face between which the mouth's lining ceases to move with it."""
+MIN_EYE_MOTION = 0.15
+"""Displacement at the edge of an eye's region, relative to the largest one of the shapes that move
+it."""
+MIN_LIPS_MOTION = 0.45
+"""Displacement at the edge of the lips' region, relative to the largest one of the shapes that move
+them."""
 
 
 def main(source: Path) -> None:
@@ -145,16 +157,16 @@ def with_lining(displacements: np.ndarray, neutral: np.ndarray, kept: np.ndarray
         _smooth_step((distance[:, 0] - low) / (high - low))
         for low, high in (LINING_FOLLOWS_CM, LINING_STAYS_CM)
     )
-    share = (begins * (1 - ceases))[:, None]
+    fraction = (begins * (1 - ceases))[:, None]
     found = displacements.copy()
-    found[:, lining] = share * followed + (1 - share) * displacements[:, lining]
+    found[:, lining] = fraction * followed + (1 - fraction) * displacements[:, lining]
     return found
 
 
-def _smooth_step(share: np.ndarray) -> np.ndarray:
+def _smooth_step(fraction: np.ndarray) -> np.ndarray:
     """From 0 to 1, without a slope at both ends."""
-    share = np.clip(share, 0, 1)
-    return np.asarray(share * share * (3 - 2 * share))
+    fraction = np.clip(fraction, 0, 1)
+    return np.asarray(fraction * fraction * (3 - 2 * fraction))
 
 
 def _within(part: tuple[int, int], ids: np.ndarray) -> np.ndarray:
@@ -164,14 +176,14 @@ def _within(part: tuple[int, int], ids: np.ndarray) -> np.ndarray:
 def _regions(moved: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     """Name -> the skin's vertices that shapes of the eyes and the lips move, as (V,) bool."""
 
-    def moves(share: float, *names: str) -> np.ndarray:
-        found = np.max([moved[name] / moved[name].max() for name in names], axis=0) > share
+    def moves(fraction: float, *names: str) -> np.ndarray:
+        found = np.max([moved[name] / moved[name].max() for name in names], axis=0) > fraction
         return np.asarray(found & _within(FACE, np.arange(len(found))))
 
     return {
-        "left_eye_region": moves(MIN_EYE_SHARE, "eyeBlinkLeft", "eyeWideLeft"),
-        "right_eye_region": moves(MIN_EYE_SHARE, "eyeBlinkRight", "eyeWideRight"),
-        "lips": moves(MIN_LIPS_SHARE, "mouthRollLower", "mouthRollUpper", "mouthFunnel"),
+        "left_eye_region": moves(MIN_EYE_MOTION, "eyeBlinkLeft", "eyeWideLeft"),
+        "right_eye_region": moves(MIN_EYE_MOTION, "eyeBlinkRight", "eyeWideRight"),
+        "lips": moves(MIN_LIPS_MOTION, "mouthRollLower", "mouthRollUpper", "mouthFunnel"),
     }
 
 
@@ -306,11 +318,11 @@ def skinning_weights(template: np.ndarray, kept: np.ndarray) -> np.ndarray:
 
     Root, neck and eyeballs; the jaw is a shape.
     """
-    share = (_height(template) - NECK_BOTTOM_CM) / (NECK_TOP_CM - NECK_BOTTOM_CM)
-    share = np.where(_within(SKIN, kept), _smooth_step(share), 1.0)
+    fraction = (_height(template) - NECK_BOTTOM_CM) / (NECK_TOP_CM - NECK_BOTTOM_CM)
+    fraction = np.where(_within(SKIN, kept), _smooth_step(fraction), 1.0)
     weights = np.zeros((len(kept), len(JOINTS)))
-    weights[:, JOINTS.index("root")] = 1 - share
-    weights[:, JOINTS.index("neck")] = share
+    weights[:, JOINTS.index("root")] = 1 - fraction
+    weights[:, JOINTS.index("neck")] = fraction
     for joint, part in (("left_eye", LEFT_EYEBALL), ("right_eye", RIGHT_EYEBALL)):
         weights[_within(part, kept)] = np.eye(len(JOINTS))[JOINTS.index(joint)]
     return weights

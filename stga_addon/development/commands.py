@@ -15,16 +15,16 @@ from ..jobs.batch.plan import make_plan
 from ..jobs.table import JOBS, Job
 from ..jobs.train import Train
 from ..options import duration, given_options, like, option
-from ..progress import Report, Say, Written
+from ..progress import Log, Report, Written
 from ..training.settings import TrainingSettings
 from ..worker.machine import processors
 from .benchmark.variants import Benchmark
 
 DEMO_ITERATIONS = 300
-"""Of a training, as good on a busy machine as on an idle one, where they take about 15 seconds on
-two cores."""
+"""Iterations of the training, so that it is as good on a busy machine as on an idle one, where they
+take about 15 seconds on two cores."""
 SLICES = "benchmark"
-"""How the names of a benchmark's jobs, and of their folders, begin."""
+"""First letters of the names of a benchmark's jobs and of their folders."""
 
 
 @dataclass(frozen=True)
@@ -102,10 +102,10 @@ def run_benchmark_command(options: Namespace, head: object) -> None:
     print(report)
 
 
-def train_benchmark(request: Benchmark, report: Report, say: Say) -> Written:
+def train_benchmark(request: Benchmark, report: Report, log: Log) -> Written:
     from .benchmark.slice import train_slice  # needs more than numpy, which is enough for others
 
-    return train_slice(request, report, say)
+    return train_slice(request, report, log)
 
 
 JOBS[Benchmark] = Job(train_benchmark, output="out")

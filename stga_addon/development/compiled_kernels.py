@@ -15,6 +15,7 @@ from ..errors import StgaError
 from .wheels import Target, this_platform
 
 ROOT = Path(__file__).resolve().parents[2]
+"""Folder of the repository."""
 PROCESSORS = {"linux-x64": "x86-64-v3", "windows-x64": "x86-64-v3"}
 """Blender's name of a platform -> LLVM's name of the processor."""
 SCRIPT = """

@@ -12,6 +12,7 @@ from typing import Any
 from .wheels import Target
 
 DEMO_FOLDER = "demo_capture"
+"""Folder of the demo's capture in the zip."""
 ASSETS = {
     "ICT-FaceKit": ("stga_addon/flame/head.npz", "stga_addon/driving/arkit_shapes.npz"),
     "MediaPipe": ("stga_addon/tracking/networks/",),

@@ -24,9 +24,10 @@ ELEVATIONS_DEG = tuple(range(-45, 46, 15))
 PICTURE_SIZE_PX = 512
 DISTANCE_M = 1.2
 FACE_HEIGHT_M = 0.2
-FACE_RATIO = 0.42  # Of the picture's height
+FACE_RATIO = 0.42  # Height of the face in that of the picture
+
 PEOPLE = 5
-"""The neutral head, and so many more, less one, of random identities and expressions."""
+"""Heads that are rendered: the neutral one, the others of random identities and expressions."""
 IDENTITY_COMPONENTS = 30
 IDENTITY_SIGMA = 0.8
 EXPRESSION_SHAPES = 4

@@ -30,15 +30,16 @@ from .wheels import (
 
 ROOT = Path(__file__).resolve().parents[2]
 MANIFEST = "blender_manifest.toml"
-# Pure Python: one wheel serves every platform and Blender version. The manifest names the same
-# files.
+
 WHEELS = (
     "filelock-4.2.11-py3-none-any.whl",
     "trimesh-5.2.0-py3-none-any.whl",
     "tqdm-4.70.1-py3-none-any.whl",
 )
+"""Wheels that the manifest names. They are pure Python: one serves every platform and version of
+Blender."""
 KERNELS_FOLDER = "stga_addon/raster/cpu/compiled"
-"""In the zip; `raster.cpu.bundled.BUNDLE`."""
+"""Folder of the compiled kernels in the zip: `raster.cpu.bundled.BUNDLE`."""
 ENTRY_TIME = (1980, 1, 1, 0, 0, 0)
 """Modification time of every entry, the earliest that a zip can hold: equal sources give an equal
 zip."""
@@ -196,15 +197,15 @@ def build_editions(options: argparse.Namespace) -> Iterator[Path]:
     if not (options.blender or options.all):
         targets = [target for target in targets if target.platform == here]
     demo = options.out / DEMO_FOLDER
-    say = partial(print, flush=True)
+    log = partial(print, flush=True)
     for target in [replace(target, cuda=options.allow_cuda) for target in targets]:
-        collect_wheels(wheel_folder(target), target, say)
+        collect_wheels(wheel_folder(target), target, log)
         unpack_capture(demo)
-        say(f"{target.name}: compiling kernels, minutes where they are not there")
+        log(f"{target.name}: compiling kernels, minutes where they are not there")
         kernels = compile_kernels(target, wheel_folder(target), shlex.split(options.blender))
         if not kernels:
-            say(f"{target.name}: no Python of it is here; kernels are compiled when first used")
-        say(f"{target.name}: writing the zip")
+            log(f"{target.name}: no Python of it is here; kernels are compiled when first used")
+        log(f"{target.name}: writing the zip")
         yield build_zip(options.out, edition=complete(target), demo=demo, kernels=kernels)
 
 

@@ -22,7 +22,7 @@ from packaging.tags import Tag, cpython_tags
 from packaging.utils import canonicalize_name, parse_wheel_filename
 
 from ..errors import StgaError
-from ..progress import Say
+from ..progress import Log
 from ..worker.training_python import CAMERAS_REQUIREMENT, GPU_REQUIREMENT, REQUIREMENTS
 
 TORCH_CPU_INDEX = "https://download.pytorch.org/whl/cpu"
@@ -141,9 +141,9 @@ def this_platform() -> str:
     return found[here]
 
 
-def collect_wheels(folder: Path, target: Target, say: Say = lambda line: None) -> list[Path]:
+def collect_wheels(folder: Path, target: Target, log: Log = lambda line: None) -> list[Path]:
     """The wheels that training needs on the target, downloaded into `folder` where they are
-    missing; sorted by name. say: called with each one.
+    missing; sorted by name. log: called with each one.
 
     Raises StgaError where one cannot be had.
     """
@@ -158,7 +158,7 @@ def collect_wheels(folder: Path, target: Target, say: Say = lambda line: None) -
         followed.add(str(requirement))
         if name not in wheels:
             present = _present(folder, requirement, target)
-            say(f"{target.name}: {present.name if present else f'downloading {requirement}'}")
+            log(f"{target.name}: {present.name if present else f'downloading {requirement}'}")
             wheels[name] = present or _download(folder, requirement, target)
         wanted += needs(wheels[name], target, requirement.extras)
     chosen = sorted(wheels.values())

@@ -22,7 +22,7 @@ TYPICAL_BASE = 60
 EVEN_TOLERANCE_S = 1e-6
 """Difference of unevenness within which bases explain the frame numbers equally well."""
 OTHER_RATE = "--recorded-fps, in Blender Recorded At, sets another rate"
-"""What a guess of the rate ends with."""
+"""End of a message about a guessed rate."""
 DAY_S = 86_400.0
 
 DROP_DAY_S = (30 * DAY_S - 2 * 1296) * 1001 / 30_000
@@ -66,7 +66,7 @@ MAX_ROWS_PER_S = 250.0
 """Most rows a second that they have."""
 MAX_FRAME_STEP = 4  # Between rows that are numbered by frames of `DEFAULT_FPS`
 DEFAULT_FPS = 60.0  # Of files that hold neither times nor a rate: ARKit's own
-RATES = tuple(sorted({rate * share for rate in (10, 12, 15, *BASES) for share in (1, DROP_RATIO)}))
+RATES = tuple(sorted({rate * ratio for rate in (10, 12, 15, *BASES) for ratio in (1, DROP_RATIO)}))
 MAX_RATE_DIFFERENCE = 0.02  # Of a standard rate from that of the times, relative
 GRID_TOLERANCE = 0.1  # Of a row's distance, within which all rows come evenly
 LONG_STEP = 1.5  # Times the median, above which rows are missing between two

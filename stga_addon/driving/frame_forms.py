@@ -10,8 +10,8 @@ from ..files import parse_json
 from .performance import arkit_name
 
 FACE_CAP_COLUMNS = ("k", "time_ms", "px", "py", "pz", "rx", "ry", "rz", "lx", "ly", "rx2", "ry2")
-"""What stands before the shapes in Face Cap's lines: place and angles of the head in degrees, about
-x, y and z, and of the eyes."""
+"""Values before the shapes in Face Cap's lines: position of the head, then angles in degrees of the
+head, about x, y and z, and of the eyes."""
 NAME_OF_SHAPE = ("blendShapeLocation", "blendShape", "blendshape", "shape", "categoryName", "name")
 """Keys of a shape's name in a row of one shape."""
 VALUE_OF_SHAPE = ("value", "weight", "score", "coefficient")

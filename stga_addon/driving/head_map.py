@@ -33,7 +33,7 @@ JAW_POSES = (
     (0.25, 0, 1),
 )  # fmt: skip
 COMBINATIONS = 60  # Random combinations of the other shapes at each of the poses of the jaw
-ACTIVE_SHARE = 0.35  # Of the shapes in a combination
+ACTIVE_FRACTION = 0.35  # Of the shapes in a combination
 CACHED_MAPS = 8
 _cache: dict[bytes, "HeadMap"] = {}
 
@@ -192,7 +192,9 @@ class _Fit:
 
 def _combinations(pose: tuple[float, float, float], rng: np.random.Generator) -> np.ndarray:
     """(S, 52) weights: each shape alone and random combinations, all with the jaw at `pose`."""
-    weights = rng.random((COMBINATIONS, COUNT)) * (rng.random((COMBINATIONS, COUNT)) < ACTIVE_SHARE)
+    weights = rng.random((COMBINATIONS, COUNT)) * (
+        rng.random((COMBINATIONS, COUNT)) < ACTIVE_FRACTION
+    )
     weights[::2, MOUTH_CLOSE] = rng.random(len(weights[::2]))
     weights[:, MOUTH_CLOSE] *= pose[0]
     alone = np.eye(COUNT)

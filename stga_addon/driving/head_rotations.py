@@ -10,7 +10,8 @@ from ..errors import StgaError
 from .clocks import numbers
 
 AXES = {"yaw": 0, "pitch": 1, "roll": 2, "y": 0, "x": 1, "z": 2, "w": 3}
-"""How an angle's name ends -> its place in (yaw, pitch, roll), or of the quaternion's real part."""
+"""Last letters of an angle's name -> its place in (yaw, pitch, roll), or the quaternion's real
+part."""
 _ROTATION = "(?:rotation|rot|quaternion|quat|eulerangles?|euler|angles?|orientation|pose)"
 _UNIT = "(?P<unit>deg(?:ree)?s?|rad(?:ian)?s?)?"
 _NAME = re.compile(f"(?:(?:head|{_ROTATION})*(yaw|pitch|roll)|head{_ROTATION}+([xyzw])){_UNIT}")
@@ -32,7 +33,7 @@ TURN_S = 0.1
 QUESTIONED_RAD = 0.5
 """Angle that, where nothing tells the unit, is large in radians and small in degrees."""
 IF_DEGREES = "if they are degrees, --gain head=0.01745, in Blender Head Gain, scales them"
-"""What a guess of radians ends with."""
+"""End of a message about guessed radians."""
 HALF_TURN_RAD = math.pi + 0.01
 WHOLE_TURN_RAD = 2 * math.pi + 0.01
 WHOLE_TURN_DEG = 360.0

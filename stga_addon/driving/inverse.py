@@ -17,9 +17,9 @@ from .shapes import JAW_OPEN, MOUTH_CLOSE
 MAX_SWEEPS = 60
 CONVERGED = 1e-5  # Largest change of a weight in a sweep, below which the descent stops
 NEWTON_STEPS = 12
-STEP_SHARES = (1.0, 0.5, 0.2, 0.05, 0.0)
+STEP_FRACTIONS = (1.0, 0.5, 0.2, 0.05, 0.0)
 CHUNK = 256  # Rows whose matrices are held at once
-RIDGE = 1e-9  # Share of the mean squared displacement, for weights that a head cannot tell apart
+RIDGE = 1e-9  # Fraction of the mean squared displacement, for weights that a head cannot tell apart
 TIMECODE_BASE = 60
 TURNS = "Yaw", "Pitch", "Roll"
 EXTRA_COLUMNS = [f"{part}{turn}" for part in ("Head", "LeftEye", "RightEye") for turn in TURNS]
@@ -136,7 +136,9 @@ def _polished(
         reduced = matrices * (free[:, :, None] & free[:, None, :])
         reduced[:, np.arange(right.shape[1]), np.arange(right.shape[1])] += held
         step = np.linalg.solve(reduced, np.where(held, 0.0, slope)[..., None])[..., 0]
-        tried = np.stack([np.clip(weights + share * step, 0, limits) for share in STEP_SHARES])
+        tried = np.stack(
+            [np.clip(weights + fraction * step, 0, limits) for fraction in STEP_FRACTIONS]
+        )
         best = np.stack([value(each) for each in tried]).argmin(axis=0)
         weights = tried[best, np.arange(len(weights))]
     return weights

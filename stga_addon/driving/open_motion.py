@@ -38,7 +38,7 @@ from .performers import READ_SUFFIXES, is_performance, performer_of, read_perfor
 PART_FIELDS = {"face": "expr", "jaw": "jaw_pose", "eyes": "eyes_pose"}
 """Part of a face -> field of a frame that holds it."""
 # Of frames that count as quiet; compared ones
-QUIET_SHARE = 0.2
+QUIET_FRACTION = 0.2
 """Fraction of the frames that count as quiet."""
 MAX_COMPARED_FRAMES = 1000
 """Frames that are compared to find these."""
@@ -100,7 +100,7 @@ def quiet_neutral(frames: Sequence[FlameFrame]) -> dict[str, np.ndarray]:
     face = np.concatenate([parts["face"], parts["jaw"]], axis=1)
     squares = (face**2).sum(axis=1)
     apart = squares[:, None] + squares - 2 * face @ face.T
-    count = max(1, round(QUIET_SHARE * len(face)))
+    count = max(1, round(QUIET_FRACTION * len(face)))
     center = np.sort(apart, axis=1)[:, :count].sum(axis=1).argmin()
     quiet = np.argsort(apart[center], kind="stable")[:count]
     return {part: np.median(values[quiet], axis=0) for part, values in parts.items()}
@@ -109,7 +109,7 @@ def quiet_neutral(frames: Sequence[FlameFrame]) -> dict[str, np.ndarray]:
 def quiet_weights(performance: Performance) -> np.ndarray:
     """(52,) median of the weights over the rows in which their sum is least."""
     order = np.argsort(performance.weights.sum(axis=1), kind="stable")
-    quiet = order[: max(1, round(QUIET_SHARE * len(order)))]
+    quiet = order[: max(1, round(QUIET_FRACTION * len(order)))]
     return np.median(performance.weights[quiet], axis=0)
 
 
@@ -244,7 +244,7 @@ class MotionOptions:
         None,
         0,
         1,
-        metavar="SHARE",
+        metavar="FRACTION",
         bare=1.0,
         needs=(ON_AVATAR,),
     )

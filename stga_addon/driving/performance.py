@@ -21,14 +21,14 @@ ARKIT_SHAPES = (
     "browInnerUp", "browOuterUpLeft", "browOuterUpRight", "cheekPuff", "cheekSquintLeft",
     "cheekSquintRight", "noseSneerLeft", "noseSneerRight", "tongueOut",
 )  # fmt: skip
-"""In the order of Live Link Face's CSV files."""
+"""ARKit's shapes, in the order of Live Link Face's CSV files."""
 COUNT = len(ARKIT_SHAPES)
 MAX_WEIGHT = 10.0  # Beyond it, weights of shapes are in percent, or are no weights
 COLUMN = {name: column for column, name in enumerate(ARKIT_SHAPES)}
 OPTIONAL = ("tongueOut",)  # Shapes that sources of 51 lack; they stay zero
 PARTS = ("face", "jaw", "eyes")
 MAX_NAMED = 8  # Names that an error lists
-MIN_LIKENESS = 0.8  # Of a mistyped name and the shape that it stands for (`difflib`)
+MIN_SIMILARITY = 0.8  # Of a mistyped name and the shape that it stands for (`difflib`)
 _KEYS = {name.lower(): name for name in ARKIT_SHAPES}
 _LIKE_A_SHAPE = re.compile("(eye|jaw|mouth|brow|cheek|nose|tongue)(?!yaw|pitch|roll)")
 
@@ -73,7 +73,7 @@ def columns_of(where: str, names: Iterable[str]) -> tuple[dict[int, int], list[s
     mistyped = [
         shorten(name)
         for name in strange
-        if get_close_matches(_last(name).lower(), lowered, 1, MIN_LIKENESS)
+        if get_close_matches(_last(name).lower(), lowered, 1, MIN_SIMILARITY)
     ]
     more = f" and {len(missing) - MAX_NAMED} more" if len(missing) > MAX_NAMED else ""
     lacks = f"lacks {', '.join(missing[:MAX_NAMED])}{more}"

@@ -54,7 +54,7 @@ PERFORMERS: Mapping[str, Performer] = {
     ".txt": _at_once("lines of iFacialMocap or Face Cap", text_performance),
     **dict.fromkeys(VIDEO_SUFFIXES, Performer("a video", _watched, False)),
 }
-"""By the suffixes of their files."""
+"""Suffix of a file -> its readers."""
 READ_SUFFIXES = tuple(suffix for suffix, performer in PERFORMERS.items() if performer.at_once)
 RECORDED_SUFFIXES = tuple(suffix for suffix in PERFORMERS if suffix not in READ_SUFFIXES)
 

@@ -22,13 +22,13 @@ from ..files import (
     save_npz,
 )
 from ..flame.sequence import FlameSequence, motion_arrays
-from ..progress import Say, warn
+from ..progress import Log, warn
 
 MAX_SPLAT_BYTES = 16 << 30
 READ_FILES = "the folder of a run, an avatar (.npz), or splats (.ply, .spz, .splat)"
 
 CLOUDCOMPARE_PREFIX = "scalar_"
-"""What CloudCompare writes before the names of other properties."""
+"""Prefix that CloudCompare writes before the names of other properties."""
 COLOR_NAMES = (("red", "green", "blue"), ("r", "g", "b"))
 
 FRAME_NAME = re.compile(r"(\d{5,}|-\d{4,})\.ply")
@@ -74,11 +74,11 @@ def ply_bytes(splats: Splats) -> int:
     return 4 * len(PROPERTIES) * len(splats)
 
 
-def read_ply(path: Path, say: Say = warn) -> Splats:
+def read_ply(path: Path, log: Log = warn) -> Splats:
     """World-space splats of a 3D Gaussian Splatting PLY.
 
     Properties may stand in any order, beside others; red, green and blue may stand for f_dc_0…2;
-    of harmonics above degree 3, and of flat splats' missing third scale, `say` gets a sentence.
+    of harmonics above degree 3, and of flat splats' missing third scale, `log` gets a sentence.
     Values may be not finite. Raises StgaError naming the file and the property that is missing, and
     for splats that are packed, or bound to triangles.
     """
@@ -90,7 +90,7 @@ def read_ply(path: Path, say: Say = warn) -> Splats:
             f"{path}: has the property {binding}: these splats lie in the frames of a head's "
             "triangles, not in the world; render the run, or export it as --format ply"
         )
-    return splats_of(path, vertices, say)
+    return splats_of(path, vertices, log)
 
 
 def _without_prefix(vertices: np.ndarray) -> np.ndarray:
@@ -103,7 +103,7 @@ def _without_prefix(vertices: np.ndarray) -> np.ndarray:
     return vertices
 
 
-def splats_of(path: Path, vertices: np.ndarray, say: Say) -> Splats:
+def splats_of(path: Path, vertices: np.ndarray, log: Log) -> Splats:
     """The splats of a PLY's vertices, as `read_ply` reads them, in the axes of the file."""
     names = set(vertices.dtype.names or ())
     rest = sum(1 for name in names if name.startswith("f_rest_"))
@@ -113,13 +113,13 @@ def splats_of(path: Path, vertices: np.ndarray, say: Say) -> Splats:
     channels = _columns(path, vertices, [f"f_rest_{i}" for i in range(rest)])
     channels = channels.reshape(len(vertices), 3, rest // 3).transpose(0, 2, 1)
     if size > MAX_SH_DEGREE + 1:
-        say(f"{path}: harmonics of degree {size - 1} are cut at {MAX_SH_DEGREE}")
+        log(f"{path}: harmonics of degree {size - 1} are cut at {MAX_SH_DEGREE}")
         channels = channels[:, : (MAX_SH_DEGREE + 1) ** 2 - 1]
     scales = [f"scale_{i}" for i in range(3)]
     flat = {"scale_0", "scale_1"} <= names and "scale_2" not in names
     log_scale = _columns(path, vertices, scales[:2] if flat else scales)
     if flat:
-        say(f"{path}: has no scale_2: its splats are flat (2D Gaussian Splatting)")
+        log(f"{path}: has no scale_2: its splats are flat (2D Gaussian Splatting)")
         log_scale = np.pad(log_scale, ((0, 0), (0, 1)), constant_values=-np.inf)
     return in_world(
         _columns(path, vertices, ["x", "y", "z"]),

@@ -38,7 +38,7 @@ TURNED = ("color", "sh", "strain_color", "normal_color")
 """Arrays that are stored along their principal axes: red, green and blue go together, and what the
 eye does not see becomes zeros."""
 MIN_OPACITY = 1 / 255
-"""Of splats that any renderer draws."""
+"""Least opacity that any renderer draws."""
 
 
 def pack(
@@ -105,7 +105,7 @@ POSITION_STEP_M = 2.5e-5
 MOVED_STEP_M = 4e-5
 """Step of how far a driven offset moves them with a unit of its signal."""
 OFFSET_STEP = 2.0**-7
-"""Of other driven offsets."""
+"""Quantization step of other driven offsets."""
 PLAYER_SIGNALS = ("smoothed_strain", "normal")
 """Those of `face_frames.js`."""
 STEPS = {

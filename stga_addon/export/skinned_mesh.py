@@ -15,9 +15,9 @@ SHAPE_STEP_M = 4e-5
 """Step of what a shape moves a vertex by; larger where one moves farther than a short integer
 holds."""
 MIN_SHAPE_M = 8e-5
-"""What a shape moves by less is left where it is."""
+"""Least displacement by a shape that is kept."""
 BASE_STEP_M = 2.0**-20
-"""Of vertices at rest: so fine that no thin triangle becomes a line."""
+"""Quantization step of vertices at rest, so fine that no thin triangle becomes a line."""
 MAX_SHORT = 32767
 MAX_USHORT = 65535
 _INDICES = 34963
@@ -83,14 +83,14 @@ def _skin_attributes(weights: np.ndarray, accessors: Accessors, exact: bool) -> 
     sets = -(-max(1, int((weights > 0).sum(axis=1).max())) // 4)
     padded = np.pad(weights, ((0, 0), (0, max(0, 4 * sets - weights.shape[1]))))
     joints = np.argsort(-padded, axis=1, kind="stable")[:, : 4 * sets]
-    shares = np.take_along_axis(padded, joints, axis=1)
+    fractions = np.take_along_axis(padded, joints, axis=1)
     if exact:
-        shares = np.asarray(shares, np.float32)
+        fractions = np.asarray(fractions, np.float32)
     else:
-        steps = np.rint(shares * MAX_USHORT).astype(np.int64)
+        steps = np.rint(fractions * MAX_USHORT).astype(np.int64)
         steps[:, 0] += MAX_USHORT - steps.sum(axis=1)
-        shares = steps.astype(np.uint16)
-    joints = np.where(shares > 0, joints, 0)
+        fractions = steps.astype(np.uint16)
+    joints = np.where(fractions > 0, joints, 0)
     kind = np.uint8 if weights.shape[1] <= 256 else np.uint16
     attributes = {}
     for number in range(sets):
@@ -98,7 +98,7 @@ def _skin_attributes(weights: np.ndarray, accessors: Accessors, exact: bool) -> 
         own = np.ascontiguousarray(joints[four].astype(kind))
         attributes[f"JOINTS_{number}"] = accessors.add(own, VERTICES)
         normalized = {} if exact else {"normalized": True}
-        own = np.ascontiguousarray(shares[four])
+        own = np.ascontiguousarray(fractions[four])
         attributes[f"WEIGHTS_{number}"] = accessors.add(own, VERTICES, **normalized)
     return attributes
 

@@ -283,10 +283,10 @@ def _mesh(
         basis[number] = unit * values(target["POSITION"], count, 3)
     weights = np.zeros((count, joints))
     for number in range(sum(name.startswith("JOINTS") for name in attributes)):
-        shares = values(attributes[f"WEIGHTS_{number}"], count, 4)
+        fractions = values(attributes[f"WEIGHTS_{number}"], count, 4)
         own = values(attributes[f"JOINTS_{number}"], count, 4).astype(int)
         for column in range(4):
-            np.add.at(weights, (np.arange(count), own[:, column]), shares[:, column])
+            np.add.at(weights, (np.arange(count), own[:, column]), fractions[:, column])
     for name, array in (("POSITION", base), ("targets", basis), ("WEIGHTS", weights)):
         if not np.isfinite(array).all():
             raise ValueError(f"{name} holds values that are not finite")

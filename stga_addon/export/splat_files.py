@@ -9,12 +9,12 @@ import numpy as np
 from ..avatar.splats import SH_C0, Splats, in_world
 from ..errors import StgaError
 from ..files import is_folder, read_bytes
-from ..progress import Say, warn
+from ..progress import Log, warn
 from .ply import MAX_SPLAT_BYTES, READ_FILES, read_ply
 from .spz import read_spz
 
 GAUSSIAN_OUTPUT = "point_cloud/iteration_*/*.ply"
-"""Where 3D Gaussian Splatting writes the splats of an iteration."""
+"""Paths at which 3D Gaussian Splatting writes the splats of an iteration."""
 CONVERTED = "are not read; save them as .ply, for example with SuperSplat"
 
 UNREAD_SUFFIXES = {
@@ -40,7 +40,8 @@ UNREAD_SUFFIXES = {
 SPLAT_ROW = np.dtype(
     [("xyz", "<f4", 3), ("scale", "<f4", 3), ("color", "u1", 4), ("rotation", "u1", 4)]
 )
-"""Of antimatter15's .splat: linear scales; red, green, blue, opacity; w, x, y, z from -1 to 1."""
+"""Row of antimatter15's .splat: linear scales; red, green, blue, opacity; w, x, y, z from -1 to
+1."""
 
 
 def is_splats(path: Path) -> bool:
@@ -60,21 +61,21 @@ def latest_iteration(folder: Path) -> Path | None:
     return found[max(found)] if found else None
 
 
-def read_splats(path: Path, say: Say = warn) -> Splats:
+def read_splats(path: Path, log: Log = warn) -> Splats:
     """World-space splats of a .ply, .spz or .splat file, with harmonics of degree 0 to 3.
 
-    Rows that hold a value that is not finite are left out. `say` gets a sentence about what was
+    Rows that hold a value that is not finite are left out. `log` gets a sentence about what was
     left out or repaired. Raises StgaError naming the file, also for other kinds of files.
     """
     latest = latest_iteration(path)
     if latest is not None:
-        say(f"{path}: {latest.relative_to(path).as_posix()} is used")
+        log(f"{path}: {latest.relative_to(path).as_posix()} is used")
         path = latest
     suffix = path.suffix.lower()
     if suffix not in READERS:
         kind = UNREAD_SUFFIXES.get(suffix, f"files named {suffix}")
         raise StgaError(f"{path}: {kind} {CONVERTED}; expected {READ_FILES}")
-    splats = READERS[suffix](path, say)
+    splats = READERS[suffix](path, log)
     if not len(splats):
         raise StgaError(f"{path}: holds no splats")
     finite = np.ones(len(splats), bool)
@@ -86,11 +87,11 @@ def read_splats(path: Path, say: Say = warn) -> Splats:
     lost = f"{len(finite) - finite.sum()} of {len(finite)} splats hold values that are not finite"
     if not finite.any():
         raise StgaError(f"{path}: {lost}")
-    say(f"{path}: left out splats: {lost}")
+    log(f"{path}: left out splats: {lost}")
     return splats.rows(finite)
 
 
-def read_splat(path: Path, say: Say = warn) -> Splats:
+def read_splat(path: Path, log: Log = warn) -> Splats:
     """The splats of a .splat file, without harmonics above degree 0. Raises StgaError."""
     data = read_bytes(path, MAX_SPLAT_BYTES)
     if not data or len(data) % SPLAT_ROW.itemsize:
@@ -99,20 +100,20 @@ def read_splat(path: Path, say: Say = warn) -> Splats:
             f"of {SPLAT_ROW.itemsize}; expected {READ_FILES}"
         )
     table = np.frombuffer(data, SPLAT_ROW)
-    share = table["color"].astype(np.float32) / 255
+    fraction = table["color"].astype(np.float32) / 255
     with np.errstate(divide="ignore", invalid="ignore"):
         log_scale = np.log(table["scale"])
-        opacity = np.log(share[:, 3] / (1 - share[:, 3]))
+        opacity = np.log(fraction[:, 3] / (1 - fraction[:, 3]))
     return in_world(
         table["xyz"],
         (table["rotation"].astype(np.float32) - 128) / 128,
         log_scale,
         opacity,
-        ((share[:, :3] - 0.5) / SH_C0)[:, None],
+        ((fraction[:, :3] - 0.5) / SH_C0)[:, None],
     )
 
 
-READERS: dict[str, Callable[[Path, Say], Splats]] = {
+READERS: dict[str, Callable[[Path, Log], Splats]] = {
     ".ply": read_ply,
     ".spz": read_spz,
     ".splat": read_splat,

@@ -14,7 +14,7 @@ from ..avatar.splats import MAX_SH_DEGREE, Splats, in_world, logits
 from ..errors import StgaError
 from ..files import CHANGED_LINE_ENDS, allowed_bytes, line_ends_changed, read_bytes, replacing
 from ..flame.quaternions import normalized
-from ..progress import Say, warn
+from ..progress import Log, warn
 from .ply import READ_FILES
 
 MAGIC = b"NGSP"
@@ -96,12 +96,12 @@ def write_spz(path: Path, world: Splats, antialiased: bool = False) -> None:
         partial.write_bytes(packed)
 
 
-def read_spz(path: Path, say: Say = warn) -> Splats:
+def read_spz(path: Path, log: Log = warn) -> Splats:
     """World-space splats of an .spz of version 1 to 4, in the axes of the file; of harmonics above
-    degree 3 and of antialiasing, `say` gets a sentence. Raises StgaError naming the file."""
+    degree 3 and of antialiasing, `log` gets a sentence. Raises StgaError naming the file."""
     data = read_bytes(path, MAX_SPZ_BYTES)
     try:
-        return _unpacked(path, data, say)
+        return _unpacked(path, data, log)
     except (ValueError, struct.error, zlib.error, EOFError) as error:
         reason = "it ends within its header" if isinstance(error, struct.error) else error
         problem = CHANGED_LINE_ENDS if line_ends_changed(data) else f"({reason})"
@@ -110,7 +110,7 @@ def read_spz(path: Path, say: Say = warn) -> Splats:
         ) from error
 
 
-def _unpacked(path: Path, data: bytes, say: Say) -> Splats:
+def _unpacked(path: Path, data: bytes, log: Log) -> Splats:
     stream = zlib.decompressobj(wbits=zlib.MAX_WBITS | 16)
     header = data[:HEADER_BYTES]
     if data[:2] == GZIP_MAGIC:
@@ -133,7 +133,7 @@ def _unpacked(path: Path, data: bytes, say: Say) -> Splats:
     else:
         body = stream.decompress(stream.unconsumed_tail, needed + 1)
     if flags & HAS_EXTENSIONS:
-        say(f"{path}: has extensions, which are not read")
+        log(f"{path}: has extensions, which are not read")
         body = body[:needed]
     if len(body) != needed:
         raise ValueError(f"{len(body)} bytes of {count} splats, expected {needed}")
@@ -143,9 +143,9 @@ def _unpacked(path: Path, data: bytes, say: Say) -> Splats:
         for size, start in zip(parts, edges.tolist(), strict=False)
     )
     if flags & ANTIALIASED:
-        say(f"{path}: is marked as antialiased; splats of files are drawn without")
+        log(f"{path}: is marked as antialiased; splats of files are drawn without")
     if degree > MAX_SH_DEGREE:
-        say(f"{path}: harmonics of degree {degree} are cut at {MAX_SH_DEGREE}")
+        log(f"{path}: harmonics of degree {degree} are cut at {MAX_SH_DEGREE}")
     harmonics = (rest.reshape(count, others, 3).astype(np.float32) - 128) / 128
     base = (color.astype(np.float32) / 255 - 0.5) / COLOR_SCALE
     sh = np.concatenate([base[:, None], harmonics[:, : (MAX_SH_DEGREE + 1) ** 2 - 1]], axis=1)

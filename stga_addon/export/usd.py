@@ -27,11 +27,11 @@ EXTENT_DEVIATIONS = 3.0
 """Standard deviations that count as a splat's extent, as for USD's Gaussian kernel."""
 
 HAS_USD = "has usd"
-"""Of the writing process's first message: whether its interpreter has USD."""
+"""Key of the writing process's first message: whether its interpreter has USD."""
 NUMBER = "number"
-"""Of a frame's message: its time code."""
+"""Key of a frame's message: its time code."""
 ERROR = "error"
-"""Of the writing process's last message: why the file could not be written."""
+"""Key of the writing process's last message: why the file could not be written."""
 
 
 def write_usd(

@@ -145,8 +145,8 @@ def parameters_at(times: np.ndarray, known: np.ndarray, values: np.ndarray) -> n
     constant before and after."""
     row = np.clip(np.searchsorted(known, times, side="right") - 1, 0, max(len(known) - 2, 0))
     after = np.minimum(row + 1, len(known) - 1)
-    share = (times - known[row]) / np.maximum(known[after] - known[row], 1e-9)
-    change = np.clip(share, 0, 1)[:, None] * change_between(values[row], values[after])
+    fraction = (times - known[row]) / np.maximum(known[after] - known[row], 1e-9)
+    change = np.clip(fraction, 0, 1)[:, None] * change_between(values[row], values[after])
     return changed_by(values[row], change)
 
 

@@ -14,16 +14,16 @@ EYEBALLS = (3931, 4477, TEMPLATE_VERTICES)
 """Index layout: the first vertices of FLAME's left eyeball, after the skin, and of its right one,
 and the end of that."""
 EYE_REGION_RADII = 2.0
-"""How far from the middle of an eyeball the region of the eye reaches, in its radius."""
-LIP_HEIGHT_SHARE = 0.18
-"""How far from where lips meet they reach, as a share of the width of the mouth."""
-NOSE_RADIUS_SHARE = 0.35
-"""How far a nose reaches from the line from between the eyes to its tip, as a share of the eyes'
+"""Radius of an eye's region, in radii of the eyeball."""
+LIP_HEIGHT_FRACTION = 0.18
+"""How far from where lips meet they reach, as a fraction of the width of the mouth."""
+NOSE_RADIUS_FRACTION = 0.35
+"""How far a nose reaches from the line from between the eyes to its tip, as a fraction of the eyes'
 height over the mouth."""
-MIDDLE_SHARE = 0.1
-"""Half the width of the middle of a face, as a share of the eyes' distance."""
+MIDDLE_FRACTION = 0.1
+"""Half the width of the middle of a face, as a fraction of the eyes' distance."""
 RIDGE_POINTS = 9
-"""Of a nose, from the tip to between the eyes."""
+"""Points on the ridge of a nose, from the tip to between the eyes."""
 NECK_TILT = np.radians(29.3)
 """Radians between straight up and where the eyes are, seen from the end of FLAME's neck."""
 
@@ -47,7 +47,7 @@ def found_masks(vertices: np.ndarray, faces: np.ndarray) -> dict[str, np.ndarray
         "right_eyeball": right,
         "left_eye_region": np.flatnonzero(skin & _around_eyeball(at, left)),
         "right_eye_region": np.flatnonzero(skin & _around_eyeball(at, right)),
-        "lips": np.flatnonzero(skin & (_distance(at, at[lips]) < LIP_HEIGHT_SHARE * width)),
+        "lips": np.flatnonzero(skin & (_distance(at, at[lips]) < LIP_HEIGHT_FRACTION * width)),
         "nose": np.flatnonzero(skin & _on_nose(at, skin, (left, right, lips))),
     }
 
@@ -81,7 +81,7 @@ def _on_nose(at: np.ndarray, skin: np.ndarray, around: Sequence[np.ndarray]) -> 
     left, right, mouth = (at[vertices].mean(0) for vertices in around)
     between = (left + right) / 2
     height = between[1] - mouth[1]
-    middle = skin & (abs(at[:, 0] - between[0]) < MIDDLE_SHARE * (left - right)[0])
+    middle = skin & (abs(at[:, 0] - between[0]) < MIDDLE_FRACTION * (left - right)[0])
     below = between[1] - at[:, 1]
     ridge = at[middle & (below > 0) & (below < height)]
     if not len(ridge):
@@ -89,7 +89,7 @@ def _on_nose(at: np.ndarray, skin: np.ndarray, around: Sequence[np.ndarray]) -> 
     tip = ridge[ridge[:, 2].argmax()]
     root = ridge[ridge[:, 1].argmax()]
     line = np.linspace(tip, root, RIDGE_POINTS)
-    return np.asarray(_distance(at, line) < NOSE_RADIUS_SHARE * height)
+    return np.asarray(_distance(at, line) < NOSE_RADIUS_FRACTION * height)
 
 
 def _distance(at: np.ndarray, points: np.ndarray) -> np.ndarray:

@@ -36,7 +36,8 @@ Creative Technologies) in FLAME's form, made by `development/bundled_head.py`.""
 EXPRESSION_NAMES = "expression_names"
 """Key of the names in model files, and in motions of the bundled head."""
 SHAPE_STEP_M = 1e-5
-"""Of `shape_steps` (K, V, 3), whole numbers, which a file may have in place of shapedirs."""
+"""Step of the whole numbers `shape_steps` (K, V, 3), which a file may have in place of
+shapedirs."""
 EYEBALL_WEIGHT = 0.9
 """Skinning weight by an eye's joint, above which a vertex belongs to the eyeball."""
 MIN_TORSO_WEIGHT = 0.7

@@ -36,9 +36,10 @@ class Part:
 PARTS = {
     "teeth": Part("Teeth", "rows of teeth", with_teeth, TEETH_VERTICES, TEETH_FACES, "mouth"),
 }
-"""By name, in the order in which they are grafted."""
+"""Name -> part, in the order in which parts are grafted."""
 ADDED_VERTICES = tuple(accumulate((part.vertices for part in PARTS.values()), initial=0))
-"""Of meshes that have none of the parts, the first one, …: those of other programs lack some."""
+"""Number of added vertices of a mesh with none of the parts, with the first one, …: meshes of other
+programs lack some."""
 FLAME_SIZES = tuple(TEMPLATE_VERTICES + added for added in ADDED_VERTICES)
 """Numbers of vertices of FLAME's meshes."""
 KEY_MASKS = {

@@ -185,8 +185,8 @@ def read_identity(path: Path, model: FlameModel, arrays: Arrays | None = None) -
 
 def torso_shapes(model: FlameModel) -> np.ndarray:
     """(V, 3, 3) vertex offsets by which the torso is shifted along x, y and z, in its axes."""
-    share = np.minimum(model.weights[:, JOINTS.index("root")] / MIN_TORSO_WEIGHT, 1)
-    return share[:, None, None] * np.eye(SHIFT_SIZE)
+    fraction = np.minimum(model.weights[:, JOINTS.index("root")] / MIN_TORSO_WEIGHT, 1)
+    return fraction[:, None, None] * np.eye(SHIFT_SIZE)
 
 
 def torso_offset(

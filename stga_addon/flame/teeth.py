@@ -32,15 +32,15 @@ TEETH_STRIPS = {
     "lower back": ("LRB0 LEB1 LEB0 LRB0 LRB1 LEB1", "LRB0 LRB1 LEB0 LRB1 LEB1 LEB0"),
     "lower top": ("LEB0 LEB1 LE0 LEB1 LE1 LE0", "LEB0 LE1 LE0 LEB0 LEB1 LE1"),
 }
-# Sizes as shares of the width between the corners of the mouth, about 50 mm.
+# Sizes as fractions of the width between the corners of the mouth, about 50 mm.
 ARCH_WIDTH = 0.85
 """Width of the arch as a fraction of the mouth's."""
 CLEARANCE = 0.03
 """Gap between the lips' inner surface and the teeth."""
 OVERBITE = 0.06
-"""How far the upper edge reaches below the lower one."""
+"""Distance that the upper edge reaches below the lower one."""
 OVERJET = 0.02
-"""How far the upper edge stands in front of the lower one."""
+"""Distance that the upper edge stands in front of the lower one."""
 EDGE_THICKNESS = 0.05
 ROOT_THICKNESS = 0.1
 MAX_MOUTH_RINGS = 12

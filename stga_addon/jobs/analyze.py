@@ -11,7 +11,7 @@ from ..capture.other_input import other_input
 from ..capture.repairs import REPAIR_OPTION
 from ..format import format_duration
 from ..options import When, like
-from ..progress import Progress, Report, Say
+from ..progress import Log, Progress, Report
 from ..render.device import choose_device
 from ..selection import SelectionOptions, select_capture
 from ..training.effect_catalog import EffectDecision
@@ -19,7 +19,7 @@ from ..training.run.folder import RUN
 from ..training.settings import PRESETS, TrainingSettings, make_settings
 from .train import Selected, Train
 
-SHARES = (0.1, 0.35, 0.65)  # Of an analysis that are over when each preset begins to be timed
+FRACTIONS = (0.1, 0.35, 0.65)  # Of an analysis that are over when each preset begins to be timed
 
 
 @dataclass(frozen=True)
@@ -92,7 +92,7 @@ class Analyzed:
     repaired: bool = False
 
 
-def analyze(request: Analyze, report: Report, say: Say) -> Analyzed:
+def analyze(request: Analyze, report: Report, log: Log) -> Analyzed:
     """Decide the effects of a training on the capture; also times the presets if asked to. Raises
     StgaError."""
     from ..training.effects.plan import plan_effects
@@ -102,7 +102,7 @@ def analyze(request: Analyze, report: Report, say: Say) -> Analyzed:
     source = request.capture, request.flame, request.principal_point
     repaired = repair_capture(*source) if request.repair else None
     if repaired:
-        say(repaired)
+        log(repaired)
     capture = open_capture(*source)
     if not capture.views.get("train"):
         return Analyzed((), {})
@@ -115,38 +115,38 @@ def analyze(request: Analyze, report: Report, say: Say) -> Analyzed:
         from ..training.preset_timing import time_presets
 
         timings = time_presets(capture, device=device)
-        for share, preset in zip(SHARES, PRESETS, strict=True):
-            left_s = partial(dict[str, float], left_s=(monotonic() - begin) * (1 / share - 1))
-            report(Progress(share, "Timing the presets", figures=left_s))
+        for fraction, preset in zip(FRACTIONS, PRESETS, strict=True):
+            left_s = partial(dict[str, float], left_s=(monotonic() - begin) * (1 / fraction - 1))
+            report(Progress(fraction, "Timing the presets", figures=left_s))
             seconds[preset] = next(timings).seconds
     misfit = next((text for text in capture.warnings if REPAIR_OPTION in text), "")
     return Analyzed(plan, seconds, misfit, repaired is not None)
 
 
-def time_each_preset(request: TimePresets, report: Report, say: Say) -> Analyzed:
+def time_each_preset(request: TimePresets, report: Report, log: Log) -> Analyzed:
     """Time the presets; says what each is for. Raises StgaError."""
     from ..training.preset_timing import time_presets
 
     capture = open_capture(request.capture, request.flame, request.principal_point)
     device, why = choose_device(request.device)
-    say(why)
+    log(why)
     timings = []
     for timing in time_presets(capture, device=device):
         timings.append(timing)
-        say(
+        log(
             f"{timing.preset:<9} {timing.iterations:6d} iterations  about "
             f"{format_duration(timing.seconds):<10}  {timing.purpose}"
         )
     return Analyzed((), {timing.preset: timing.seconds for timing in timings})
 
 
-def select(request: Select, report: Report, say: Say) -> Selected:
+def select(request: Select, report: Report, log: Log) -> Selected:
     """Say how much each timestep selects, and which regions as a whole. Raises StgaError."""
     capture = open_capture(request.capture, request.flame, request.principal_point)
     options = SelectionOptions(request.threshold, request.zero_pose or SelectionOptions.zero_pose)
     selection = select_capture(capture, options)
-    say(f"threshold {1000 * request.threshold:g} mm, {len(capture.faces)} triangles")
+    log(f"threshold {1000 * request.threshold:g} mm, {len(capture.faces)} triangles")
     for timestep, faces in selection.items():
         regions = (name for name, r in capture.regions.items() if r.any() and faces[r].all())
-        say(f"{timestep:5d}  {faces.mean():6.1%}  {', '.join(regions)}")
+        log(f"{timestep:5d}  {faces.mean():6.1%}  {', '.join(regions)}")
     return Selected(selection)

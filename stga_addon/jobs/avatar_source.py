@@ -18,7 +18,7 @@ from ..export.ply import READ_FILES
 from ..files import read_json, read_npz, write_json, write_npz
 from ..flame.sequence import motion_of
 from ..options import Need, option
-from ..progress import Say, warn
+from ..progress import Log, warn
 from ..schema import Arrays, from_json, setting, to_json
 from ..training.run.folder import AVATAR, open_refined, open_run, read_run, with_refined_tracking
 
@@ -100,7 +100,7 @@ def required_capture(capture: Capture | None) -> Capture:
     return capture
 
 
-def timesteps_between(capture: Capture, span: tuple[int, int] | None, say: Say) -> tuple[int, ...]:
+def timesteps_between(capture: Capture, span: tuple[int, int] | None, log: Log) -> tuple[int, ...]:
     """The capture's timesteps within `span`, inclusive; says so where it reaches beyond. Raises
     StgaError for none."""
     if span is None:
@@ -112,7 +112,7 @@ def timesteps_between(capture: Capture, span: tuple[int, int] | None, say: Say) 
     begin = min(capture.timesteps)
     end = max(capture.timesteps)
     if first < begin or last > end:
-        say(f"--frames {first}:{last}: the capture has timesteps {begin} to {end}")
+        log(f"--frames {first}:{last}: the capture has timesteps {begin} to {end}")
     return timesteps
 
 
@@ -153,7 +153,7 @@ def _as_played(capture: Capture, played: Played) -> Capture:
 # Motions
 
 
-def open_avatar_motion(request: Posed, avatar: Avatar, say: Say) -> Motion:
+def open_avatar_motion(request: Posed, avatar: Avatar, log: Log) -> Motion:
     """The request's motion on its avatar; says how far it is outside the trained range, where that
     is asked for. Raises StgaError."""
     assert request.motion is not None
@@ -170,7 +170,7 @@ def open_avatar_motion(request: Posed, avatar: Avatar, say: Say) -> Motion:
         except StgaError as error:
             if options.stay_trained is not None:
                 raise
-            say(f"{error}; the motion is put on the head without expression, not its quiet face")
+            log(f"{error}; the motion is put on the head without expression, not its quiet face")
     if options.stay_trained is not None and trained is None:
         raise StgaError(
             f"--stay-trained: {source} is no run with a FLAME capture, whose motion would be "
@@ -179,13 +179,13 @@ def open_avatar_motion(request: Posed, avatar: Avatar, say: Say) -> Motion:
     head = avatar.neutral, avatar.faces
     motion = open_motion(request.motion, flame, head, options, trained, request.fps)
     for line in findings(motion):
-        say(line)
+        log(line)
     return motion
 
 
-def motion_capture(request: Posed, avatar: Avatar, own: Capture | None, say: Say) -> Capture:
+def motion_capture(request: Posed, avatar: Avatar, own: Capture | None, log: Log) -> Capture:
     """The motion as a capture, seen by the cameras of the run's own one."""
-    motion = open_avatar_motion(request, avatar, say)
+    motion = open_avatar_motion(request, avatar, log)
     views = {} if own is None else own.views
     capture = sequence_capture(request.motion, motion.sequence, request.flame, views)
     return replace(capture, fps=motion.fps)
@@ -199,10 +199,10 @@ def findings(motion: Motion) -> list[str]:
         lines.append(f"{motion.lost} rows are missing and were interpolated")
     for part, beyond in motion.outside.items():
         if beyond.any():
-            share = float(np.mean(beyond > 0))
+            fraction = float(np.mean(beyond > 0))
             frame = int(beyond.argmax())
             lines.append(
-                f"{part}: {100 * share:.0f} % of the frames are outside the trained range, "
+                f"{part}: {100 * fraction:.0f} % of the frames are outside the trained range, "
                 f"by up to {beyond.max():.1f} of its half width (frame {frame})"
             )
     return lines

@@ -14,7 +14,7 @@ from pathlib import Path
 from ..errors import StgaError
 from ..files import naming, temporary_folder
 from ..options import like
-from ..progress import Cancelled, Progress, Report, Say, Written, counted
+from ..progress import Cancelled, Log, Progress, Report, Written, counted
 from ..render.device import Composer
 from ..render.video import (
     check_output,
@@ -30,7 +30,8 @@ from ..worker.training_python import BLENDER_VARIABLE, PYTHON_VARIABLE
 from .train import Train
 
 PARTIAL = "rendering"
-"""In the name of the folder that Blender writes into; a picture leaves it when it is whole."""
+"""Part of the name of the folder into which Blender writes; a finished picture is moved out of
+it."""
 SAVED = re.compile(r"Saved: '(?P<path>.+)'")  # What Blender prints when it has written a picture
 LAST_LINES = 30  # Lines of Blender's output that are searched for why it failed
 STOP_TIMEOUT_S = 10.0
@@ -61,7 +62,7 @@ def check_recording(request: RenderRecording) -> None:
     check_output(request.output)
 
 
-def render_recording(request: RenderRecording, report: Report, say: Say) -> Written:
+def render_recording(request: RenderRecording, report: Report, log: Log) -> Written:
     """Render the recorded images and remove the recording; cancelled, no video is written, finished
     PNGs stay."""
     output = request.output
@@ -113,7 +114,7 @@ def pictures(request: RenderBlend) -> Collection[Path]:
     return request.pictures.values()
 
 
-def render_blend(request: RenderBlend, report: Report, say: Say) -> Written:
+def render_blend(request: RenderBlend, report: Report, log: Log) -> Written:
     """Render the frames that have no picture yet.
 
     The add-on has to be enabled in that Blender; it renders with the Python of this process, unless
@@ -129,7 +130,7 @@ def render_blend(request: RenderBlend, report: Report, say: Say) -> Written:
     # runs that follow each other
     for _, numbered in groupby(enumerate(missing), lambda item: item[1] - item[0]):
         frames = [frame for _, frame in numbered]
-        for _ in _rendered(request, frames[0], frames[-1], say):
+        for _ in _rendered(request, frames[0], frames[-1], log):
             done += 1
             progress = Progress(done / total, "Rendering", f"Frame {done} of {total}")
             if report(progress) and done < total:
@@ -137,7 +138,7 @@ def render_blend(request: RenderBlend, report: Report, say: Say) -> Written:
     return Written(request.output)
 
 
-def _rendered(request: RenderBlend, first: int, last: int, say: Say) -> Iterator[Path]:
+def _rendered(request: RenderBlend, first: int, last: int, log: Log) -> Iterator[Path]:
     """Let Blender render the frames; yields each picture when it is whole."""
     with temporary_folder(request.output, PARTIAL) as partial:
         names = str(partial.absolute() / ("#" * FRAME_DIGITS))
@@ -170,7 +171,7 @@ def _rendered(request: RenderBlend, first: int, last: int, say: Say) -> Iterator
         try:
             for line in process.stdout:
                 printed.append(line.strip())
-                say(line.rstrip())
+                log(line.rstrip())
                 picture = pictures[min(expected, last)]
                 found = SAVED.search(line)
                 if found is not None and Path(found["path"]).name == picture.name:

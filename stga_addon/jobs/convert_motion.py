@@ -29,7 +29,7 @@ from ..flame.parts import flame_model
 from ..flame.quaternions import from_axis_angle, from_matrices, to_axis_angle, to_matrices
 from ..flame.sequence import FRAME_FIELDS, FlameSequence, retimed
 from ..options import When, like, option
-from ..progress import Progress, Report, Say, Written
+from ..progress import Log, Progress, Report, Written
 from ..tracking.folder import (
     AVATAR_MISFIT,
     LOCK_FILE,
@@ -108,13 +108,13 @@ class ConvertMotion:
             raise StgaError(f"{self.output}: expected a name that ends in {SHAPES_SUFFIX} or .npz")
 
 
-def convert_motion(request: ConvertMotion, report: Report, say: Say) -> Written:
+def convert_motion(request: ConvertMotion, report: Report, log: Log) -> Written:
     """Write the motion or the performance. Raises StgaError."""
     report(Progress(stage="Converting"))
     options = request.options
     tracked = None
     if request.avatar is not None:
-        tracked = _tracked_by_avatar(request, request.avatar, report, say)
+        tracked = _tracked_by_avatar(request, request.avatar, report, log)
     if tracked is not None:
         performance = _performance_of_head(tracked)
     elif performer_of(request.source) is not None:
@@ -152,7 +152,7 @@ def _person(request: ConvertMotion) -> FlameSequence:
 
 
 def _tracked_by_avatar(
-    request: ConvertMotion, avatar: Path, report: Report, say: Say
+    request: ConvertMotion, avatar: Path, report: Report, log: Log
 ) -> Capture | None:
     """The footage tracked by the avatar, in folders beside the result with which a cancelled
     request for the same footage and avatar goes on; None where some of its timesteps look like
@@ -174,16 +174,16 @@ def _tracked_by_avatar(
                 clear(out)
         if not is_written(out):
             asked = Track(request.source, None, out, avatar=avatar, step=step, take="talk")
-            track(asked, report, say)
+            track(asked, report, log)
         misfit = read_json(out / REPORT_FILE)["image_misfit"][AVATAR_MISFIT]
-        share = float(np.median(list(misfit.values())))
-        if share > MAX_MISFIT:
-            say(
-                f"warning: the avatar does not explain {share:.0%} of the head's pixels: is it of "
-                "another person? The face networks detect the motion"
+        fraction = float(np.median(list(misfit.values())))
+        if fraction > MAX_MISFIT:
+            log(
+                f"warning: the avatar does not explain {fraction:.0%} of the head's pixels: is it "
+                "of another person? The face networks detect the motion"
             )
             return None
-    say(f"avatar: does not explain {share:.0%} of the head's pixels (median)")
+    log(f"avatar: does not explain {fraction:.0%} of the head's pixels (median)")
     return open_capture(out, flame)
 
 

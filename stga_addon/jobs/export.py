@@ -31,7 +31,7 @@ from ..flame.sequence import FlameSequence
 from ..format import format_bytes, format_name
 from ..light.relight import albedo_avatar
 from ..options import When, like, option
-from ..progress import Report, Say, Written, counted
+from ..progress import Log, Report, Written, counted
 from ..selection import SelectionOptions, select_capture
 from ..training.run.folder import AVATAR, SELECTION
 from . import avatar_source
@@ -128,7 +128,7 @@ class Export:
         check_suffix(self.output, self.file_format)
 
 
-def export(request: Export, report: Report, say: Say) -> Written:
+def export(request: Export, report: Report, log: Log) -> Written:
     """Write the file or the folder. Says how much room several frames take; raises StgaError."""
     avatar, capture = avatar_source.open_avatar(request)
     if request.filmed_only:
@@ -136,7 +136,7 @@ def export(request: Export, report: Report, say: Say) -> Written:
     if request.albedo:
         avatar = albedo_avatar(avatar)
     if request.motion is not None:
-        capture = avatar_source.motion_capture(request, avatar, capture, say)
+        capture = avatar_source.motion_capture(request, avatar, capture, log)
     fps = playback_fps(capture, request.fps, numbered=request.file_format == "usd")
     format = FORMATS[request.file_format]
     timestep = request.timestep
@@ -144,15 +144,15 @@ def export(request: Export, report: Report, say: Say) -> Written:
     flame = None if capture is None else capture.flame
     meshes: Meshes = [(0, avatar.neutral)]
     if format.has_rig and capture is None and request.frames is None:
-        _say_size(request, avatar, 1, say)
+        _say_size(request, avatar, 1, log)
         playback = Playback(title=_title(request), fps=fps, motion_only=True)
-        _say_licence(flame_notice(avatar, None, motion_only=True), say)
+        _say_licence(flame_notice(avatar, None, motion_only=True), log)
     elif format.source == "range":
         capture = avatar_source.required_capture(capture)
-        timesteps = avatar_source.timesteps_between(capture, request.frames, say)
-        _say_size(request, avatar, len(timesteps), say)
+        timesteps = avatar_source.timesteps_between(capture, request.frames, log)
+        _say_size(request, avatar, len(timesteps), log)
         if format.has_rig:
-            playback, flame = capture_playback(request, avatar, capture, timesteps, fps, say)
+            playback, flame = capture_playback(request, avatar, capture, timesteps, fps, log)
         posed = ((timestep, capture.mesh(timestep)) for timestep in timesteps)
         meshes = counted(posed, len(timesteps), report, "Exporting", "Frame")
     elif format.source == "frame" and timestep is not None:
@@ -164,11 +164,11 @@ def export(request: Export, report: Report, say: Say) -> Written:
     return Written(request.output)
 
 
-def _say_size(request: Export, avatar: Avatar, frames: int, say: Say) -> None:
+def _say_size(request: Export, avatar: Avatar, frames: int, log: Log) -> None:
     """Say how large the file will be. Raises StgaError where the disk has too little free space."""
     size = FORMATS[request.file_format].size(Content(avatar), frames)
     check_free_space(request.output, size)
-    say(
+    log(
         f"{frames} frame{'' if frames == 1 else 's'} of {len(avatar.splats)} splats: about "
         f"{format_bytes(size)}"
     )
@@ -185,7 +185,7 @@ def capture_playback(
     capture: Capture,
     timesteps: tuple[int, ...],
     fps: float,
-    say: Say,
+    log: Log,
 ) -> tuple[Playback, FlameSequence | None]:
     """What a page shows of timesteps, and its FLAME motion. Says what of FLAME it holds."""
     # what each timestep trains: the open file's or the run's selection, else by the rule
@@ -217,13 +217,13 @@ def capture_playback(
     notice = flame_notice(avatar, sequence, motion_only)
     if sequence is not None and not motion_only:
         notice += " --motion-only leaves them out, but not the meshes of the take."
-    _say_licence(notice, say)
+    _say_licence(notice, log)
     return playback, sequence
 
 
-def _say_licence(notice: str, say: Say) -> None:
+def _say_licence(notice: str, log: Log) -> None:
     if notice:
-        say(notice)
+        log(notice)
 
 
 def _title(request: Export) -> str:

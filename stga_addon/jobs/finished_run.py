@@ -16,7 +16,7 @@ from ..export.splat_files import read_splats
 from ..files import write_json
 from ..light.environment import read_hdr, split_environment
 from ..options import like, option
-from ..progress import Progress, Report, Say, Written, ignore
+from ..progress import Log, Progress, Report, Written, ignore
 from ..training.run import folder as run_folder
 from ..training.run.folder import AVATAR, WORLD_FILE
 
@@ -51,7 +51,7 @@ class Relight:
             raise StgaError("--gray-card: has no effect with --light, whose level is known")
 
 
-def relight(request: Relight, report: Report, say: Say) -> Written:
+def relight(request: Relight, report: Report, log: Log) -> Written:
     """Write the light, estimated or known, into the run's avatar file. Raises StgaError."""
     from ..light.estimate import Known
 
@@ -98,7 +98,7 @@ class MakeExact:
     capture: Path | None = like(Relight, "capture")
 
 
-def make_exact(request: MakeExact, report: Report, say: Say) -> Written:
+def make_exact(request: MakeExact, report: Report, log: Log) -> Written:
     """Write what was fitted into the run's avatar file, beside what was trained. Raises StgaError,
     also while another process works on the run."""
     from ..render.linear_fit import fit_linear
@@ -154,7 +154,7 @@ def measure_run(
     return quality, evaluate_avatar(avatar, fitted, split, True, matched)
 
 
-def evaluate(request: Evaluate, report: Report, say: Say) -> Written:
+def evaluate(request: Evaluate, report: Report, log: Log) -> Written:
     """Measure PSNR, SSIM and LPIPS; also with the heads that the avatar has fitted, where it did.
     Raises StgaError."""
     from ..capture.usable_views import with_usable_views
@@ -169,7 +169,7 @@ def evaluate(request: Evaluate, report: Report, say: Say) -> Written:
         raise StgaError(f"{capture.root}: has no views in the split '{split}'")
     capture, left_out = with_usable_views(capture)
     for sentence in left_out:
-        say(f"warning: {sentence}")
+        log(f"warning: {sentence}")
     views = capture.views[split]
     if not views:
         raise StgaError(f"{capture.root}: shows nobody in the split '{split}'")

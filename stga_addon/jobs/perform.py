@@ -13,7 +13,7 @@ from typing import Any
 from ..errors import StgaError, telling_refusals
 from ..files import read_document, read_npz, write_document, write_npz
 from ..options import refuse_useless
-from ..progress import Cancelled, Progress, Report, Say, ignore
+from ..progress import Cancelled, Log, Progress, Report, ignore
 from ..schema import Arrays, from_json, to_json, validate
 from ..worker.launch import prepare_status_folder
 from ..worker.status import PICTURE, PREVIEW, remove_status_folder, status_writer
@@ -89,21 +89,21 @@ def _read(path: Path, kinds: Any) -> Any:
     return from_json(kinds, values, path, arrays)
 
 
-def perform(request: Request, report: Report = ignore, say: Say = print) -> Result:
+def perform(request: Request, report: Report = ignore, log: Log = print) -> Result:
     """Carry out a request; returns what it found.
 
-    say: called with lines about what was decided and found.
-    Raises what the work raises: StgaError for mistakes and damaged files; Cancelled where the
-    report stopped work that has nothing to keep; KeyboardInterrupt after Ctrl-C.
+    log: called with lines about what was decided and found. Raises what the work raises: StgaError
+    for mistakes and damaged files; Cancelled where the report stopped work that has nothing to
+    keep; KeyboardInterrupt after Ctrl-C.
     """
     refuse_useless(request)
     validate(request)
     with telling_refusals():
-        return JOBS[type(request)].work(request, report, say)
+        return JOBS[type(request)].work(request, report, log)
 
 
 def perform_in_folder(
-    folder: Path, say: Say = print, also: Report = ignore, resume: bool = False
+    folder: Path, log: Log = print, also: Report = ignore, resume: bool = False
 ) -> Result | None:
     """Carry out the request in a folder, with its status, previews and result there; None where it
     was cancelled.
@@ -128,7 +128,7 @@ def perform_in_folder(
             if job.kind in TRAINS:
                 begin_training()
             left: Any = job.left(request) if resume else request
-            result: Result = perform(left, report, say) if type(left) in JOBS else left
+            result: Result = perform(left, report, log) if type(left) in JOBS else left
         except Cancelled:
             return None
         write_result(folder, result)

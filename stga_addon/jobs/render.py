@@ -23,7 +23,7 @@ from ..flame.sequence import sequence_mesh
 from ..light.environment import read_lighting, turned
 from ..light.relight import Relighter
 from ..options import When, like, option
-from ..progress import Report, Say, Written, counted
+from ..progress import Log, Report, Written, counted
 from ..raster.posed_splats import PosedSplats
 from ..render.device import Composer
 from ..render.video import sequence_writer, video_writer
@@ -168,17 +168,17 @@ class Render:
             raise StgaError("--out needs --cameras, which says what to render, or --turntable")
 
 
-def render(request: Render, report: Report, say: Say) -> Written:
+def render(request: Render, report: Report, log: Log) -> Written:
     """Render the pictures or the video; cancelled, no video is written, and pictures that are
     finished stay. Raises StgaError."""
     if request.turntable is not None:
         _turntable_images(request, request.fps or DEFAULT_FPS)  # before anything is read
     views: Sequence[View] = ()
     if request.cameras is not None:
-        views = camera_views(request, request.cameras, say)
+        views = camera_views(request, request.cameras, log)
     composer = Composer(request.device)
     composer.choose()
-    subject = _subject(request, composer, say)
+    subject = _subject(request, composer, log)
     if request.is_film:
         _film(request, subject, subject.views if request.cameras is None else views, report)
         return Written(request.output)
@@ -194,7 +194,7 @@ def render(request: Render, report: Report, say: Say) -> Written:
     return Written(request.output)
 
 
-def camera_views(request: Render, path: Path, say: Say) -> list[View]:
+def camera_views(request: Render, path: Path, log: Log) -> list[View]:
     """The views of a file of cameras: transforms, or 3D Gaussian Splatting's. Raises StgaError."""
     if is_file(path) and is_gaussian_cameras(path):
         shots = read_gaussian_cameras(path)
@@ -207,7 +207,7 @@ def camera_views(request: Render, path: Path, say: Say) -> list[View]:
             principal_point = read_avatar(avatar_source.avatar_path(request.source)).principal_point
     frames = read_transforms(path, principal_point)
     if distorted := distortion(frames):
-        say(f"{distorted}; pictures are drawn as of a pinhole")
+        log(f"{distorted}; pictures are drawn as of a pinhole")
     return [frame.view for frame in frames]
 
 
@@ -215,7 +215,7 @@ def camera_views(request: Render, path: Path, say: Say) -> list[View]:
 class _Subject:
     """What is rendered.
 
-    image      view and share of the film, 0 to 1 -> image (3, H, W)
+    image      view and fraction of the film, 0 to 1 -> image (3, H, W)
     timesteps  of its motion, ascending; none where nothing moves
     center     of the head or splats at the first timestep, (3,) meters
     fps        at which it plays
@@ -304,13 +304,13 @@ def _turntable_images(request: Render, fps: float) -> int:
     return round(images)
 
 
-def _subject(request: Render, composer: Composer, say: Say) -> _Subject:
+def _subject(request: Render, composer: Composer, log: Log) -> _Subject:
     """An avatar with its capture or moved by another person's motion, or world-space splats."""
     source = request.source
     if is_splats(source):
         from ..render.render import render_layers
 
-        splats = read_splats(source, say)
+        splats = read_splats(source, log)
         layers = [PosedSplats(splats)]
         return _Subject(
             lambda view, _: render_layers(layers, view.camera, request.background, composer),
@@ -321,7 +321,7 @@ def _subject(request: Render, composer: Composer, say: Say) -> _Subject:
     if request.motion is not None:
         avatar = read_avatar(avatar_source.avatar_path(source))
         capture = avatar_source.open_avatar(request)[1] if request.cameras is None else None
-        motion = avatar_source.open_avatar_motion(request, avatar, say)
+        motion = avatar_source.open_avatar_motion(request, avatar, log)
         sequence = motion.sequence
         fps = request.fps or motion.fps or DEFAULT_FPS
         return _Subject(
@@ -371,9 +371,9 @@ def _pictured(
         behind = [PosedSplats(read_splats(path))]
     colors = None if request.light is None else _lit_colors(request, request.light, avatar)
 
-    def picture(view: View, share: float) -> np.ndarray:
+    def picture(view: View, fraction: float) -> np.ndarray:
         posed = mesh(view)
-        lit = None if colors is None else colors(posed, view, share)
+        lit = None if colors is None else colors(posed, view, fraction)
         layers = [posed_avatar(avatar, posed, lit), *behind]
         return render_layers(layers, view.camera, request.background, composer)
 
@@ -383,14 +383,14 @@ def _pictured(
 def _lit_colors(
     request: Render, source: Path, avatar: Avatar
 ) -> Callable[[np.ndarray, View, float], np.ndarray]:
-    """Mesh, view and share of the pictures -> colors (N, 3) under the asked light."""
+    """Mesh, view and fraction of the pictures -> colors (N, 3) under the asked light."""
     relighter = Relighter(avatar)
     lighting = read_lighting(source)
 
-    def colors(mesh: np.ndarray, view: View, share: float) -> np.ndarray:
+    def colors(mesh: np.ndarray, view: View, fraction: float) -> np.ndarray:
         light = lighting
         if request.light_turn:
-            light = turned(lighting, _middle(mesh), request.light_turn * share)
+            light = turned(lighting, _middle(mesh), request.light_turn * fraction)
         return relighter.colors(mesh, view.camera.position, light)
 
     return colors

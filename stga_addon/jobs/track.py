@@ -15,7 +15,7 @@ from ..errors import StgaError, shorten
 from ..files import read_json, usable_path, write_json
 from ..format import format_duration
 from ..options import option
-from ..progress import Cancelled, Progress, Report, Say, TimeLeft, Written
+from ..progress import Cancelled, Log, Progress, Report, TimeLeft, Written
 from ..report import CURVE
 from ..tracking.folder import (
     KEPT_FOLDER,
@@ -59,7 +59,7 @@ TAKES = {
 }
 """Choice of what was filmed -> what it is."""
 MATTES = {"auto": "made for frames without a mask", "none": "only those of the footage"}
-"""What `Track.mattes` may be but a folder of masks."""
+"""Values of `Track.mattes` beside a folder of masks."""
 CAPTURE_FOLDER = "capture"
 RUN_FOLDER = "run"
 
@@ -67,7 +67,7 @@ INPUTS = "inputs.json"
 """File in the folder of `MakeAvatar`: capture, run, and what was asked for when they began, which
 alone continues."""
 KINDS = "kinds"
-"""In it what each of several takes is, once that was found out."""
+"""Key in that file of each take's kind, once it is known."""
 
 
 def _parsed_mattes(text: str) -> str:
@@ -128,7 +128,7 @@ class Track:
         metavar="COUNT",
     )
     size: float = option(
-        "of the images, as a share of the recorded size", 1.0, 0.1, 1.0, metavar="SHARE"
+        "of the images, as a fraction of the recorded size", 1.0, 0.1, 1.0, metavar="FRACTION"
     )
     offset: Mapping[str, int] | None = option(
         "frames by which a camera's recording is later; may be repeated",
@@ -233,12 +233,12 @@ OF_ONE_TAKE = ("cameras", "landmarks", "focal", "start", "stop", "offset", "sync
 QUICK: Mapping[str, Any] = {"most": 24, "size": 0.5}
 """Fields of `Track` for a first look at an avatar, as soon of a long video as of a short one."""
 QUICK_S = 30.0
-"""Of training, for one."""
+"""Seconds of training for a quick look."""
 WRITER = "tracking is writing this capture"
 """Who holds the lock of a capture that is being tracked."""
 MAX_MISFIT = 0.5
 """Median fraction of the head's pixels beyond which the avatar is another person's."""
-TRACKING_SHARE = 0.5
+TRACKING_FRACTION = 0.5
 """Of the progress, before an avatar tracks or is trained."""
 
 
@@ -259,7 +259,7 @@ def untracked(request: Track) -> Track | Written:
     return Written(request.out) if is_written(request.out) else request
 
 
-def track(request: Track, report: Report, say: Say) -> Written:
+def track(request: Track, report: Report, log: Log) -> Written:
     """Track the head into a capture; cancelled, the same request continues. Raises StgaError, also
     while another process writes the capture."""
     with hold_folder(request.out, LOCK_FILE, WRITER):
@@ -302,7 +302,7 @@ def _track_by_avatar(request: Track, run: Path, report: Report) -> Written:
     from ..tracking.track import track as track_footage
     from ..training.run.recording import avatar_person, track_recording
 
-    steps = _Steps(report, TRACKING_SHARE)
+    steps = _Steps(report, TRACKING_FRACTION)
     out = request.out
     footage, messages = _open(request, steps)
     person, model = avatar_person(run)
@@ -314,9 +314,9 @@ def _track_by_avatar(request: Track, run: Path, report: Report) -> Written:
         tracked = track_recording(run, out, helpers, report_avatar, keeps_world)
     found = replace(found, median_px=report_errors(out, model))
     end_tracking(out)
-    share = float(np.median(tracked.misfit))
-    lines = [*messages, f"avatar: does not explain {share:.0%} of the head's pixels (median)"]
-    if share > MAX_MISFIT:
+    fraction = float(np.median(tracked.misfit))
+    lines = [*messages, f"avatar: does not explain {fraction:.0%} of the head's pixels (median)"]
+    if fraction > MAX_MISFIT:
         lines.append("warning: the avatar does not look like the person of this footage")
     return _written(out, found, report, lines)
 
@@ -349,14 +349,14 @@ def _with_found_cameras(
 ) -> tuple["Footage", tuple[str, ...]]:
     """As `around.with_found_cameras`; what is refused leaves nothing."""
     from ..tracking.around import with_found_cameras
-    from ..tracking.stages import Crew
+    from ..tracking.stages import Workers
 
     out = request.out
     is_new = not is_begun(out)
     try:
         with Helpers(folder=out / KEPT_FOLDER) as helpers:
-            crew = Crew(helpers, steps.report, steps.show)
-            return with_found_cameras(footage, out, request.take, crew)
+            workers = Workers(helpers, steps.report, steps.show)
+            return with_found_cameras(footage, out, request.take, workers)
     except StgaError:
         if is_new and is_begun(out):
             clear(out)
@@ -384,7 +384,7 @@ def _written(
     return Written(out, (*lines, f"capture: {out}"))
 
 
-def solve_again(request: SolveAgain, report: Report, say: Say) -> Written:
+def solve_again(request: SolveAgain, report: Report, log: Log) -> Written:
     """Solve the capture again around the keys. Raises StgaError as `track` does."""
     from ..tracking.correct import correct_capture
 
@@ -396,10 +396,10 @@ def solve_again(request: SolveAgain, report: Report, say: Say) -> Written:
 class _Steps:
     """A tracking's steps as progress, with the time that is left and how well the head fits."""
 
-    def __init__(self, report: Report, tracking_share: float = 1.0) -> None:
+    def __init__(self, report: Report, tracking_fraction: float = 1.0) -> None:
         self._report = report
         self._time_left = TimeLeft()
-        self._share = tracking_share
+        self._fraction = tracking_fraction
         self._before = 0  # 1 where cameras are found before the head is tracked
         self._spans: Mapping[Stage, tuple[float, float]] = {}
         self._now = Progress()
@@ -420,10 +420,10 @@ class _Steps:
         begin, end = self._spans.get(stage, (stage.begin, stage.end))
         self._before = max(self._before, -math.floor(begin))
         at = begin + (end - begin) * done / max(total, 1)
-        share = (at + self._before) / (1 / self._share + self._before)
-        figures = {"left_s": self._time_left.after(share), **self._quality}
+        fraction = (at + self._before) / (1 / self._fraction + self._before)
+        figures = {"left_s": self._time_left.after(fraction), **self._quality}
         detail = f"{done} of {total}" if total > 1 else ""
-        self._now = Progress(share, stage.title, detail, lambda: figures)
+        self._now = Progress(fraction, stage.title, detail, lambda: figures)
         if self._report(self._now):
             raise Cancelled
 
@@ -435,29 +435,29 @@ class _Steps:
 # From footage to an avatar
 
 
-def make_avatar(request: MakeAvatar, report: Report, say: Say) -> Written:
+def make_avatar(request: MakeAvatar, report: Report, log: Log) -> Written:
     """Track unless that is done, then train or continue. Raises StgaError for other inputs."""
     capture = request.track.out
     run = request.train.run
 
     def report_tracking(progress: Progress) -> bool:
-        share = TRACKING_SHARE * progress.share
+        fraction = TRACKING_FRACTION * progress.fraction
         stage = f"Tracking: {progress.stage}"
         figures = {"left_s": math.nan, **progress.figures()}
         figures["left_s"] += (request.train.settings.seconds or 0.0) + AFTER_S
-        return report(replace(progress, share=share, stage=stage, figures=lambda: figures))
+        return report(replace(progress, fraction=fraction, stage=stage, figures=lambda: figures))
 
     def report_training(progress: Progress) -> bool:
-        share = TRACKING_SHARE + (1 - TRACKING_SHARE) * progress.share
-        return report(replace(progress, share=share))
+        fraction = TRACKING_FRACTION + (1 - TRACKING_FRACTION) * progress.fraction
+        return report(replace(progress, fraction=fraction))
 
     begin = perf_counter()
     check_inputs(request.track, request.takes)
-    captures = _track_takes(request, report_tracking, say)
+    captures = _track_takes(request, report_tracking, log)
     tracked = perf_counter()
     flame = request.track.model if is_flame(capture) else None
     new = replace(request.train, flame=flame, takes=tuple(captures[1:]))
-    trained = train_and_finish(resumed(new), report_training, say)
+    trained = train_and_finish(resumed(new), report_training, log)
     tracking = tracked - begin
     training = perf_counter() - tracked
     lines = [""]
@@ -490,7 +490,7 @@ def _tracking_lines(capture: Path) -> list[str]:
     return [*lines, f"tracking: reprojection error {median}"]
 
 
-def _track_takes(request: MakeAvatar, report: Report, say: Say) -> list[Path]:
+def _track_takes(request: MakeAvatar, report: Report, log: Log) -> list[Path]:
     """The captures of all takes, that of CAPTURE_FOLDER first; those that are not there are
     tracked."""
     out = request.out
@@ -498,17 +498,17 @@ def _track_takes(request: MakeAvatar, report: Report, say: Say) -> list[Path]:
     if not (out / INPUTS).exists():
         write_json(out / INPUTS, _inputs(request.track, request.takes))
     try:
-        tracks = _planned(request, report, say)
+        tracks = _planned(request, report, log)
         for number, own in enumerate(tracks):
 
             def report_take(progress: Progress, before: int = number) -> bool:
-                share = (before + progress.share) / len(tracks)
-                return report(replace(progress, share=share))
+                fraction = (before + progress.fraction) / len(tracks)
+                return report(replace(progress, fraction=fraction))
 
             if not is_written(own.out):
                 with hold_folder(own.out, LOCK_FILE, WRITER):
                     for line in _track_head(own, report_take).lines:
-                        say(line)
+                        log(line)
     except (StgaError, OSError):
         # nothing was tracked yet, so that the inputs may be mended
         if not any(path.name != INPUTS for path in out.iterdir()):
@@ -519,14 +519,14 @@ def _track_takes(request: MakeAvatar, report: Report, say: Say) -> list[Path]:
     return sorted((own.out for own in tracks), key=lambda path: path != request.track.out)
 
 
-def _planned(request: MakeAvatar, report: Report, say: Say) -> list[Track]:
+def _planned(request: MakeAvatar, report: Report, log: Log) -> list[Track]:
     """The takes in the order in which they are tracked: one around a still head first, the others
     with its head. The first talk is in CAPTURE_FOLDER: it is what the avatar plays."""
     track = request.track
     if not request.takes:
         return [track]
     footage = [track.footage, *request.takes]
-    kinds = _kinds(request, report, say)
+    kinds = _kinds(request, report, log)
     shown = kinds.index("talk") if "talk" in kinds else 0
     person = kinds.index("around") if "around" in kinds else 0
     folders = [f"{CAPTURE_FOLDER}_{number + 1}" for number in range(1, len(footage))]
@@ -545,12 +545,12 @@ def _planned(request: MakeAvatar, report: Report, say: Say) -> list[Track]:
     ]
 
 
-def _kinds(request: MakeAvatar, report: Report, say: Say) -> list[str]:
+def _kinds(request: MakeAvatar, report: Report, log: Log) -> list[str]:
     """What each take is, "around" or "talk": found out once and kept, or as given for the first, of
     which the others are none."""
     from ..tracking.around import take_of
     from ..tracking.footage.open import open_footage
-    from ..tracking.stages import Crew
+    from ..tracking.stages import Workers
 
     track = request.track
     stored = read_inputs(request.out)
@@ -566,10 +566,10 @@ def _kinds(request: MakeAvatar, report: Report, say: Say) -> list[str]:
         steps = _Steps(report)
         with Helpers() as helpers:
             for own, path in zip(opened, footage, strict=True):
-                kind, why = take_of(own, Crew(helpers, steps.report, steps.show))
+                kind, why = take_of(own, Workers(helpers, steps.report, steps.show))
                 kinds.append(kind)
                 what = "around a still head" if kind == "around" else "a head that moves"
-                say(f"take: {path.name}: {what} ({why})")
+                log(f"take: {path.name}: {what} ({why})")
     write_json(request.out / INPUTS, {**stored, KINDS: kinds})
     return kinds
 
@@ -613,7 +613,7 @@ def _inputs(track: Track, takes: Sequence[Path] = ()) -> dict[str, Any]:
 # Further takes of an avatar
 
 
-def extend(request: Extend, report: Report, say: Say) -> Written:
+def extend(request: Extend, report: Report, log: Log) -> Written:
     """Extend a run. Takes that are footage are tracked by its avatar first, into captures beside
     the new run; those that are there already are used. Raises StgaError."""
     captures = list[Path]()
@@ -621,20 +621,20 @@ def extend(request: Extend, report: Report, say: Say) -> Written:
         captures.append(path)
         if is_footage(path):
             out = captures[-1] = request.run.with_name(f"{request.run.name}_{path.stem}")
-            say(f"take: {path.name} is tracked by the avatar of {request.parent} into {out}")
+            log(f"take: {path.name} is tracked by the avatar of {request.parent} into {out}")
             if not is_written(out):
                 asked = Track(footage=path, model=None, out=out, avatar=request.parent)
-                for line in track(asked, partial(_tell_half, report, 0.0), say).lines:
-                    say(line)
+                for line in track(asked, partial(_report_half, report, 0.0), log).lines:
+                    log(line)
     if captures == list(request.captures):
-        return train_and_finish(request, report, say)
-    tell = partial(_tell_half, report, TRACKING_SHARE)
-    return train_and_finish(replace(request, captures=tuple(captures)), tell, say)
+        return train_and_finish(request, report, log)
+    report_half = partial(_report_half, report, TRACKING_FRACTION)
+    return train_and_finish(replace(request, captures=tuple(captures)), report_half, log)
 
 
-def _tell_half(report: Report, begin: float, progress: Progress) -> bool:
+def _report_half(report: Report, begin: float, progress: Progress) -> bool:
     """Report a half of the progress."""
-    return report(replace(progress, share=begin + TRACKING_SHARE * progress.share))
+    return report(replace(progress, fraction=begin + TRACKING_FRACTION * progress.fraction))
 
 
 def is_footage(path: Path) -> bool:

@@ -20,7 +20,7 @@ from ..export.ply import write_ply
 from ..files import file_digest
 from ..format import format_table
 from ..options import like, option
-from ..progress import Cancelled, Progress, Report, Say, Written
+from ..progress import Cancelled, Log, Progress, Report, Written
 from ..render.device import EXPECTED_DEVICE, choose_device, is_device
 from ..report import CurveUpdater, report_run
 from ..schema import setting
@@ -28,16 +28,16 @@ from ..training.effect_catalog import RELIGHT, WORLD
 from ..training.run import folder as run_folder
 from ..training.run.folder import AVATAR, Continuation, Run
 from ..training.run.identity import identity_of
-from ..training.settings import MAX_GROWTH, TrainingSettings, with_budget
+from ..training.settings import MAX_ADDED_RATIO, TrainingSettings, with_budget
 
 if TYPE_CHECKING:
     from ..training.run.session import Trained
 
 AFTERWARDS = (StgaError, Cancelled, MemoryError)
-"""What may end the work after a training, whose avatar is whole without it."""
+"""Exceptions that may end the work after a training; its avatar is complete without that work."""
 AFTER_S = 20.0
 """Seconds that light and world take after a training, about."""
-AFTER_SHARE = 0.05
+AFTER_FRACTION = 0.05
 """Fraction of the progress that they take."""
 Selection = Mapping[int, np.ndarray]  # timestep -> (F,) bool: triangles to train
 
@@ -114,11 +114,11 @@ class _Continue:
     parent: Path = option("folder of a run", flag="RUN")
     _: KW_ONLY
     growth: float = option(
-        "splats to add, as a share of those on the triangles that are trained",
+        "splats to add, as a fraction of those on the triangles that are trained",
         0.0,
         0,
-        MAX_GROWTH,
-        metavar="SHARE",
+        MAX_ADDED_RATIO,
+        metavar="FRACTION",
     )
     seconds: float | None = like(TrainingSettings, "seconds", help="training time")
     iterations: int | None = like(TrainingSettings, "iterations")
@@ -219,47 +219,47 @@ class Prepared:
         return train(self.capture, self.request.run, self.run, self.selection, resumes, report)
 
 
-def train_and_finish(request: Training, report: Report, say: Say) -> Written:
+def train_and_finish(request: Training, report: Report, log: Log) -> Written:
     """Train the run that is asked for, and add its summary, light and world. Raises StgaError,
     KeyboardInterrupt after Ctrl-C."""
     from ..training.effects.plan import describe_effects
 
-    prepared = prepare(request, report, say)
+    prepared = prepare(request, report, log)
     folder = request.run
     for warning in prepared.capture.warnings:
-        say(f"warning: {warning}")
+        log(f"warning: {warning}")
     for line in format_table(describe_effects(prepared.run.effect_plan)):
-        say(line)
+        log(line)
     choices = {decision.effect: decision.on for decision in prepared.run.effect_plan}
     after = [choices.get(RELIGHT, True), choices.get(WORLD, False)]
     draw = CurveUpdater(folder)
     latest = Progress()
     is_stopped = False
 
-    def tell(progress: Progress, done: float) -> bool:
+    def report_part(progress: Progress, done: float) -> bool:
         """Report training, or with its figures what comes after it, of which `done` is done."""
         figures = {"left_s": math.nan, **latest.figures()}
         training_s = figures["left_s"] if progress is latest else 0.0
         figures["left_s"] = training_s + AFTER_S * (sum(after) - done)
-        share = latest.share * (1 - AFTER_SHARE * sum(after)) + AFTER_SHARE * done
-        return report(replace(progress, share=share, figures=lambda: figures))
+        fraction = latest.fraction * (1 - AFTER_FRACTION * sum(after)) + AFTER_FRACTION * done
+        return report(replace(progress, fraction=fraction, figures=lambda: figures))
 
     def report_training(progress: Progress) -> bool:
         nonlocal latest, is_stopped
         draw(progress.metrics)
         latest = progress
-        is_stopped = tell(progress, 0.0)
+        is_stopped = report_part(progress, 0.0)
         return is_stopped
 
     def report_light(progress: Progress) -> bool:
-        return tell(progress, progress.share)
+        return report_part(progress, progress.fraction)
 
     def report_world(progress: Progress) -> bool:
-        return tell(progress, after[0] + progress.share)
+        return report_part(progress, after[0] + progress.fraction)
 
     trained = prepared.train_as_asked(report_training)
     avatar = trained.path
-    tell(Progress(stage="Drawing the curve"), 0.0)
+    report_part(Progress(stage="Drawing the curve"), 0.0)
     lines = report_run(folder, latest.metrics)
     # whoever stops a training does not wait; `stga relight` finds the light out later
     if not is_stopped:
@@ -323,27 +323,27 @@ def avatar_file(request: Train | Refine | Extend) -> tuple[Path]:
     return (request.run / AVATAR,)
 
 
-def prepare(request: Training, report: Report, say: Say) -> Prepared:
+def prepare(request: Training, report: Report, log: Log) -> Prepared:
     """Check what is asked for, and decide what is trained and on which device. Raises StgaError."""
     if isinstance(request, Resume):
         flame = request.flame
         principal_point = request.principal_point
         opened = run_folder.open_run(request.run, request.capture, flame, principal_point)
         device, why = run_folder.device_of(opened.run, request.device)
-        say(why)
+        log(why)
         run = replace(opened.run, device=device)
         return Prepared(request, run, opened.capture, request.selection)
     refuse_run(request)
     if isinstance(request, Train):
-        return _new_run(request, report, say)
+        return _new_run(request, report, log)
     device, why = run_folder.device_of(run_folder.read_run(request.parent), request.device)
-    say(f"{why}\nrun: {request.run}")
+    log(f"{why}\nrun: {request.run}")
     begin: Any = _refinement if isinstance(request, Refine) else _extension
-    prepared: Prepared = begin(request, report, say)
+    prepared: Prepared = begin(request, report, log)
     return replace(prepared, run=replace(prepared.run, device=device))
 
 
-def _new_run(request: Train, report: Report, say: Say) -> Prepared:
+def _new_run(request: Train, report: Report, log: Log) -> Prepared:
     from ..raster.cpu.precompile import begin_compiling
     from ..training.effects.plan import plan_effects
 
@@ -353,7 +353,7 @@ def _new_run(request: Train, report: Report, say: Say) -> Prepared:
     device, why = choose_device(request.device)
     source = request.capture, request.flame, request.principal_point
     if request.repair and (repaired := repair_capture(*source)):
-        say(repaired)
+        log(repaired)
     opened = open_capture(*source)
     if opened.repair is not None:
         raise StgaError(next(text for text in opened.warnings if REPAIR_OPTION in text))
@@ -365,8 +365,8 @@ def _new_run(request: Train, report: Report, say: Say) -> Prepared:
     settings, plan = plan_effects(capture, request.settings, device)
     settings = with_budget(settings, len(capture.views.get("train", ())))
     if settings.iterations != request.settings.iterations:
-        say(f"Preset {settings.preset}: {settings.iterations} iterations")
-    say(why)
+        log(f"Preset {settings.preset}: {settings.iterations} iterations")
+    log(why)
     flame = None if request.flame is None else request.flame.resolve()
     run = Run(capture.root, flame, request.principal_point, settings, plan, device)
     run = replace(run, takes=_named_takes(every, 1, run))
@@ -404,7 +404,7 @@ def _named_takes(every: Sequence[Capture], first: int, run: Run) -> tuple[run_fo
     )
 
 
-def _refinement(request: Refine, report: Report, say: Say) -> Prepared:
+def _refinement(request: Refine, report: Report, log: Log) -> Prepared:
     """Raises StgaError without run, region or frames, or where no camera sees the region."""
     from ..training.run.continuation import continued_settings, is_faced
 
@@ -442,7 +442,7 @@ def _refinement(request: Refine, report: Report, say: Say) -> Prepared:
     return Prepared(request, run, capture, {capture.timesteps[0]: region}, avatar)
 
 
-def _extension(request: Extend, report: Report, say: Say) -> Prepared:
+def _extension(request: Extend, report: Report, log: Log) -> Prepared:
     from ..training.effects.plan import add_effects
     from ..training.run.continuation import continued_settings
 
@@ -451,11 +451,11 @@ def _extension(request: Extend, report: Report, say: Say) -> Prepared:
     capture, run = _joined_takes(request)
     budget = (request.seconds, request.iterations)
     settings = continued_settings(run.settings, "extend", request.growth, *budget, request.seed)
-    say(f"takes: {1 + len(run.takes)}")
+    log(f"takes: {1 + len(run.takes)}")
     settings, plan = add_effects(capture, settings, run.effect_plan)
     for old, new in zip(run.effect_plan, plan, strict=True):
         if new.on != old.on:
-            say(f"{new.effect}  {new}")
+            log(f"{new.effect}  {new}")
     run = replace(run, settings=settings, effect_plan=plan)
     return Prepared(request, run, capture, {}, avatar)
 

@@ -78,10 +78,10 @@ def _line(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return slope, a[0] - slope * a[1]
 
 
-def lit_shares(
+def lit_fractions(
     depth: np.ndarray, points: np.ndarray, bias: np.ndarray, step: float, lit: np.ndarray
 ) -> None:
-    """As `raster.cpu.shadow.lit_shares`; step: a whole number."""
+    """As `raster.cpu.shadow.lit_fractions`; step: a whole number."""
     size = len(depth)
     reach = int(step)
     border = 2 * reach + 3
@@ -105,19 +105,19 @@ def lit_shares(
         columns = _texel_weights(taps, x - left)
         for row, weight in _texel_weights(taps, y - top).items():
             open_ = np.zeros(len(z), np.float32)
-            for column, share in columns.items():
-                open_ += np.where(z <= flat.take(at + (row * width + column)), share, 0)
+            for column, fraction in columns.items():
+                open_ += np.where(z <= flat.take(at + (row * width + column)), fraction, 0)
             found += weight * open_
         lit[part] = found / np.float32(len(taps) ** 2)
 
 
-def _texel_weights(taps: tuple[int, ...], share: np.ndarray) -> dict[int, np.ndarray]:
-    """Of texels along an axis: where the taps at whole numbers, moved by the share (N,) of a texel,
-    look up linearly."""
+def _texel_weights(taps: tuple[int, ...], fraction: np.ndarray) -> dict[int, np.ndarray]:
+    """Of texels along an axis: where the taps at whole numbers, moved by the fraction (N,) of a
+    texel, look up linearly."""
     weights: dict[int, np.ndarray] = {}
     for tap in taps:
-        weights[tap] = weights.get(tap, np.float32(0)) + (1 - share)
-        weights[tap + 1] = weights.get(tap + 1, np.float32(0)) + share
+        weights[tap] = weights.get(tap, np.float32(0)) + (1 - fraction)
+        weights[tap + 1] = weights.get(tap + 1, np.float32(0)) + fraction
     return weights
 
 
@@ -140,7 +140,7 @@ def add_lights(
         view *= 1 / np.sqrt(np.maximum(_dot(view, view), np.float32(1e-20)))
         toward_eye = np.maximum(_dot(normal, view), MIN_FACING)
         alpha = roughness[part] ** 2
-        share = reflectance[part]
+        fraction = reflectance[part]
         arriving = np.zeros_like(view)
         reflected = np.zeros_like(view)
         for light in lights:
@@ -163,7 +163,7 @@ def add_lights(
             shadowing += toward_eye * np.sqrt(facing * facing * (1 - square) + square)
             fade = 1 - np.clip(_dot(view, half), 0, 1)
             fade_square = fade * fade
-            fresnel = share + (1 - share) * fade_square * fade_square * fade
+            fresnel = fraction + (1 - fraction) * fade_square * fade_square * fade
             least = np.float32(1e-12)
             gloss = square * fresnel / np.maximum(2 * np.pi * spread * spread * shadowing, least)
             strength *= np.where(alpha > 0, gloss, 0)

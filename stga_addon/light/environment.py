@@ -18,11 +18,12 @@ MIN_ROWS = 128
 MAX_SUNS = 4
 """Suns that are taken out of an environment."""
 SUN_CONTRAST = 12.0
-"""How much brighter than the mean of the environment a pixel must be to belong to a sun."""
+"""Brightness, relative to the environment's mean, above which a pixel belongs to a sun."""
 SUN_RADIUS = np.radians(12)
 """Angle from the brightest pixel within which bright ones are the same sun."""
 UPRIGHT = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
-"""From Blender's axes (z up) to those of a capture that is shown upright (y up, face along z)."""
+"""Rotation from Blender's axes (z up) to those of a capture that is shown upright (y up, face along
+z)."""
 
 
 def read_hdr(path: Path) -> np.ndarray:
@@ -83,12 +84,12 @@ def split_environment(
 def _coarser(image: np.ndarray, step: int) -> np.ndarray:
     """Means (H', W', 3), float64, over squares of about `step` pixels. Where step does not divide
     height or width, pixels on the edge of two squares are shared, so that none is lost."""
-    rows, columns = (_share_of_pixels(size, size // step) for size in image.shape[:2])
+    rows, columns = (_fraction_of_pixels(size, size // step) for size in image.shape[:2])
     wide = rows @ image.reshape(len(image), -1)
     return np.einsum("cw,rwk->rck", columns, wide.reshape(len(rows), -1, 3), dtype=np.float64)
 
 
-def _share_of_pixels(size: int, count: int) -> np.ndarray:
+def _fraction_of_pixels(size: int, count: int) -> np.ndarray:
     """(count, size) float32: weights of pixels in means over `count` equal parts of them."""
     edges = np.linspace(0, size, count + 1)[:, None]
     place = np.arange(size)

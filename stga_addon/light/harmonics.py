@@ -7,7 +7,7 @@ from ..avatar.splats import SH_C0, harmonics
 COUNT = 9
 
 DARK = 1e-5
-"""What counts as no light."""
+"""Radiance up to which there is no light."""
 LAMBERT = np.array([np.pi] + [2 * np.pi / 3] * 3 + [np.pi / 4] * 5)
 """Irradiance of an unoccluded surface: Σ LAMBERT · basis(normal) · radiance (Ramamoorthi 2001)."""
 GLOSSY = np.array([1.0] + [0.85] * 3 + [0.62] * 5)
@@ -47,8 +47,8 @@ def uniform(radiance: object) -> np.ndarray:
 
 
 def least_squares(rows: np.ndarray, values: np.ndarray, ridge: float) -> np.ndarray:
-    """(9,) light with which rows (M, 9) come nearest to values (M,), drawn to 0 by `ridge`, a share
-    of the mean of the normal equations' diagonal: some harmonics may give no light."""
+    """(9,) light with which rows (M, 9) come nearest to values (M,), drawn to 0 by `ridge`, a
+    fraction of the mean of the normal equations' diagonal: some harmonics may give no light."""
     matrix = rows.T @ rows
     matrix[np.diag_indices(COUNT)] += ridge * np.trace(matrix) / COUNT + DARK**2
     return np.linalg.solve(matrix, rows.T @ values)

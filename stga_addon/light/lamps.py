@@ -16,7 +16,7 @@ from .values import KINDS, Caster, Light, Lighting
 MAP_SIZE = 512
 """Texels a side of a light's shadow map, which just holds the head."""
 LIFT_M = 0.001
-"""How far points are lifted off the surface, so that it does not shade itself."""
+"""Distance by which points are lifted off the surface, so that it does not shade itself."""
 BIAS_M = 0.001
 """A surface shades what lies deeper by this, and on slopes by what its depth changes within the
 taps."""
@@ -142,13 +142,13 @@ class ShadowMap:
             sloped = bias + (step + 1) * self._view.texel_m * slope
             biases = np.asarray(np.minimum(sloped, max(bias, MAX_BIAS_M)), np.float32)
         places = np.nan_to_num(self._view.project(points), nan=-1e6)  # beside the map, and so lit
-        kernels("shadow").lit_shares(self.depth, places, biases, np.float32(step), found)
+        kernels("shadow").lit_fractions(self.depth, places, biases, np.float32(step), found)
         return found
 
 
 def kernels(name: str) -> Any:
-    """`raster.cpu.shade` (`add_lights`) or `.shadow` (`add_depths`, `lit_shares`), three times as
-    fast, where Numba's kernels are compiled, else NumPy's."""
+    """`raster.cpu.shade` (`add_lights`) or `.shadow` (`add_depths`, `lit_fractions`), three times
+    as fast, where Numba's kernels are compiled, else NumPy's."""
     if prefers_numba():
         return import_module(f"...raster.cpu.{name}", __name__)
     return array_kernels
@@ -223,8 +223,8 @@ def light_rows(light: Light, center: np.ndarray, shadow_map: int) -> np.ndarray:
         width = float(np.tan(light.angle / 2))
     elif light.kind == "area":
         distance = max(float(np.linalg.norm(light.position - center)), 1e-6)
-        share = max(light.size) / distance
-        side = FEW if share < 0.15 else SOME if share < 0.6 else MANY
+        fraction = max(light.size) / distance
+        side = FEW if fraction < 0.15 else SOME if fraction < 0.6 else MANY
         grid = (np.arange(side) + 0.5) / side - 0.5
         x, y = (axis.ravel() for axis in np.meshgrid(grid, grid))
         if light.shape == "ellipse":  # the square's points moved into the disk, of equal area each

@@ -29,13 +29,13 @@ RIDGE = 1e-6  # For meshes without light in some harmonics
 
 
 class Kept(NamedTuple):
-    """Colors are share · gain · recorded + (1 − share) · relit, all linear.
+    """Colors are fraction · gain · recorded + (1 − fraction) · relit, all linear.
 
-    share  0…1, of splats at which about as much arrives as in the capture (`kept_shares`)
+    fraction  0…1, of splats at which about as much arrives as in the capture (`kept_fractions`)
     gain   (3,) the scene's light over the capture's
     """
 
-    share: float
+    fraction: float
     gain: np.ndarray
 
 
@@ -49,13 +49,13 @@ def kept(recorded: np.ndarray, distant: np.ndarray) -> Kept:
     return Kept(1 - float(_smooth_step(np.asarray(difference / UNLIKE_LIGHT))), gain)
 
 
-def kept_shares(kept: Kept, arriving: np.ndarray, irradiance: np.ndarray) -> np.ndarray:
+def kept_fractions(kept: Kept, arriving: np.ndarray, irradiance: np.ndarray) -> np.ndarray:
     """(N,) float32 of what arrives at splats now, and of what arrived in the capture (N, 3)."""
     same = np.asarray(kept.gain, np.float32) * irradiance
     square = row_dot(arriving - same, arriving - same)
     unlike = np.sqrt(square / np.maximum(row_dot(same, same), np.float32(1e-12)))
     step = _smooth_step((unlike - ALIKE_AT_SPLAT) / (UNLIKE_AT_SPLAT - ALIKE_AT_SPLAT))
-    return np.asarray(kept.share * (1 - step), np.float32)
+    return np.asarray(kept.fraction * (1 - step), np.float32)
 
 
 def _smooth_step(values: np.ndarray) -> np.ndarray:
@@ -74,16 +74,16 @@ REFLECTANCE = 0.04
 """Reflectance of skin, eyes and teeth seen straight on: a refractive index of 1.5."""
 MIN_IRRADIANCE = 0.15
 """Least irradiance that color is divided by, as a fraction of its mean: noise."""
-HIGHLIGHT_SHARE = 0.034
+HIGHLIGHT_FRACTION = 0.034
 """Fraction of what arrived in the capture that came back as highlights from skin; it is taken from
 recorded colors."""
-WET_HIGHLIGHT_SHARE = 0.14
+WET_HIGHLIGHT_FRACTION = 0.14
 """The same from wet eyes."""
-MIN_DIFFUSE_SHARE = 0.1
+MIN_DIFFUSE_FRACTION = 0.1
 """Fraction of recorded colors that remains at least."""
 VIEW_MEANS = (1.0, 0.65, 0.195, -0.089375)
-"""By degree, harmonics' mean over directions that see a surface (cosine above 0.3), over their
-value straight from the front: what recorded colors are."""
+"""Degree -> mean of its harmonics over directions that see a surface (cosine above 0.3), relative
+to their value straight from the front. Recorded colors are such means."""
 
 
 class Relighter:
@@ -107,7 +107,7 @@ class Relighter:
 
     @cached_property
     def occlusion(self) -> np.ndarray:
-        """(N,) share of the sky that is open."""
+        """(N,) fraction of the sky that is open."""
         return self._at_splats(self.light.occlusion[:, None])[:, 0]
 
     @cached_property
@@ -169,13 +169,13 @@ class Relighter:
         self, mesh: np.ndarray, eye: np.ndarray, lighting: Lighting, casters: Sequence[Caster] = ()
     ) -> np.ndarray:
         """(N, 3) float32: the same before sRGB's curve, for a scene's own color management."""
-        share = {"recorded": 0.0, "mix": lighting.mix, "scene": 1.0}[lighting.mode]
-        if not share:
+        fraction = {"recorded": 0.0, "mix": lighting.mix, "scene": 1.0}[lighting.mode]
+        if not fraction:
             return self._recorded(mesh, eye)
         mesh, eye = (np.asarray(points, np.float64) for points in (mesh, eye))
         lit = self._lit(mesh, eye, lighting, casters)
         lit *= np.float32(2**lighting.exposure) / np.asarray(lighting.white, np.float32)
-        return lit if share == 1 else share * lit + (1 - share) * self._recorded(mesh, eye)
+        return lit if fraction == 1 else fraction * lit + (1 - fraction) * self._recorded(mesh, eye)
 
     def distant_in_head(self, mesh: np.ndarray, lighting: Lighting) -> tuple[np.ndarray, Kept]:
         """(9, 6) of the world, and of it with lamps far away, in the neutral mesh's axes for a
@@ -192,14 +192,14 @@ class Relighter:
         found = kept(self.recorded_light, both[:, 3:])
         # Other highlights than the capture's are asked for.
         for factor in (lighting.specular, lighting.roughness / SKIN_ROUGHNESS):
-            found = found._replace(share=found.share * max(0.0, 1 - abs(factor - 1)))
+            found = found._replace(fraction=found.fraction * max(0.0, 1 - abs(factor - 1)))
         return both.astype(np.float32), found
 
     def _lit(
         self, mesh: np.ndarray, eye: np.ndarray, lighting: Lighting, casters: Sequence[Caster]
     ) -> np.ndarray:
         vertex_normal = vertex_normals(mesh, self.avatar.faces)
-        distant, likeness = self.distant_in_head(mesh, lighting)
+        distant, kept = self.distant_in_head(mesh, lighting)
         world = distant[:, :3]
         casters = (*casters, *self.lash_casters(mesh, lighting))
         lamps = Lamps(lighting, mesh, self.avatar.faces, casters)
@@ -231,18 +231,18 @@ class Relighter:
         albedo = self.albedo if color is self.diffuse_color else self._albedo(color)
         lit = albedo * arriving * np.float32(1 / np.pi)
         lit += np.float32(lighting.specular) * highlight
-        if likeness.share > 0:
-            same = np.asarray(likeness.gain, np.float32) * self._recorded(mesh, eye)
-            lit += kept_shares(likeness, arriving, self.irradiance)[:, None] * (same - lit)
+        if kept.fraction > 0:
+            same = np.asarray(kept.gain, np.float32) * self._recorded(mesh, eye)
+            lit += kept_fractions(kept, arriving, self.irradiance)[:, None] * (same - lit)
         return lit
 
     def _albedo(self, color: np.ndarray) -> np.ndarray:
         """(N, 3) of recorded sRGB (N, 3) without what depends on the view."""
         linear = srgb_to_linear(np.maximum(color, 0))
-        wet = np.float32(WET_HIGHLIGHT_SHARE)
-        skin = np.float32(HIGHLIGHT_SHARE)
+        wet = np.float32(WET_HIGHLIGHT_FRACTION)
+        skin = np.float32(HIGHLIGHT_FRACTION)
         highlight = np.where(self.roughness > 0, wet, skin)[:, None] * self.irradiance / np.pi
-        diffuse = np.maximum(linear - highlight, MIN_DIFFUSE_SHARE * linear)
+        diffuse = np.maximum(linear - highlight, MIN_DIFFUSE_FRACTION * linear)
         albedo = np.pi * diffuse / self.irradiance
         damping = self.light.damping
         if damping:

@@ -7,8 +7,8 @@ from . import lamps, relight, values
 
 _CONSTANTS = {"MAP_SIZE": lamps.MAP_SIZE, "LIFT": lamps.LIFT_M, "BIAS": lamps.BIAS_M}
 _CONSTANTS |= {"MAX_BIAS": lamps.MAX_BIAS_M, "TAP_STEP": lamps.TAP_STEP, "PI": 3.14159265358979}
-_SHARES = "HIGHLIGHT_SHARE", "WET_HIGHLIGHT_SHARE", "MIN_DIFFUSE_SHARE"
-for _name in ("REFLECTANCE", *_SHARES, "ALIKE_AT_SPLAT", "UNLIKE_AT_SPLAT"):
+_FRACTIONS = "HIGHLIGHT_FRACTION", "WET_HIGHLIGHT_FRACTION", "MIN_DIFFUSE_FRACTION"
+for _name in ("REFLECTANCE", *_FRACTIONS, "ALIKE_AT_SPLAT", "UNLIKE_AT_SPLAT"):
     _CONSTANTS[_name] = getattr(relight, _name)
 _CONSTANTS["SKIN_ROUGHNESS"] = values.SKIN_ROUGHNESS
 _CONSTANTS |= {f"VIEW_MEAN_{degree}": mean for degree, mean in enumerate(relight.VIEW_MEANS)}

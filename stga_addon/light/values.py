@@ -31,7 +31,7 @@ class Light:
     tangent    (3,) along the width of an area light
     shape      one of SHAPES: an ellipse fills the rectangle of `size`
     cone       radians, of a spot: full angle, as Blender's `spot_size`
-    blend      0…1, of a spot: share of the cone that fades out, as Blender's `spot_blend`
+    blend      0…1, of a spot: fraction of the cone that fades out, as Blender's `spot_blend`
     casts_shadow  whether it is blocked by head and casters
     diffuse, specular  factors of what it adds to diffuse color and to highlights, as Blender's
     """
@@ -80,7 +80,7 @@ class Lighting:
     world      (9, 3) harmonics (`harmonics.basis`) of the world's radiance by direction of sight
     lights     see `Light`; an environment's sun is one of them (`environment.split_environment`)
     mode       "recorded": colors as trained, to the bit; "scene": relit; "mix": between both
-    mix        share of "scene" in "mix", 0…1, in linear light
+    mix        fraction of "scene" in "mix", 0…1, in linear light
     exposure   stops (powers of two) by which relit colors are made brighter
     white      (3,) linear color that the capture shows of what is white under its own light,
                relative to the estimate: relit colors are divided by it (the eyedropper)

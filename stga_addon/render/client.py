@@ -26,7 +26,7 @@ from ..worker.messages import receive, send
 from .device import Composer
 
 REQUIRED_PACKAGES = ("numba", "platformdirs")
-"""What the kernels need beside numpy, by the names of the packages."""
+"""Packages that the kernels need beside numpy."""
 SPLAT_FIELDS = [field.name for field in fields(Splats)]
 FRAME_FIELDS = [field.name for field in fields(FaceFrames)]
 

@@ -15,7 +15,7 @@ if TYPE_CHECKING:  # without a GPU, choosing needs numpy only
     from ..raster.gpu.trial import Trial
 
 GPU = "gpu:"
-"""Before the adapter's name in a device."""
+"""Prefix of the adapter's name in a device."""
 DEVICES = ("auto", "cpu", "gpu")
 """Choices of `choose_device`, beside "gpu:NAME"."""
 EXPECTED_DEVICE = "auto, cpu, gpu or gpu:NAME"
@@ -124,8 +124,8 @@ def _comparison(trial: "Trial") -> str:
     times = f"{1e3 * trial.device_s:.1f} and {1e3 * trial.cpu_s:.1f} ms an image"
     faster = trial.cpu_s / trial.device_s
     slower = trial.device_s / trial.cpu_s
-    share = f"{faster:.1f} times as fast as" if faster > 1 else f"{slower:.1f} times slower than"
-    return f"{share} the CPU in a trial ({times})"
+    fraction = f"{faster:.1f} times as fast as" if faster > 1 else f"{slower:.1f} times slower than"
+    return f"{fraction} the CPU in a trial ({times})"
 
 
 def _wrong(adapter: str, trial: "Trial") -> str:

@@ -10,7 +10,7 @@ from .compat import action_curves
 from .evaluation import evaluated, kept_evaluated
 
 Z_UP_TO_Y_UP = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
-"""From Blender's axes to those of captures: (x, y, z) is (x, z, -y)."""
+"""Rotation from Blender's axes to those of captures: (x, y, z) is (x, z, -y)."""
 
 
 def read_values(items: Any, field: str, width: int, dtype: Any = np.float32) -> np.ndarray:

@@ -30,10 +30,11 @@ from .objects import (
 from .rig.head import import_head
 
 DISTANCE = 2.2
-"""From the viewport's eye to the head's center, in radii of the sphere around its bounding box."""
+"""Distance from the viewport's eye to the head's center, in radii of the sphere around its bounding
+box."""
 
 GAP_M = 0.1
-"""Between heads beside each other."""
+"""Distance between neighboring heads."""
 
 
 def frame_head(head: Any, camera: Any, screens: Iterable[Any]) -> None:

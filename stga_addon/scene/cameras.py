@@ -26,8 +26,8 @@ ORTHOGRAPHIC_DISTANCE = 1000.0
 
 def image_size(render: Any) -> tuple[int, int]:
     """Width and height in pixels of final images by a scene's render settings."""
-    share = render.resolution_percentage / 100
-    return max(1, int(render.resolution_x * share)), max(1, int(render.resolution_y * share))
+    fraction = render.resolution_percentage / 100
+    return max(1, int(render.resolution_x * fraction)), max(1, int(render.resolution_y * fraction))
 
 
 class Eye(NamedTuple):

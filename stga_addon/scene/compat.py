@@ -159,13 +159,13 @@ STRIP_FIELDS = (
     "influence",
     "mute",
 )
-"""What `keep_animation` keeps of an NLA strip, in an order in which it can be set."""
+"""Fields of an NLA strip that `keep_animation` keeps, in an order in which they can be set."""
 
 
 TRACK_FIELDS = ("name", "mute", "is_solo", "lock")
-"""What is kept of an NLA track."""
+"""Fields of an NLA track that are kept."""
 ACTION_FIELDS = ("action_blend_type", "action_extrapolation", "action_influence")
-"""What is kept of how an owner's action acts on the strips below."""
+"""Kept fields that say how an owner's action acts on the strips below."""
 STRIP_CURVES = ("influence", "strip_time")
 """Values of a strip that may have keyframes of their own."""
 

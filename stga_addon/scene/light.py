@@ -46,7 +46,7 @@ class LightingSettings(bpy.types.PropertyGroup):  # type: ignore[misc]
     )
     mix: bpy.props.FloatProperty(
         name="Mix",
-        description="Share of the scene's light",
+        description="Fraction of the scene's light",
         default=0.5,
         min=0.0,
         max=1.0,

@@ -23,7 +23,8 @@ log_warning: Warn = logging.getLogger(__name__).warning
 
 
 AVATAR_SUFFIX = re.compile(r" avatar(?=( \d+)?$)")
-"""Of a folder for capture and run of a video (`operators.track.proposed_folder`)."""
+"""End of the name of a folder with a video's capture and run
+(`operators.track.proposed_folder`)."""
 
 
 IMPORTED_AVATAR = re.compile(r"(.+)_avatar(?:_\d+)?")
@@ -288,7 +289,7 @@ class SceneView:
 
 
 RENDER_INTERVAL_S = 0.2
-"""Between two looks whether Blender still renders."""
+"""Time between two checks whether Blender still renders."""
 
 
 def is_rendering() -> bool:
@@ -336,11 +337,11 @@ def go_to_frame(frame: int) -> None:
     bpy.context.view_layer.update()
 
 
-def show_progress(share: float) -> None:
+def show_progress(fraction: float) -> None:
     """At the mouse pointer, between `progress_begin(0, 1)` and `progress_end`. Nothing without a
     display, where Blender crashes once a file has brought a window."""
     if not bpy.app.background:
-        bpy.context.window_manager.progress_update(share)
+        bpy.context.window_manager.progress_update(fraction)
 
 
 def iterate_frames(

@@ -1,5 +1,5 @@
-"""Per-frame selections as vertex groups, to view, paint and scrub through; shares of selection, or
-errors, by triangle as colors. A triangle counts as selected when its three vertices are in the
+"""Per-frame selections as vertex groups, to view, paint and scrub through; fractions of selection,
+or errors, by triangle as colors. A triangle counts as selected when its three vertices are in the
 group: what is written and read back gains triangles whose corners all belong to selected ones."""
 
 from collections.abc import Mapping, Sequence
@@ -140,7 +140,7 @@ def _read_faces(head: Any, groups: list[int]) -> list[np.ndarray]:
     return list(in_group[:, mesh_triangles(head.data)].all(2))
 
 
-SHARE = "stga_selected_share"  # on faces: fraction of the frames that select them
+FRACTION = "stga_selected_share"  # on faces: fraction of the frames that select them
 RESIDUAL = "stga_residual"  # on faces: mean absolute error (0…1) of what their splats show
 HEAT = "stga_heat"  # on face corners: one of these as a color, relative to the largest
 MODIFIER = "STGA Heat Map"
@@ -152,11 +152,11 @@ BLUE = (0.1, 0.3, 0.6, 0.1, 0.02, 0.01)
 
 
 def show_heat_map(
-    head: Any, values: np.ndarray, attribute: str = SHARE, largest: float | None = None
+    head: Any, values: np.ndarray, attribute: str = FRACTION, largest: float | None = None
 ) -> None:
     """Color the head's triangles by values (F,) from 0 to `largest` (None: the largest value),
-    stored as `attribute` (SHARE or RESIDUAL): as the active color attribute, for solid shading, and
-    by a modifier with a material, for EEVEE and Cycles; its own materials stay."""
+    stored as `attribute` (FRACTION or RESIDUAL): as the active color attribute, for solid shading,
+    and by a modifier with a material, for EEVEE and Cycles; its own materials stay."""
     hide_heat_map(head)
     whole = values.max(initial=0.0) if largest is None else largest
     scaled = np.minimum(values / max(whole, 1e-9), 1.0)
@@ -183,7 +183,7 @@ def hide_heat_map(head: Any) -> None:
     """Show the head as it was before `show_heat_map`."""
     for modifier in [old for old in head.modifiers if old.name.startswith(MODIFIER)]:
         head.modifiers.remove(modifier)
-    for name in (SHARE, RESIDUAL, HEAT):
+    for name in (FRACTION, RESIDUAL, HEAT):
         if name in head.data.attributes:
             head.data.attributes.remove(head.data.attributes[name])
 

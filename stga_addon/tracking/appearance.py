@@ -1,4 +1,4 @@
-"""Appearance of a head's surface points: sampled in image pyramids, freed of lighting, averaged."""
+"""Appearance of a head's surface points: sampled in image pyramids, without lighting, averaged."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -22,7 +22,7 @@ CHANNEL_WEIGHTS = np.array([0.5, 1.5, 0.7])
 NOISE_LEVELS = 6.0
 """Standard deviation, of 255, of a pixel from the texture on skin that is followed exactly."""
 LIGHT_PRIOR = 0.02
-"""Weight of the camera's mean lighting in a view's, as a share of the points' information."""
+"""Weight of the camera's mean lighting in a view's, as a fraction of the points' information."""
 LIGHT_ITERATIONS = 2
 """Reweighted least squares fits of the light."""
 TEXTURE_ITERATIONS = 4
@@ -32,11 +32,11 @@ MEAN_ITERATIONS = 3
 ALBEDO_SCALE = 6 * NOISE_LEVELS
 """Difference from skin of one color, in levels, beyond which pixels are outliers."""
 TEXTURE_SCALE = 4 * NOISE_LEVELS
-"""The same from the texture while it is being averaged."""
+"""The same for the difference from the texture while it is being averaged."""
 LIGHT_SCALE = 2 * NOISE_LEVELS
-"""The same from the texture where the light is fitted."""
+"""The same for the difference from the texture where the light is fitted."""
 MEAN_SCALE = 3 * NOISE_LEVELS
-"""The same from a mean."""
+"""The same for the difference from a mean."""
 MIN_SHADING = 0.2
 """Least factor of the light on a texture."""
 MAX_SHADING = 4.0
@@ -48,7 +48,7 @@ MAX_DEVIATION_LEVELS = 60.0
 """Largest difference, in levels, that counts in a texture's mean deviation."""
 MAX_SAMPLES = 1 << 14
 """Samples of an image at a time: OpenCV takes fewer than 2^15."""
-POINT_SHARE = 0.25
+POINT_FRACTION = 0.25
 """Weight of a point in a view: neighboring points share pixels."""
 OUTLIER_SQUARED = 4.0, 4.0, 16.0, 16.0
 """Squared difference in NOISE_LEVELS at which a point is explained by half, for each level."""
@@ -58,7 +58,7 @@ FLOW_POINTS = 2
 """Level of the pyramid whose points optical flow moves."""
 FLOW_ITERATIONS = 4
 """Gauss–Newton steps with a flow."""
-FLOW_SHARE = 0.3
+FLOW_FRACTION = 0.3
 """Weight of a point's flow of 1 pixel."""
 FLOW_SCALE_PX = 2.0
 """Distance beyond which a point's flow is an outlier."""
@@ -178,8 +178,8 @@ def box_of(where: np.ndarray, margin: int) -> tuple[slice, slice]:
 def mean_around(
     image: np.ndarray, known: np.ndarray, deviations: Sequence[float], places: np.ndarray
 ) -> np.ndarray:
-    """(N, 3) float32 mean of pixels that are known, (H, W) 0 or 1, around places (N, 2), rows and
-    columns; those far away where none is near.
+    """(N, 3) float32 mean of the known pixels, (H, W) 0 or 1, around places (N, 2), rows and
+    columns; the mean of those far away where none is near.
 
     deviations: standard deviations, in pixels, of the near and the far neighborhood.
     """
@@ -203,7 +203,7 @@ def mean_around(
 
 
 def reduced(image: np.ndarray, size: tuple[int, ...]) -> np.ndarray:
-    """The image's means over the areas of a smaller one's pixels; by halves, which is fast."""
+    """The image at a smaller size: means over the areas of its pixels, by halves, which is fast."""
     import cv2
 
     while not any(
@@ -233,8 +233,8 @@ def projection_derivative(camera: Camera, points: np.ndarray) -> np.ndarray:
 
 
 def flow_targets(at: np.ndarray, before: Views, now: Views) -> Any:
-    """(key, camera, pixels (M, 2) to which optical flow (DIS, Kroeger et al. 2016) moves points at
-    `at` (M, 3)) of each camera that saw both timesteps."""
+    """(key, camera, pixels (M, 2)) of each camera that saw both timesteps: the pixels to which
+    optical flow (DIS, Kroeger et al. 2016) moves points at `at` (M, 3)."""
     import cv2
 
     opencv: Any = cv2  # whose type stubs lack DIS
@@ -303,22 +303,22 @@ def robust(residual: np.ndarray, scale: float) -> np.ndarray:
 
 
 def point_weights(residual: np.ndarray, level: int) -> np.ndarray:
-    """(M,) of points whose channels differ from a view's by (M, 3) NOISE_LEVELS."""
-    share = residual**2 @ CHANNEL_WEIGHTS / OUTLIER_SQUARED[level]
-    return POINT_SHARE / (1 + share) ** 2
+    """(M,) weights of points whose channels differ from a view's by (M, 3) NOISE_LEVELS."""
+    fraction = residual**2 @ CHANNEL_WEIGHTS / OUTLIER_SQUARED[level]
+    return POINT_FRACTION / (1 + fraction) ** 2
 
 
 def unexplained(
     residual: np.ndarray, level: int, weights: np.ndarray = CHANNEL_WEIGHTS
 ) -> np.ndarray:
-    """(M,) from 0 where images explain points to 1, of differences (M, 3) in NOISE_LEVELS."""
+    """(M,) from 0, images explain the points, to 1, for differences (M, 3) in NOISE_LEVELS."""
     squared = residual**2 @ weights
     return squared / (OUTLIER_SQUARED[level] + squared)
 
 
 def flow_weights(miss: np.ndarray) -> np.ndarray:
-    """(M,) of points that lie (M, 2) pixels from where optical flow moves them."""
-    return FLOW_SHARE * robust(np.linalg.norm(miss, axis=1), FLOW_SCALE_PX)
+    """(M,) weights of points that lie (M, 2) pixels from where optical flow moves them."""
+    return FLOW_FRACTION * robust(np.linalg.norm(miss, axis=1), FLOW_SCALE_PX)
 
 
 def average_texture(samples: Sequence[Sample]) -> Texture:
@@ -354,11 +354,11 @@ def average_texture(samples: Sequence[Sample]) -> Texture:
     by_camera: dict[bytes, list[np.ndarray]] = {}
     for name in lights:  # what one camera sees, drawn to what all do
         rows = [row for row, own in enumerate(samples) if own.camera == name]
-        share = weight[rows].sum(0)[:, None]
+        fraction = weight[rows].sum(0)[:, None]
         by_camera[name] = []
         for level, every in enumerate(values):
             mean = _robust_mean([lit[row][level] for row in rows], weight[rows], every)
-            mean = (share * mean + OWN_VIEW_PRIOR * every) / (share + OWN_VIEW_PRIOR)
+            mean = (fraction * mean + OWN_VIEW_PRIOR * every) / (fraction + OWN_VIEW_PRIOR)
             by_camera[name].append(mean)
     return Texture(by_camera, lights, trust)
 
@@ -366,16 +366,16 @@ def average_texture(samples: Sequence[Sample]) -> Texture:
 def _robust_mean(
     values: Sequence[np.ndarray], weight: np.ndarray, start: np.ndarray | None = None
 ) -> np.ndarray:
-    """(N, 3) of M values (N, 3) with weights (M, N), from the weighted median on; outliers by
-    detail and redness."""
+    """(N, 3) mean of M values (N, 3) with weights (M, N), starting at the weighted median; outliers
+    by detail and redness count less."""
     stacked = np.stack(values)
     mean = start
     if mean is None:
         order = np.argsort(stacked, axis=0)
         ordered = np.take_along_axis(stacked, order, axis=0)
         weights = np.repeat(weight[..., None], stacked.shape[2], 2)
-        share = np.cumsum(np.take_along_axis(weights, order, axis=0), axis=0)
-        middle = np.minimum((share < 0.5 * share[-1:]).sum(0), len(values) - 1)
+        fraction = np.cumsum(np.take_along_axis(weights, order, axis=0), axis=0)
+        middle = np.minimum((fraction < 0.5 * fraction[-1:]).sum(0), len(values) - 1)
         mean = np.take_along_axis(ordered, middle[None], axis=0)[0]
     for _ in range(MEAN_ITERATIONS):
         used = weight * robust(np.abs(stacked - mean)[..., 1:].max(2), MEAN_SCALE)

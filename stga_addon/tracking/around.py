@@ -22,14 +22,14 @@ from . import folder
 from .face_networks import FaceNetworks, PersonNetwork
 from .fit import pose_from_one_camera
 from .footage.model import Footage, FootageCamera, ImageFrames
-from .footage.open import usual_focal
+from .footage.open import typical_focal
 from .footage.shots import listed
 from .footage.video import VideoFrames
 from .landmarks import read_places
 from .opened import check_place, file_state
 from .recorded import BUNDLED_PLACES
 from .sharp_frames import choose_frames, reduced_to
-from .stages import Crew, Stage
+from .stages import Stage, Workers
 from .structure_from_motion import SearchOptions, Structure, find_structure
 
 MAX_PHOTOS = 60
@@ -38,14 +38,14 @@ FRAMES = 40
 """Frames of a video that get a camera: some 5° apart in half a circle."""
 MIN_IMAGES = 8
 """Images with a camera, below which the take is not one of many cameras."""
-MIN_IMAGES_SHARE = 0.5
+MIN_IMAGES_FRACTION = 0.5
 """Of the images that were looked at."""
 MIN_ON_HEAD = 30
 """Points on the face, below which it was the room alone whose structure was found."""
 TIME_LIMIT_S = 900.0
-"""Of structure from motion."""
+"""Longest time of structure from motion."""
 MAX_THREADS = 8
-"""That COLMAP uses: each takes up to 300 MB."""
+"""Largest number of threads of COLMAP: each takes up to 300 MB."""
 REMEDY = (
     "film in even light and without blur, in steps of at most 15° around a head that keeps still, "
     "before a room with detail"
@@ -60,10 +60,11 @@ MIN_TURN_DEG = 30.0
 """Largest angle between two poses of the head before the camera, below which nobody walked around
 it."""
 MAX_AXIS_COSINE = -0.1
-"""Between the head's axes up and ahead and the camera's down and ahead, of a face that is seen."""
+"""Largest cosine between the head's axes up and ahead and the camera's axes down and ahead, of a
+face that is visible."""
 PAIR_S = 0.5
-"""Between the two frames of a video in which the room is compared."""
-USUAL_FPS = 30.0
+"""Time between the two frames of a video in which the room is compared."""
+TYPICAL_FPS = 30.0
 """Frames per second where a take does not say."""
 PAIR_TURN_DEG = 1.0, 25.0
 """Turns of the head between two frames that are compared."""
@@ -74,31 +75,31 @@ MIN_PAIRS = 3
 MATCH_RATIO = 0.75
 """Lowe's ratio test."""
 MAX_LIP_CHANGE = 0.08
-"""Of photos without a room, `Recognition.lip_change` beyond which the face is no still one: that of
-three still people, seen from 85° around, is .004, .016 and .022, that of a talk .21."""
+"""Largest `Recognition.lip_change` of a still face in photos without a room: three still people,
+seen from 85° around, have .004, .016 and .022, a talking one .21."""
 INNER_LIPS = 13, 14
 """Landmarks of the middle of the upper and the lower lip, where they meet."""
 EYE_CORNERS = 33, 263
 """Landmarks of the outer corners of the eyes."""
 FACE_MARGIN = 0.6
-"""Of the face's size, around it, which is no part of the room."""
+"""Margin around the face that does not belong to the room, in sizes of the face."""
 PERSON_PROBABILITY = 0.3
-"""From which on a pixel is no part of the room."""
+"""Probability of a person above which a pixel does not belong to the room."""
 MIN_PARALLAX = 0.2
 """Radians that the room moves behind the head for each radian by which the head turns before the
 camera; 0 of a camera that stands still, 1 − (distance of the head / distance of the room) of one
 that goes around."""
 MIN_CORRELATION = 0.6
-"""Of the room's motion with the head's turns, below which a hand shook the camera."""
+"""Correlation of the room's motion with the head's turns below which a hand shook the camera."""
 
 
 class CamerasNotFound(StgaError):
-    """Structure from motion gives no cameras; says why, and what helps."""
+    """Structure from motion gives no cameras; the message names the reason and what helps."""
 
 
 @dataclass(frozen=True)
 class Recognition:
-    """What frames of a single camera say of the take.
+    """What frames of a single camera show about the take.
 
     turn_deg     largest angle between two poses of the head before the camera
     parallax     as MIN_PARALLAX; NaN where too little of a room is seen
@@ -124,10 +125,10 @@ class Recognition:
 
 
 def with_found_cameras(
-    footage: Footage, out: Path, take: str, crew: Crew
+    footage: Footage, out: Path, take: str, workers: Workers
 ) -> tuple[Footage, tuple[str, ...]]:
-    """The footage of a single camera without a calibration, as that of a camera for each image
-    where it was filmed around a still head; and sentences about that.
+    """The footage of a single camera without a calibration and, if it was filmed around a still
+    head, with a camera for each image; and sentences about that.
 
     out: folder of the capture, in which what an interruption leaves is kept. take: "auto",
     "around" or "talk". Raises StgaError for a folder that is no place for a capture, and
@@ -143,15 +144,15 @@ def with_found_cameras(
             raise CamerasNotFound(
                 f"{footage.root}: --take around: has {count} images, expected at least {MIN_IMAGES}"
             )
-        found, line = _with_cameras(footage, out, crew)
+        found, line = _with_cameras(footage, out, workers)
         return found, (f"take: around a still head, as given; {line}",)
-    kind, why = take_of(footage, crew)
+    kind, why = take_of(footage, workers)
     if kind == "talk":
         return footage, (
             f"take: a head that moves before a camera ({why}; else give --take around)",
         )
     try:
-        found, line = _with_cameras(footage, out, crew)
+        found, line = _with_cameras(footage, out, workers)
     except StgaError as error:
         warning = (
             f"take: looks like one around a still head, but {error}. It is tracked as one of a "
@@ -161,8 +162,8 @@ def with_found_cameras(
     return found, (f"take: around a still head ({why}; else give --take talk); {line}",)
 
 
-def take_of(footage: Footage, crew: Crew) -> tuple[str, str]:
-    """What was filmed, "around" a still head or else "talk"; and why, in a clause."""
+def take_of(footage: Footage, workers: Workers) -> tuple[str, str]:
+    """The kind of take, "around" a still head or else "talk"; and the reason, in a clause."""
     if footage.focal == "calibration":
         several = len(footage.cameras) >= MIN_IMAGES
         return "around" if several else "talk", f"{len(footage.cameras)} calibrated cameras"
@@ -170,7 +171,7 @@ def take_of(footage: Footage, crew: Crew) -> tuple[str, str]:
     count = len(camera.timesteps)
     if count < MIN_IMAGES:
         return "talk", f"{count} images"
-    seen = _recognized(footage, camera, crew)
+    seen = _recognized(footage, camera, workers)
     photos = isinstance(camera.frames, ImageFrames) and count <= MAX_PHOTOS
     is_plain = photos and seen.turns and bool(np.isnan(seen.parallax))
     plain_photos = is_plain and seen.lip_change <= MAX_LIP_CHANGE
@@ -184,7 +185,7 @@ def take_of(footage: Footage, crew: Crew) -> tuple[str, str]:
     return "talk", why + (", but the room does not move with it" if seen.turns else "")
 
 
-def _with_cameras(footage: Footage, out: Path, crew: Crew) -> tuple[Footage, str]:
+def _with_cameras(footage: Footage, out: Path, workers: Workers) -> tuple[Footage, str]:
     """The footage with a camera for each image, and a line on these. Raises CamerasNotFound."""
     (camera,) = footage.cameras
     if find_spec("pycolmap") is None:
@@ -192,7 +193,7 @@ def _with_cameras(footage: Footage, out: Path, crew: Crew) -> tuple[Footage, str
             f"{footage.root}: finding cameras needs the package pycolmap, which this Python lacks; "
             "install it, or give --cameras"
         )
-    timesteps = _chosen(camera, crew)
+    timesteps = _chosen(camera, workers)
     given = footage.focal != "usual"
     focal = camera.camera.fl_x if given else None
     threads = min(processors(), MAX_THREADS)
@@ -202,17 +203,17 @@ def _with_cameras(footage: Footage, out: Path, crew: Crew) -> tuple[Footage, str
     scratch = out / folder.KEPT_FOLDER / f"structure-{file_state(camera.frames.files)}"
     part = (camera, timesteps, options, scratch)
     stages = [(stage, len(timesteps)) for stage in _SEARCH_STAGES]
-    report = _Stages(crew, stages, footage)
-    found = crew.helpers.run(find_structure, part, report, keep=True, apart=True)
+    report = _Stages(workers, stages, footage)
+    found = workers.helpers.run(find_structure, part, report, keep=True, apart=True)
     structure = Structure.of_arrays(found)
     _require_cameras(footage, structure, len(timesteps))
     cameras = _cameras(camera, structure)
     count = f"{len(cameras)} of {len(timesteps)} images"
-    share = structure.on_head / structure.points
+    fraction = structure.on_head / structure.points
     lens = f"focal length {structure.focal_px:.0f} px"
     lens += f", distortion {structure.distortion:.3f}" if structure.distortion else ""
     line = (
-        f"cameras of {count} found, {lens}, {structure.error_px:.2f} px; {share:.0%} of "
+        f"cameras of {count} found, {lens}, {structure.error_px:.2f} px; {fraction:.0%} of "
         f"{structure.points} points are on the face"
     )
     line += "; the room was left out, as it did not turn with the person" * structure.masked
@@ -231,8 +232,10 @@ class _Stages:
     """Reports the steps of work that has several stages, as (stage, steps), one after another.
     Raises CamerasNotFound beyond TIME_LIMIT_S."""
 
-    def __init__(self, crew: Crew, stages: Sequence[tuple[Stage, int]], footage: Footage) -> None:
-        self._crew = crew
+    def __init__(
+        self, workers: Workers, stages: Sequence[tuple[Stage, int]], footage: Footage
+    ) -> None:
+        self._workers = workers
         self._stages = stages
         self._root = footage.root
         self._end = monotonic() + TIME_LIMIT_S
@@ -245,33 +248,33 @@ class _Stages:
             )
         for stage, total in self._stages[:-1]:
             if steps < total:
-                self._crew.report(stage, steps, total)
+                self._workers.report(stage, steps, total)
                 return
             steps -= total
         stage, total = self._stages[-1]
-        self._crew.report(stage, min(steps, total), total)
+        self._workers.report(stage, min(steps, total), total)
 
 
-def _chosen(camera: FootageCamera, crew: Crew) -> list[int]:
+def _chosen(camera: FootageCamera, workers: Workers) -> list[int]:
     """Timesteps whose images get a camera."""
     timesteps = list(camera.timesteps)
     limit = MAX_PHOTOS if isinstance(camera.frames, ImageFrames) else FRAMES
     if len(timesteps) <= limit:
         return timesteps
     total = len(timesteps)
-    found = crew.helpers.run(
+    found = workers.helpers.run(
         choose_frames,
         (camera, timesteps, FRAMES),
-        lambda steps: crew.report(Stage.FRAMES, steps, total),
+        lambda steps: workers.report(Stage.FRAMES, steps, total),
     )
     chosen: list[int] = found["timesteps"].tolist()
     return chosen
 
 
 def _require_cameras(footage: Footage, structure: Structure, count: int) -> None:
-    """Raise CamerasNotFound where these are too few, or of the room alone."""
+    """Raise CamerasNotFound where there are too few cameras, or where they show the room alone."""
     found = len(structure.timesteps)
-    least = max(MIN_IMAGES, round(MIN_IMAGES_SHARE * count))
+    least = max(MIN_IMAGES, round(MIN_IMAGES_FRACTION * count))
     if found < least:
         raise CamerasNotFound(
             f"{footage.root}: structure from motion places {found} of {count} images, expected at "
@@ -316,12 +319,12 @@ def _cameras(camera: FootageCamera, structure: Structure) -> tuple[FootageCamera
 # Recognition
 
 
-def _recognized(footage: Footage, camera: FootageCamera, crew: Crew) -> Recognition:
-    """What some of the frames say."""
-    found = crew.helpers.run(
+def _recognized(footage: Footage, camera: FootageCamera, workers: Workers) -> Recognition:
+    """`Recognition` from some of the frames."""
+    found = workers.helpers.run(
         recognize,
         (camera, footage.fps),
-        lambda steps: crew.report(Stage.OPENING, steps, SAMPLES),
+        lambda steps: workers.report(Stage.OPENING, steps, SAMPLES),
     )
     return Recognition(*found["recognition"].tolist())
 
@@ -344,7 +347,7 @@ def recognize(camera: FootageCamera, fps: float | None, step: Step) -> dict[str,
     pairs = []
     if turn >= MIN_TURN_DEG:
         photos = isinstance(camera.frames, ImageFrames) and len(timesteps) <= MAX_PHOTOS
-        ahead = 1 if photos else max(1, round(PAIR_S * (fps or USUAL_FPS)))
+        ahead = 1 if photos else max(1, round(PAIR_S * (fps or TYPICAL_FPS)))
         for number, sample in samples.items():
             other = min(number + ahead, len(timesteps) - 1)
             later = look.at(timesteps[other]) if other != number else None
@@ -383,7 +386,7 @@ class _Sample:
 
 
 class _Look:
-    """Looks at frames of a camera for a head's pose, and for the room behind it."""
+    """Finds, in frames of a camera, a head's pose and features of the room behind it."""
 
     def __init__(self, camera: FootageCamera) -> None:
         import cv2
@@ -409,7 +412,7 @@ class _Look:
             return None
         face = self._near = faces[0]
         height, width = image.shape[:2]
-        focal = usual_focal(width, height)
+        focal = typical_focal(width, height)
         size = width, height
         lens = Camera(*size, focal, focal, width / 2, height / 2, np.eye(4))
         posed = pose_from_one_camera(lens, face[self._rows], self._neutral)
@@ -439,8 +442,8 @@ def _lip_gap(face: np.ndarray) -> float:
 
 
 def _parallax(pairs: Sequence[tuple[_Sample, _Sample]]) -> tuple[float, float]:
-    """`Recognition.parallax` and its correlation, of pairs of frames between which the head turns a
-    little."""
+    """`Recognition.parallax` and its correlation, from pairs of frames between which the head turns
+    a little."""
     turns = []
     moves = []
     for first, second in pairs:

@@ -26,7 +26,7 @@ from .stages import ReportStage, Stage, unreported
 from .write_capture import moving_arrays
 
 SOLVED_FILE = "tracking_solved.npz"
-"""In a corrected capture: the parameters as they were solved without keys."""
+"""File in a corrected capture with the parameters as they were solved without keys."""
 DEFAULT_SPAN = 12  # Timesteps before and after a key that it may change
 
 
@@ -98,15 +98,15 @@ def corrected(
     for row, values in keys.items():
         change[row] = change_between(solved[row], values)
     near = np.flatnonzero(distance <= span + 2)
-    shares = trust[near] * (distance[near] / (span + 1)) ** 2
+    fractions = trust[near] * (distance[near] / (span + 1)) ** 2
     # The prior of a change: standard deviations of 1 for coefficients, 1 radian for joints, 1 meter
     # for translation.
     blocks = []
     posed = PosedPoints(model, points)
-    for row, share in zip(near, shares, strict=True):
+    for row, fraction in zip(near, fractions, strict=True):
         _, jacobian = posed.linearized(solved[row, :-RIGID_SIZE], solved[row, -RIGID_SIZE:])
         flat = jacobian.reshape(-1, size) @ by_change(solved[row]) / LANDMARK_SIGMA_M
-        blocks.append(share * (flat.T @ flat) + np.eye(size))
+        blocks.append(fraction * (flat.T @ flat) + np.eye(size))
     matrix = block_diag(blocks)
     # second differences of three rows that follow each other
     middle = 1 + np.flatnonzero((np.diff(near)[:-1] == 1) & (np.diff(near)[1:] == 1))
@@ -149,7 +149,8 @@ def _are_parameters(values: np.ndarray | None, shape: tuple[int, ...]) -> bool:
 
 
 def _misfit(report: Mapping[str, Any]) -> dict[str, dict[int, float]]:
-    """Region -> timestep -> share of the images not explained, of a report that has one."""
+    """Region -> timestep -> fraction of the images that is not explained, from the report, if it
+    has one."""
     return {
         name: {int(t): float(value) for t, value in own.items()}
         for name, own in report.get("image_misfit", {}).items()
@@ -157,8 +158,8 @@ def _misfit(report: Mapping[str, Any]) -> dict[str, dict[int, float]]:
 
 
 def _trust(path: Path, report: Any, timesteps: Sequence[int]) -> np.ndarray:
-    """(T,) from 0 to 1: share of the images that the timesteps' worst regions explain, 1 where that
-    is not known; 0 without landmarks. Raises StgaError where the report says neither."""
+    """(T,) from 0 to 1: fraction of the images that is explained in the timesteps' worst regions, 1
+    where it is not known; 0 without landmarks. Raises StgaError where the report has neither."""
     without = report.get("interpolated") if isinstance(report, dict) else None
     if not isinstance(without, list) or not all(type(timestep) is int for timestep in without):
         raise StgaError(f"{path}: interpolated: expected timesteps, got {shorten(without)}")
@@ -168,7 +169,9 @@ def _trust(path: Path, report: Any, timesteps: Sequence[int]) -> np.ndarray:
         if not np.isfinite(worst).all():
             raise ValueError
     except (ValueError, TypeError, AttributeError) as error:
-        raise StgaError(f"{path}: image_misfit: expected shares by region and timestep") from error
+        raise StgaError(
+            f"{path}: image_misfit: expected fractions by region and timestep"
+        ) from error
     return np.where(np.isin(timesteps, list(set(without))), 0.0, 1 - np.clip(worst, 0.0, 1.0))
 
 

@@ -1,4 +1,4 @@
-"""Where a detector's landmarks lie on a head model, found with the detector itself on pictures of
+"""Places of a detector's landmarks on a head model, found by running the detector on pictures of
 the model."""
 
 import math
@@ -54,7 +54,8 @@ MAX_SURFACE_DISTANCE = 0.02
 """Distance from the surface beyond which a landmark is not used, as a fraction of the head's extent
 (6 mm)."""
 MAX_RESIDUAL = 0.013
-"""Share of the head's extent: a landmark whose rays miss each other by more (4 mm) is not used."""
+"""Fraction of the head's extent: a landmark whose rays miss each other by more (4 mm) is not
+used."""
 CANDIDATES = 48  # Triangles of the nearest centers, among which the nearest one is looked for
 
 
@@ -131,8 +132,8 @@ def calibrate(
 
 
 def head_colors(model: FlameModel) -> np.ndarray:
-    """(V, 3) of the pictures: a detector needs irises to tell open eyes from closed ones, of models
-    whose eyes are closed in some."""
+    """(V, 3) colors for the pictures. A detector needs irises to distinguish open eyes from closed
+    ones on models that can close their eyes."""
     colors = np.tile(SKIN_RGB, (len(model.v_template), 1))
     for joint in EYE_JOINTS if BLINKS[0] in model.expression_names else ():
         eyeball = np.flatnonzero(model.weights[:, joint] > EYEBALL_WEIGHT)

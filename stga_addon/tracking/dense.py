@@ -27,69 +27,81 @@ from .fit import (
 )
 from .posed_points import split
 from .solve import Observation, acceleration_precision, normal_equations, prior_terms, smoothed
-from .stages import Crew, Stage
+from .stages import Stage, Workers
 
-MIN_TIMESTEPS = 6  # Below it, an averaged texture is no evidence of how timesteps differ
-SETTLED_WEIGHT = 0.1  # Least weight of a timestep in the texture of a settled take
+MIN_TIMESTEPS = 6
+"""Least number of timesteps: an average texture of fewer is no evidence of how timesteps differ."""
+SETTLED_WEIGHT = 0.1
+"""Least weight of a timestep in the texture of a settled take."""
 TEXTURE_TIMESTEPS = 32
+"""Timesteps, spread over the take, from which the texture is averaged."""
 MAX_CAMERAS = 8
-"""Timesteps, spread over the take, of the texture; cameras, spread over the rig, whose images are
-compared."""
+"""Largest number of cameras, spread over the rig, whose images are compared."""
 TEXTURE_PART_TIMESTEPS = 12
+"""Largest number of the texture's timesteps that are worked on at once."""
 PART_TIMESTEPS = 24
-"""At most, of the parts in which a texture's timesteps, and then the whole take, are worked on."""
-LANDMARK_SHARE = 0.01
-INNER_SHARE = 0.3
-"""Weight of landmarks beside the images; of those on eyeballs and lids, where no texture shows
-reflections, nor which of the two is seen."""
+"""Largest number of the take's timesteps that are worked on at once."""
+LANDMARK_WEIGHT = 0.01
+"""Weight of landmarks beside the images."""
+INNER_WEIGHT = 0.3
+"""The same for landmarks on eyeballs and lids: the texture shows neither reflections nor whether
+lid or eyeball is visible."""
 REGION_SCALE_M = 0.004
-"""Median distance of a region's landmarks from the head at which the region's weight has fallen to
-a quarter."""
+"""Median distance between a region's landmarks and the head at which the region's weight has fallen
+to a quarter."""
 DISAGREEMENT_M = 0.0015
-"""The same, of the distance beyond that at most timesteps, for landmarks of which a fit begins
-again."""
+"""Distance at which a landmark's weight has fallen to a quarter when the fit starts again, beyond
+its distance at most timesteps."""
 START_STEPS = ((3, 2), (2, 2))
+"""(level of the pyramid, Gauss–Newton steps) from every start."""
 START_LEVEL = 2
-"""Levels of the pyramid and Gauss–Newton steps in each, for every start; and the level in which
-starts are compared."""
+"""Level of the pyramid at which starts are compared."""
 FINE_STEPS = ((2, 3), (1, 16), (0, 3))
+"""(level, steps) from the best start."""
 EVIDENCE_LEVEL = 1
-"""The same for the best start; and the level in which points that were not fitted tell whether it
-is better."""
+"""Level at which held-out points show whether the fit has become better."""
 LAST_STEPS = ((1, 12), (0, 4))
+"""(level, steps) from that result where other points are visible than at the start, as in a mouth
+that opens."""
 LAST_ROUNDS = 2
-"""The same for its result where other points are visible than at the start, as in a mouth that
-opens."""
+"""How often LAST_STEPS are taken at most."""
 CARRIED_STEPS = ((1, 3), (0, 1))
+"""(level, steps) of a timestep that is first moved as its neighbors were."""
 CARRIED_FACTOR = 1.25
-"""The same for a timestep that is moved as those beside it; which is enough where it leaves no
-region worse explained than theirs, by this factor."""
-OPENINGS_M = 0.008, 0.016  # By which the chin is moved for further starts
+"""Largest misfit of a region, relative to the neighbors' misfit, for which that is enough."""
+OPENINGS_M = 0.008, 0.016
+"""How far the chin is moved down for further starts."""
 TYPICAL_QUANTILE = 0.2
+"""Quantile, over the texture's timesteps, of a region's misfit that is typical."""
 TYPICAL_FACTOR = 1.5
-"""Other starts are tried where the first leaves a region of the face worse explained, by this
-factor, than it is at this share of the texture's timesteps."""
+"""Misfit of a region of the face, relative to its typical misfit, above which other starts are
+tried."""
 DAMPING = 1e-3
-CONVERGED_STEP_M = 1e-4  # Root mean square motion of points in a step, after which a level is done
-MAX_TURN = 0.3  # Of a joint in one step, in radians
+"""Relative damping of the normal equations' diagonal (Levenberg–Marquardt)."""
+CONVERGED_STEP_M = 1e-4
+"""Root mean square motion of points in a step, below which a level is done."""
+MAX_TURN = 0.3
+"""Largest turn of a joint in one step, in radians."""
 SETTLED_GAIN = 0.01
-"""By which a region's misfit has to fall for a settled timestep to be changed: below it, the
+"""Least relative fall of a region's misfit for which a settled timestep is changed: below it, the
 surface that several cameras see is the better evidence."""
-KEPT_STIFFNESS = 100.0  # Of a timestep that keeps what it had; in the stiffness over time
-MAX_GROWTH = 1.5
-SMALL_MISS_M = 0.001
+KEPT_STIFFNESS = 100.0
+"""Stiffness of a timestep that keeps its parameters, relative to the stiffness over time."""
 MIN_REGION_GAIN = 0.1
-"""Of the landmarks' distance in a region whose misfit falls by less than MIN_REGION_GAIN of it:
-beyond, landmarks are the better evidence there. A forehead in wrinkles looks a little more like
-lowered brows than like raised ones."""
+"""Relative fall of a region's misfit below which its landmarks are the better evidence: a wrinkled
+forehead looks a little more like lowered brows than like raised ones."""
+MAX_MISS_FACTOR = 1.5
+"""Largest factor by which the landmarks' distance from the head may then become larger."""
+SMALL_MISS_M = 0.001
+"""Additional distance that is allowed beside MAX_MISS_FACTOR."""
 MAX_UPPER_MISS_M = 0.01
-"""By which landmarks of the upper face may be missed at most: no brow is raised by more."""
+"""Largest additional distance of the upper face's landmarks: no brow is raised by more."""
 
 
 @dataclass(frozen=True)
 class DenseFit:
-    """fit; landmarks, of which those in regions that disagree are moved to the fit; how badly the
-    regions (R,) are explained at each timestep."""
+    """The fit; landmarks, moved to the fit in regions that disagree with it; and each timestep's
+    misfit by region (R,)."""
 
     fit: HeadFit
     landmarks: Mapping[int, TimestepLandmarks]
@@ -98,8 +110,8 @@ class DenseFit:
 
 @dataclass(frozen=True)
 class _Shot:
-    """What is known of a timestep: views, triangulated landmarks, where the fit so far is, and in
-    which regions of the face (R,) landmarks are the better evidence."""
+    """Data of a timestep: views, triangulated landmarks, parameters of the fit so far, and the
+    regions of the face (R,) in which landmarks are the better evidence."""
 
     views: Views
     landmarks: Observation
@@ -123,7 +135,7 @@ class _Solved:
 
 
 def fit_dense(
-    fit: HeadFit, take: RecordedTake, crew: Crew, settled: bool = False
+    fit: HeadFit, take: RecordedTake, workers: Workers, settled: bool = False
 ) -> DenseFit | None:
     """Expression and pose of every timestep from the images; None where the take is too short for
     it.
@@ -149,7 +161,7 @@ def fit_dense(
         work: Callable[..., Any], parts: Sequence[tuple], before: int, keep: bool = False
     ) -> list:
         every = [(*excerpt(fit, take, part), *arguments) for part, *arguments in parts]
-        return crew.map(work, every, (stage, before, total), keep)
+        return workers.map(work, every, (stage, before, total), keep)
 
     weights = head.rest([fit.parameters[t] for t in chosen])
     weights = np.maximum(weights, SETTLED_WEIGHT if settled else 0)
@@ -184,8 +196,7 @@ def _sampled_part(
 
 
 def _started_part(fit: HeadFit, take: RecordedTake, texture: Texture, step: Step) -> np.ndarray:
-    """(T, R) how badly the regions are explained in coarse images from where the fit is, at the
-    timesteps of a part."""
+    """(T, R) misfit by region in coarse images at the fit so far, for the timesteps of a part."""
     solver = _Solver(fit, take, texture)
     found = []
     for timestep in sorted(take.landmarks):
@@ -204,8 +215,8 @@ def _solved_part(
     settled: bool,
     step: Step,
 ) -> dict[str, np.ndarray]:
-    """The timesteps of a part, solved one from the other, every second one first; by name, T of
-    what `_Solved` has of each."""
+    """The timesteps of a part, each solved from the one before, every second one first; name ->
+    values of `_Solved` for T timesteps."""
     solver = _Solver(fit, take, texture, SETTLED_GAIN if settled else 0.0)
     timesteps = sorted(take.landmarks, reverse=settled)
 
@@ -297,9 +308,9 @@ class _Solver:
     def carried(
         self, shot: _Shot, before: tuple[_Shot, _Solved], after: tuple[_Shot, _Solved]
     ) -> _Solved | None:
-        """The start, moved as timesteps before and after it were moved from theirs, and a few steps
-        on; None where that is no better than the start, explains some region worse than they are
-        explained, or leaves its landmarks."""
+        """The start, moved as its neighbors were moved from their starts, after a few steps; None
+        where that is no better than the start, explains some region worse than its neighbors do, or
+        leaves its landmarks."""
         moves = [own.values - near.start for near, own in (before, after)]
         values = shot.start + np.mean(moves, axis=0)
         visible = self.head.visibility(values, shot.views)
@@ -324,8 +335,9 @@ class _Solver:
         return self.head.misfit(shot.views, visible, values, HELD_OUT_LEVEL, EVIDENCE_LEVEL)
 
     def _astray(self, shot: _Shot, values: np.ndarray, visible: np.ndarray) -> np.ndarray:
-        """(R,) bool: regions whose landmarks are missed by much more, though they are not explained
-        clearly better; and those of the upper face that went farther from them than it moves."""
+        """(R,) bool: regions whose landmarks are much farther away though the images are not
+        clearly better explained; and regions of the upper face that moved farther from their
+        landmarks than a face can."""
         both = (shot.start, values)
         astray = np.zeros(len(REGIONS), bool)
         old, new = (self._evidence(shot, own, visible).regions for own in both)
@@ -334,7 +346,7 @@ class _Solver:
             use = (self.head.landmark_region == region) & (shot.landmarks.weight > 0)
             before, after = (float(np.median(own[use])) if use.any() else 0.0 for own in missed)
             unproven = new[region] > (1 - MIN_REGION_GAIN) * old[region]
-            astray[region] = unproven and after > MAX_GROWTH * before + SMALL_MISS_M
+            astray[region] = unproven and after > MAX_MISS_FACTOR * before + SMALL_MISS_M
             astray[region] |= region >= UPPER_FACE and after > before + MAX_UPPER_MISS_M
         return astray
 
@@ -383,7 +395,7 @@ class _Solver:
         by_images = np.where(shot.by_landmarks[self.head.region], 0.0, visible)
         curvature, slope = self.head.photo_term(shot.views, by_images, values, level)
         # a level weighs the same with fewer points
-        share = len(self.head.rows[0]) / len(jacobian)
+        fraction = len(self.head.rows[0]) / len(jacobian)
         flat = jacobian.reshape(-1, len(values))
         missed = self._missed(shot.landmarks, values)
         weight = shot.landmarks.weight.copy()
@@ -391,11 +403,11 @@ class _Solver:
             own = self.head.landmark_region == region
             if (own & (weight > 0)).any():  # far from the head, they count less
                 weight[own] *= robust(np.median(missed[own & (weight > 0)]), REGION_SCALE_M)
-            weight[own] *= np.where(self.head.inner[own], INNER_SHARE, LANDMARK_SHARE)
+            weight[own] *= np.where(self.head.inner[own], INNER_WEIGHT, LANDMARK_WEIGHT)
         weighted = replace(shot.landmarks, weight=weight)
         matrix, right = normal_equations(self.head.landmarks, values, weighted)
-        matrix = matrix + share * flat.T @ (curvature @ jacobian).reshape(flat.shape)
-        return matrix, right + share * flat.T @ slope.ravel(), jacobian
+        matrix = matrix + fraction * flat.T @ (curvature @ jacobian).reshape(flat.shape)
+        return matrix, right + fraction * flat.T @ slope.ravel(), jacobian
 
     def _missed(self, landmarks: Observation, values: np.ndarray) -> np.ndarray:
         """(L,) distance in meters of the landmarks from the head, as far as the cameras determine
@@ -408,8 +420,8 @@ class _Solver:
 def _agreeing(
     head: DenseHead, fit: HeadFit, take: RecordedTake, missed: np.ndarray, better: np.ndarray
 ) -> dict[int, TimestepLandmarks]:
-    """The take's landmarks, moved towards the fit in regions where they miss it by more than they
-    mostly do.
+    """The take's landmarks, moved toward the fit in regions where their distance from it is larger
+    than at most timesteps.
 
     missed (T, L), better (T,): of `_Solved` at the take's timesteps.
     """

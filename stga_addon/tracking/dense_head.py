@@ -1,5 +1,5 @@
-"""The points of a person's face that dense tracking compares with images, by their texture and by
-optical flow."""
+"""Points of a person's face that dense tracking compares with images, by texture and by optical
+flow."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -42,7 +42,7 @@ REGION_EDGES = (0.4, 0.62, 0.735)
 """Edges of the REGIONS, in the landmarks' height on the neutral head."""
 UPPER_FACE = 2
 """Regions from this one on stay where they are when the mouth opens."""
-CHIN_SHARE = 0.12
+CHIN_FRACTION = 0.12
 """Landmarks in this lowest fraction of the landmarks' height are the chin's."""
 CHIN_DIRECTION = np.array([0.0, -1.0, -0.4])
 """Direction in which an opening jaw moves the chin, in the head's axes."""
@@ -59,7 +59,7 @@ OPENING_STEP_M = 0.008
 REST_QUANTILE = 0.2
 """Fraction of the timesteps at which a region moves so little that it is at rest."""
 REST_SCALE_M = 0.002
-"""How much farther than in these a region at rest may move."""
+"""Additional distance that a region at rest may move."""
 HELD_OUT_LEVEL = len(appearance.LEVELS_M)
 """Stands for the points that are not fitted, where a level is asked for."""
 ALL_POINTS = HELD_OUT_LEVEL + 1
@@ -75,8 +75,8 @@ def in_single_precision(model: FlameModel) -> FlameModel:
 
 @dataclass(frozen=True)
 class Misfit:
-    """How badly points are explained, from 0 to 1: over all, and by region (R,); 0 where no point
-    is seen."""
+    """Fraction in 0…1 of the images that points do not explain: of all points, and by region (R,);
+    0 where no point is visible."""
 
     all: float
     regions: np.ndarray
@@ -121,7 +121,7 @@ class DenseHead:
         edges = low + (high - low) * np.array(REGION_EDGES)
         self.landmark_region = np.digitize(height, edges)
         self.region = np.digitize(self.points.on(template, faces)[:, 1], edges)
-        self._chin = reliable & (height < low + CHIN_SHARE * (high - low))
+        self._chin = reliable & (height < low + CHIN_FRACTION * (high - low))
         self._fixed = reliable & (self.landmark_region >= UPPER_FACE)
         rest = np.zeros(model.n_expression), np.zeros(RIGID_SIZE)
         smooth = unit(self.points.on(vertex_normals(template, faces), faces))
@@ -157,8 +157,8 @@ class DenseHead:
                 vertices = flame_forward(self.head.model, np.zeros(0), frame_of(values))
                 normals = self.points.on(vertex_normals(vertices, faces), faces)
                 cosine = facing(camera, at, unit(normals))
-                share = min(1.0, VISIBILITY_SIDE_PX / max(camera.width, camera.height))
-                shown = in_sight(camera.scaled(share), vertices, faces, at)
+                fraction = min(1.0, VISIBILITY_SIDE_PX / max(camera.width, camera.height))
+                shown = in_sight(camera.scaled(fraction), vertices, faces, at)
                 self._visible[key] = np.where((cosine > MIN_COSINE) & shown, cosine**2, 0.0)
             seen.append(self._visible[key])
         return np.stack(seen)
@@ -183,7 +183,7 @@ class DenseHead:
 
     def rest(self, take: Sequence[np.ndarray]) -> np.ndarray:
         """(T, N) weights of the timesteps' parameters for a point's texture: 1 where its region is
-        at rest, where detectors are mostly right, and low where it is moved far."""
+        at rest, where detectors are mostly right; low where it has moved far."""
         moved: Any = []
         regions, of_region = np.unique(self.region, return_inverse=True)
         for values in take:
@@ -265,8 +265,8 @@ class DenseHead:
             known = self._texture.values[view.key][level][rows], basis, weight * shown
             lit = appearance.relit(found, *known, self._texture.lights[view.key])
             residual = (found - lit) / appearance.NOISE_LEVELS
-            share = np.where(shown, appearance.unexplained(residual, level), 1.0)
-            total += np.bincount(self.region[rows], weight * share, len(REGIONS))
+            fraction = np.where(shown, appearance.unexplained(residual, level), 1.0)
+            total += np.bincount(self.region[rows], weight * fraction, len(REGIONS))
             weights += np.bincount(self.region[rows], weight, len(REGIONS))
         regions = total / np.maximum(weights, 1e-9)
         return Misfit(float(total.sum() / max(weights.sum(), 1e-9)), regions)
@@ -274,8 +274,8 @@ class DenseHead:
     def flow_start(
         self, before: Views, visible: np.ndarray, values: np.ndarray, now: Views
     ) -> np.ndarray:
-        """Parameters at a timestep to which optical flow carries the head of another one, of which
-        are `before`, visible (C, N) and values."""
+        """Parameters at a timestep to which optical flow carries the head from another one, which
+        `before`, visible (C, N) and values describe."""
         start = self.positions(values, appearance.FLOW_POINTS)
         targets = list(appearance.flow_targets(start, before, now))
         rows = self.rows[appearance.FLOW_POINTS]

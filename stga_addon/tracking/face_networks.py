@@ -35,7 +35,7 @@ CROP_SCALE = 1.5
 """Side of the landmarks' crop, in sides of the detected box."""
 NEAR_SCALE = 4.0
 """Side of the part around another frame's face, in that of its landmarks."""
-PART_SHARES = (0.5, 0.25)
+PART_FRACTIONS = (0.5, 0.25)
 """Sides of the parts of an image that are searched for small faces, as fractions of its longer
 side: the detector finds faces from an eighth of its input on."""
 MIN_PART_PX = 160
@@ -46,7 +46,7 @@ PERSON_SIZE_PX = 256
 
 ANCHOR_GRIDS = ((16, 2), (8, 6))
 """Cells along a side of the detector's grids, and anchors of each, which are its center."""
-MAX_SMALL_SHARE = 0.18
+MAX_SMALL_FRACTION = 0.18
 """Size of a small face as a fraction of the image's longer side."""
 SETTLING_STEPS = 2
 """Crops around a small face's landmarks: its box is a few of the detector's pixels wide, and eyes
@@ -120,13 +120,13 @@ class FaceNetworks:
 
     def detect(self, image: np.ndarray) -> list[np.ndarray]:
         """Landmarks (478, 2) of at most two faces in an image (H, W, 3) uint8, in pixels, whose
-        centers lie at .5: of those that are large enough in the whole image."""
+        centers lie at .5. Only faces that are large enough in the whole image are found."""
         return [points[:, :2] for points in self._landmarks(image, [_whole(image)], MAX_FACES)]
 
     def find(self, image: np.ndarray, near: np.ndarray | None = None) -> list[np.ndarray]:
-        """As `detect`; where the whole image shows none, faces that are small in it, as of a person
-        two meters away: around the one that a frame before showed, landmarks `near` (N, 2), else
-        in parts of the image."""
+        """As `detect`. Where the whole image shows no face, small ones are looked for, as of a
+        person two meters away: around the landmarks `near` (N, 2) of a frame before, else in parts
+        of the image."""
         return [points[:, :2] for points in self._found(image, MAX_FACES, near)]
 
     def score(self, image: np.ndarray) -> FaceScores | None:
@@ -144,7 +144,7 @@ class FaceNetworks:
     ) -> list[np.ndarray]:
         """(478, 3) of each face in the first of these places that shows one: the whole image,
         around another's landmarks, parts of the image."""
-        small = MAX_SMALL_SHARE * max(image.shape[:2])
+        small = MAX_SMALL_FRACTION * max(image.shape[:2])
         for parts in _places(image, near):
             if found := self._landmarks(image, parts, most):
                 sizes = [float(np.ptp(points[:, :2], axis=0).max()) for points in found]
@@ -158,10 +158,10 @@ class FaceNetworks:
         """(478, 3) of each face in some parts of an image: pixels, and depth in pixels, which grows
         away from the camera."""
         found = [self._boxes(image, part) for part in parts]
-        boxes, shares = map(np.concatenate, zip(*found, strict=True))
+        boxes, fractions = map(np.concatenate, zip(*found, strict=True))
         crops = [
             _Crop(box[:2], CROP_SCALE * box[2:4].max(), _tilt(box[4:6], box[6:8]))
-            for box in _distinct(boxes, shares)[:most]
+            for box in _distinct(boxes, fractions)[:most]
         ]
         faces = (self._face(image, crop) for crop in crops)
         return [points for points in faces if points is not None]
@@ -204,15 +204,15 @@ class FaceNetworks:
         small = _resampled(image, matrix, DETECTOR_SIZE_PX, black_border=True)
         self._faces.setInput(cv2.dnn.blobFromImage(small, 2 / 255, mean=(127.5,) * 3))  # −1 to 1
         found, scores = self._faces.forward(["regressors", "classificators"])
-        shares = expit(np.ravel(scores).astype(np.float64))
-        likely = shares >= MIN_DETECTION_SCORE
+        fractions = expit(np.ravel(scores).astype(np.float64))
+        likely = fractions >= MIN_DETECTION_SCORE
         boxes = np.reshape(found, (-1, 16))[likely].astype(np.float64)
         boxes[:, :2] += _anchors()[likely]
         boxes[:, 4:] += np.tile(_anchors()[likely], 6)
         boxes *= part.side / DETECTOR_SIZE_PX
         boxes[:, :2] += matrix[:, 2]
         boxes[:, 4:] += np.tile(matrix[:, 2], 6)
-        return boxes, shares[likely]
+        return boxes, fractions[likely]
 
     @cached_property
     def _faces(self) -> Any:
@@ -275,12 +275,13 @@ def _resampled(
     return cv2.warpAffine(image, matrix, (size, size), flags=flags, borderMode=border)
 
 
-def _distinct(boxes: np.ndarray, shares: np.ndarray) -> list[np.ndarray]:
-    """Faces, the likeliest (M,) first, of what may be some (M, 16): center, size and six points.
+def _distinct(boxes: np.ndarray, fractions: np.ndarray) -> list[np.ndarray]:
+    """Distinct faces (M,), the most probable first, among candidates (M, 16): center, size and six
+    points.
 
     Boxes that overlap are one face, their mean weighted by how likely they are.
     """
-    left = np.argsort(-shares, kind="stable")
+    left = np.argsort(-fractions, kind="stable")
     faces = []
     while len(left):
         low = boxes[left, :2] - boxes[left, 2:4] / 2
@@ -289,7 +290,7 @@ def _distinct(boxes: np.ndarray, shares: np.ndarray) -> list[np.ndarray]:
         area = boxes[left, 2:4].prod(axis=1)
         same = common / np.maximum(area + area[0] - common, 1e-9) > MAX_BOX_OVERLAP
         same[0] = True
-        weights = shares[left[same]]
+        weights = fractions[left[same]]
         faces.append(weights @ boxes[left[same]] / weights.sum())
         left = left[~same]
     return faces
@@ -307,22 +308,22 @@ def _tilt(right_eye: np.ndarray, left_eye: np.ndarray) -> float:
 
 
 def _places(image: np.ndarray, near: np.ndarray | None) -> Iterator[list[_Crop]]:
-    """Where a face is looked for, one after the other: see `FaceNetworks.find`."""
+    """Places where a face is looked for, in order: see `FaceNetworks.find`."""
     yield [_whole(image)]
     if near is not None:
         center = near.min(0) / 2 + near.max(0) / 2
         size = float(np.ptp(near, axis=0).max())
         yield [_Crop(center, NEAR_SCALE * size, 0.0)]
-    for share in PART_SHARES:
-        side = share * max(image.shape[:2])
+    for fraction in PART_FRACTIONS:
+        side = fraction * max(image.shape[:2])
         if side >= MIN_PART_PX:
             rows, columns = (_centers(length, side) for length in image.shape[:2])
             yield [_Crop(np.array([x, y]), side, 0.0) for y in rows for x in columns]
 
 
 def _centers(length: int, side: float) -> np.ndarray:
-    """Of parts of that side along a length, which overlap by half of it, so that a face is whole in
-    one."""
+    """Centers of parts of that side along a length. They overlap by half, so that one of them shows
+    a face whole."""
     if length <= side:
         return np.array([length / 2])
     count = 1 + math.ceil((length - side) / (side / 2))

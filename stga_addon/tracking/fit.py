@@ -34,7 +34,7 @@ ITERATIONS = 15
 """Reweighted least squares fits of a landmark's position."""
 OUTLIER_SCALE = 1.5
 """Distance from a ray, in the landmark's medians, at which its weight is a quarter."""
-MIN_DISTANCE_SHARE = 1e-5
+MIN_DISTANCE_FRACTION = 1e-5
 """Least scale of outliers as a fraction of the distance to the cameras; below is rounding."""
 RANK_GUARD = 1e-9
 """Weight of the first guess: a single ray leaves the position along it open."""
@@ -60,7 +60,7 @@ POSIT_ITERATIONS = 20
 
 @dataclass(frozen=True)
 class Triangulation:
-    """What one timestep's cameras say of N landmarks, in the units of the cameras' world.
+    """N landmarks of one timestep from its cameras, in the units of the cameras' world.
 
     position     (N, 3) the best point; for a single ray, one on that ray; without a ray, the center
                  of the cameras
@@ -103,15 +103,15 @@ def triangulate(
     distance = np.zeros(confidence.shape)
     for _ in range(ITERATIONS):
         total = weights.sum(0)
-        share = weights / np.where(total > 0, total, 1.0)
-        information = np.einsum("cn,cnij->nij", share, across)
-        right = np.einsum("cn,cni->ni", share, offsets)
+        fraction = weights / np.where(total > 0, total, 1.0)
+        information = np.einsum("cn,cnij->nij", fraction, across)
+        right = np.einsum("cn,cni->ni", fraction, offsets)
         guard = RANK_GUARD * np.eye(3)  # a single ray leaves the position along it open
         position = np.linalg.solve(information + guard, (right + guess @ guard)[..., None])[..., 0]
         to_point = position[None] - origins[:, None]
         distance = np.linalg.norm(np.cross(to_point, directions), axis=2)
         scale = OUTLIER_SCALE * _median(distance, confidence > 0)
-        floor = MIN_DISTANCE_SHARE * np.linalg.norm(to_point, axis=2)
+        floor = MIN_DISTANCE_FRACTION * np.linalg.norm(to_point, axis=2)
         # a point without a ray may lie in a camera, at distance 0 from its ray
         typical = np.maximum(np.maximum(scale, floor), np.finfo(np.float64).tiny)
         weights = confidence / (1 + (distance / typical) ** 2) ** 2
@@ -128,7 +128,7 @@ def _median(values: np.ndarray, valid: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class TimestepLandmarks:
-    """What the cameras that found a face at one timestep found: points (C, N, 2) pixels and
+    """Landmarks of one timestep from the cameras that found a face: points (C, N, 2) pixels and
     confidence (C, N); the cameras' names, where these are asked for."""
 
     cameras: tuple[Camera, ...]
@@ -144,7 +144,7 @@ def no_pictures(*_: int | None) -> Pictures:
 
 @dataclass(frozen=True)
 class RecordedTake:
-    """What was recorded: places of landmarks on the head, which are reliable, landmarks by
+    """A recording: places of landmarks on the head, which of them are reliable, landmarks by
     timestep, images, masks, and whether the world of the cameras is in meters."""
 
     places: SurfacePoints
@@ -156,7 +156,7 @@ class RecordedTake:
 
 
 def without_cameras(take: RecordedTake, names: Collection[str]) -> RecordedTake:
-    """The take without the landmarks of some cameras, which do not see all that is seen."""
+    """The take without the landmarks of cameras that do not see everything the others see."""
     landmarks = {}
     for timestep, own in take.landmarks.items():
         kept = [row for row, name in enumerate(own.names) if name not in names]
@@ -205,8 +205,8 @@ def excerpt(
 
 
 def in_cameras_world(fit: HeadFit) -> HeadFit:
-    """The same fit with the cameras where they are: only the scale of their world changes, about
-    its origin."""
+    """The same fit with the cameras at their recorded positions: only the scale of their world
+    changes, about its origin."""
     model = fit.head.model
     world = fit.to_capture
     moved = {}
@@ -297,8 +297,8 @@ def fit_head(head: HeadModel, recorded: RecordedTake, step: Step = lambda: None)
 
 
 def is_metric(head: HeadModel, take: RecordedTake) -> bool:
-    """Whether the face is as large in the cameras' world as a person's in meters; True of one
-    camera, which does not see size."""
+    """Whether the face has a person's size in meters in the cameras' world; True for one camera,
+    which cannot show size."""
     several = [t for t in sorted(take.landmarks) if len(take.landmarks[t].cameras) > 1]
     spread = evenly_spread(several, IDENTITY_TIMESTEPS)
     scales = [one.scale for one in _alignments(head, take, spread, metric=False)]
@@ -334,8 +334,8 @@ def pose_from_one_camera(camera: Camera, pixels: np.ndarray, points: np.ndarray)
 def triangulated(
     landmarks: TimestepLandmarks, reliable: np.ndarray, head: np.ndarray, scale: float
 ) -> Triangulation:
-    """The landmarks in the cameras' world; `head` (N, 3) meters and `scale` tell how far away a
-    single camera's are."""
+    """The landmarks in the cameras' world. For a single camera, `head` (N, 3) meters and `scale`
+    give their distance."""
     if len(landmarks.cameras) > 1:
         return triangulate(landmarks.cameras, landmarks.points, landmarks.confidence * reliable)
     camera = landmarks.cameras[0]
@@ -373,8 +373,8 @@ def landmarks_in_capture(
 def _alignments(
     head: HeadModel, take: RecordedTake, timesteps: Sequence[int], metric: bool
 ) -> list[Similarity]:
-    """What brings each timestep's landmarks onto the neutral head. Without several cameras, the
-    head's own size decides."""
+    """Similarities from each timestep's landmarks to the neutral head. Without several cameras, the
+    head's size gives their scale."""
     neutral = take.places.on(head.model.v_template, head.model.faces)
     found = [triangulated(take.landmarks[t], take.reliable, neutral, 1.0) for t in timesteps]
     used = [one.seen & take.reliable for one in found]

@@ -1,5 +1,5 @@
-"""Focal length of a single camera, from a head's landmarks and what is likely; and cameras of a rig
-that see the head larger or smaller than the others do."""
+"""Focal length of a single camera, from a head's landmarks and a prior; and cameras of a rig that
+see the head larger or smaller than the others do."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -51,20 +51,24 @@ CHOSEN_QUANTILE = 0.6
 side; one that is too short by half makes another person."""
 INTERVAL = (0.05, 0.95)
 """Quantiles of the posterior that are reported."""
-MAX_SCALE_DIFFERENCE = 0.043  # Of a camera from the median of all; 5 % of focal length show
+MAX_SCALE_DIFFERENCE = 0.043
+"""Largest relative difference between a camera's scale and the median of all cameras. A 5 % error
+of focal length is found."""
 MAX_SIDE_DEG = 60.0
-"""Between the way the head faces and a camera, beyond which its landmarks are not compared: on the
-path-traced head, scales of single views have a standard deviation of 0.01 up to here, and of 0.03
-beyond, with a mean of −0.02."""
+"""Largest angle between the direction that the head faces and a camera whose landmarks are
+compared: on the path-traced head, scales of single views have a standard deviation of 0.01 up to
+here, and of 0.03 beyond, with a mean of −0.02."""
 MIN_CAMERAS = 4
+"""Least number of cameras for which scales are compared."""
 MIN_VISIBILITY = 0.1
-"""Squared cosine of the angle between a landmark's surface and a camera that may use it."""
+"""Least squared cosine of the angle between a landmark's normal and a camera that may use it."""
 MAX_COMPARED_TIMESTEPS = 40
+"""Largest number of timesteps in which cameras are compared."""
 SCALE_ITERATIONS = 8
 OUTLIER_SCALE = 1.5
-HERE = Similarity(
-    1.0, np.eye(3), np.zeros(3)
-)  # The camera's own world, in meters, in which the head is fitted
+
+HERE = Similarity(1.0, np.eye(3), np.zeros(3))
+"""The camera's world, in meters, in which the head is fitted."""
 
 
 @dataclass(frozen=True)
@@ -82,7 +86,7 @@ def estimated_focal(
     head: HeadModel, take: RecordedTake, step: Step = lambda: None
 ) -> FocalEstimate:
     """Focal length of the only camera of `take`, whose own is that of a phone
-    (`open.usual_focal`).
+    (`open.typical_focal`).
 
     A quantile of its posterior. The likelihood is that of landmarks of the most differently turned
     timesteps, under the best fit of the head for each focal length; the prior knows the angle of
@@ -160,7 +164,8 @@ def _turned(
 def _observed(
     head: HeadModel, places: SurfacePoints, views: Sequence[TimestepLandmarks]
 ) -> tuple[list[Observation], np.ndarray]:
-    """Landmarks in the camera's world at the head's depth, and poses (T, 18) that lead there."""
+    """Landmarks in the camera's world at the head's depth, and the poses (T, 18) that place the
+    head there."""
     neutral = places.on(head.model.v_template, head.model.faces)
     used = np.ones(len(places), bool)
     points = (head_fit.triangulated(view, used, neutral, 1.0) for view in views)
@@ -213,8 +218,9 @@ def _slope(
     observed: Sequence[Observation],
     frames: np.ndarray,
 ) -> float:
-    """Derivative of the negative log-likelihood by the logarithm of the focal length, at the best
-    fit: there it is that with a head that stays, whose image grows about the principal point."""
+    """Derivative of the negative log-likelihood by the logarithm of the focal length at the best
+    fit. There, it equals the derivative with a fixed head whose image grows about the principal
+    point."""
     points = PosedPoints(subject.model, places)
     total = 0.0
     for view, own, values in zip(views, observed, frames, strict=True):
@@ -234,8 +240,8 @@ def _slope(
 
 
 def scale_warnings(fit: HeadFit, take: RecordedTake) -> tuple[str, ...]:
-    """One sentence for each camera whose landmarks are of another size than the fitted head is
-    there: the sign of a wrong focal length. Faces seen from the side do not count."""
+    """One sentence for each camera whose landmarks differ in size from the fitted head's: the sign
+    of a wrong focal length. Faces seen from the side do not count."""
     visibility = head_fit.LandmarkVisibility(fit.head, take.places)
     used = take.reliable
     timesteps = sorted(fit.parameters)[:: 1 + len(fit.parameters) // MAX_COMPARED_TIMESTEPS]

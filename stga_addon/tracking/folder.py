@@ -1,4 +1,4 @@
-"""Files of a tracked capture's folder, and what they say of the torso."""
+"""Files of a tracked capture's folder, and what they report of the torso."""
 
 import shutil
 from collections.abc import Mapping
@@ -21,15 +21,15 @@ LANDMARKS_FOLDER = "landmarks"
 PLACES_FILE = "head_model.npz"
 
 FOOTAGE_FILE = f"{LANDMARKS_FOLDER}/footage.json"
-"""What the landmarks were found in."""
+"""File that describes the footage in which the landmarks were found."""
 KEPT_FOLDER = "unfinished"
-"""Of results of parts, with which an interrupted tracking goes on; removed at its end."""
+"""Folder with results of parts, with which an interrupted tracking goes on; removed at its end."""
 LOCK_FILE = "tracking.lock"
 """Held while the capture is written."""
 SPLIT_FILES = ("transforms_train.json", "transforms_val.json", "transforms_test.json")
 
 MOTIONS = {"head": "turns with the head", "still": "keeps its direction", "own": "turns on its own"}
-"""How a torso can move -> its description."""
+"""Motion of a torso -> its description."""
 TORSO_KEY = "torso"
 """Key of the report; null where the torso's motion could not be determined."""
 FOCAL_KEYS = {
@@ -46,8 +46,8 @@ FOCAL_SOURCES = {
     "estimated": "estimated from the head's landmarks",
     "avatar": "that of the avatar's camera",
 }
-"""Where the focal length of a camera without calibration is from (`Footage.focal`; "usual" and
-"solved" in captures of earlier versions) -> its description."""
+"""Origin of the focal length of a camera without calibration (`Footage.focal`; "usual" and "solved"
+in captures of earlier versions) -> its description."""
 POINTS_FILE = "torso_points.npz"
 
 AVATAR_MISFIT = "avatar"
@@ -115,15 +115,15 @@ def is_tracked(out: Path) -> bool:
 
 
 def rounded(values: Mapping[str, Mapping[int, float]]) -> dict[str, dict[str, float]]:
-    """What the report has of values by camera or region, and timestep."""
+    """Values by camera or region, and timestep, rounded for the report."""
     return {name: {str(t): round(v, 3) for t, v in own.items()} for name, own in values.items()}
 
 
 @dataclass(frozen=True)
 class TorsoMotion:
-    """Which of MOTIONS the torso follows, and what speaks for it.
+    """The motion of MOTIONS that the torso follows, and the evidence for it.
 
-    misfit    motion -> share of the points below the head, held out from fitting, that images do
+    misfit    motion -> fraction of the points below the head, held out from fitting, that images do
               not explain
     turn_deg  largest angle between torso and head
     shift_mm  largest distance of the torso from where the neck's joint holds it; 0 where a rotation
@@ -174,7 +174,7 @@ def read_torso_motion(capture: Path) -> TorsoMotion | None:
 
 @dataclass(frozen=True)
 class FocalLength:
-    """Of a single camera without calibration, in pixels.
+    """Focal length of a single camera without calibration, in pixels.
 
     source       which of FOCAL_SOURCES it is from
     interval_px  the interval that holds it with a probability of 90 %; None where it was not
@@ -207,7 +207,7 @@ def describe_focal_length(capture: Path) -> str:
 
 @dataclass(frozen=True)
 class TorsoPoints:
-    """Where the torso's surface is seen at a timestep: (N, 3) meters in the capture's world."""
+    """Visible points of the torso's surface at a timestep: (N, 3) meters in the capture's world."""
 
     timestep: int
     at: np.ndarray

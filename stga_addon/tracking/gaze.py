@@ -1,4 +1,4 @@
-"""Where a person looks: the eyes' joints, turned so that the irises are where they are seen."""
+"""Gaze: the eyes' joints, turned so that the model's irises are where the images show them."""
 
 from dataclasses import replace
 
@@ -30,12 +30,12 @@ EYEBALL_SIGMA_RAD = np.array([0.06, 0.025])
 are off: both lie too high together, but a face is symmetric, and sideways they are off against each
 other."""
 SINGLE_EYEBALL_SIGMA_RAD = np.array([0.06, 0.15])
-"""The same of a single eye, whose errors nothing is compared with."""
+"""The same for a single eye, whose errors cannot be compared with the other's."""
 MIN_REMOVED_RAD = 0.1
 """Constant turn of an eye, not taken for gaze, from which on a warning names it."""
 PARALLEL_QUANTILE = 0.8
-"""Of how far a take's left eye looks to the left of the right one, at which both look in parallel:
-eyes converge on what is near, and do not look apart."""
+"""Quantile, over a take, of the angle by which the left eye looks to the left of the right one, at
+which both look in parallel: eyes converge on near things and never diverge."""
 AXES = 2
 """About which an eye turns: x, by which it looks up and down, and y, sideways."""
 
@@ -43,8 +43,8 @@ AXES = 2
 def with_gaze(
     fit: HeadFit, take: RecordedTake, is_stranger: bool
 ) -> tuple[HeadFit, tuple[str, ...]]:
-    """The fit, its eyes turned so that the foremost points of the eyeballs are where the take's
-    landmarks have the irises; as it is where there are no eyeballs, or no landmarks of irises. And
+    """The fit with eyes turned so that the foremost points of the eyeballs are at the take's
+    landmarks of the irises; unchanged without eyeballs, or without landmarks of irises. And
     warnings, one sentence each.
 
     Beside hundreds of landmarks of skin, two of irises hardly count: eyes would turn by less than
@@ -92,8 +92,8 @@ def with_gaze(
 
 
 def _rest(turns: np.ndarray) -> np.ndarray:
-    """(2 E,) the turns of one or two eyes, the left one first, at which they look straight ahead
-    and in parallel, by all of a take (T, 2 E): their medians, as far apart as they seldom are."""
+    """(2 E,) turns of one or two eyes, the left one first, at which they look straight ahead and in
+    parallel, from all of a take (T, 2 E): their medians, as far apart as the eyes seldom are."""
     rest = np.median(turns, axis=0)
     if turns.shape[1] > AXES:
         left, right = (turns - rest)[:, 1::AXES].T

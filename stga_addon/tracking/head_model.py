@@ -26,7 +26,7 @@ MAX_EXTENT_M = 2.0
 MAX_COMPONENT_M = 100.0
 """Displacement of a vertex by a component at coefficient 1; scales of components differ from model
 to model."""
-MAX_JOINT_SHARE = 100.0  # Of a vertex in a joint's position, and of a joint in a vertex's motion
+MAX_JOINT_FRACTION = 100.0  # Of a vertex in a joint's position, and of a joint in a vertex's motion
 MIN_JOINT_WEIGHT = 0.5  # Skinning weight that some vertex must have for a joint to count as present
 
 
@@ -150,8 +150,8 @@ def checked(path: Path, head: HeadModel) -> HeadModel:
     bounds = {
         template: (model.v_template, MAX_COORDINATE_M),
         **{name: (array, MAX_COMPONENT_M) for name, array in shapes.items()},
-        "J_regressor": (model.j_regressor, MAX_JOINT_SHARE),
-        "weights": (model.weights, MAX_JOINT_SHARE),
+        "J_regressor": (model.j_regressor, MAX_JOINT_FRACTION),
+        "weights": (model.weights, MAX_JOINT_FRACTION),
     }
     for name, (array, limit) in bounds.items():
         largest = float(np.abs(array).max(initial=0))

@@ -15,7 +15,7 @@ from .face_networks import FaceNetworks
 from .fit import ROUNDS, HeadFit, RecordedTake, fit_head, posed_mesh
 from .head_model import HeadModel
 from .posed_points import PosedPoints, face_size, split
-from .stages import Crew, Stage
+from .stages import Stage, Workers
 
 BIAS_ROUNDS = 3
 """Rounds in which the networks' bias is measured, each on heads fitted without that of the round
@@ -26,7 +26,7 @@ BIAS_TIMESTEPS = 12
 
 @dataclass(frozen=True)
 class KnownPerson:
-    """Whom a tracked capture shows.
+    """The person whom a tracked capture shows.
 
     fit     the head, without a take's parameters
     camera  that recorded the person; None of several
@@ -40,8 +40,8 @@ class KnownPerson:
 
 
 def captured_person(capture: Capture, name: str = "") -> KnownPerson:
-    """Whose head a capture was tracked with. Raises StgaError, beginning with `name` or the
-    folder's, where it was tracked with neither FLAME nor the bundled head."""
+    """The person whose head a capture was tracked with. Raises StgaError, beginning with `name` or
+    the folder's, where it was tracked with neither FLAME nor the bundled head."""
     sequence = capture.flame
     if sequence is None:
         where = name or capture.root
@@ -54,8 +54,8 @@ def captured_person(capture: Capture, name: str = "") -> KnownPerson:
 
 
 def cameras_of(capture: Capture) -> dict[int, Camera]:
-    """By their index; where never two show one timestep, as a phone's in several takes, the first
-    take's stands for all."""
+    """Index -> camera. Where no two cameras show one timestep, as a phone's in several takes, the
+    first take's camera stands for all."""
     views = sorted(capture.all_views, key=lambda view: view.timestep)
     found = {view.camera_index: view.camera for view in views}
     if cameras_at_once(views) > 1:
@@ -63,7 +63,7 @@ def cameras_of(capture: Capture) -> dict[int, Camera]:
     return {view.camera_index: found[view.camera_index] for view in views[:1]}
 
 
-def without_own_bias(take: RecordedTake, person: KnownPerson, crew: Crew) -> RecordedTake:
+def without_own_bias(take: RecordedTake, person: KnownPerson, workers: Workers) -> RecordedTake:
     """The take, each camera's landmarks corrected by the networks' bias: how far, in the median,
     they are off in pictures of the avatar, drawn with fitted heads as the camera sees them.
 
@@ -79,9 +79,11 @@ def without_own_bias(take: RecordedTake, person: KnownPerson, crew: Crew) -> Rec
     for _ in range(BIAS_ROUNDS):
         part = replace(corrected, landmarks={t: corrected.landmarks[t] for t in some})
         work = fit_head, (person.fit.head, part)
-        fit: HeadFit = crew.helpers.run(*work, lambda steps: crew.report(Stage.FIT, 0, ROUNDS))
+        fit: HeadFit = workers.helpers.run(
+            *work, lambda steps: workers.report(Stage.FIT, 0, ROUNDS)
+        )
         points = PosedPoints(fit.head.model, take.places)
-        shares: dict[str, list[np.ndarray]] = {}
+        fractions: dict[str, list[np.ndarray]] = {}
         for timestep, values in fit.parameters.items():
             own = take.landmarks[timestep]
             mesh = posed_mesh(fit, values)
@@ -92,8 +94,8 @@ def without_own_bias(take: RecordedTake, person: KnownPerson, crew: Crew) -> Rec
                 if len(faces) == 1:
                     found = landmark_bias.without_bias(faces[0], camera, neutral, take.reliable)
                     away = found - camera.project(head)[0]
-                    shares.setdefault(name, []).append(away / face_size(faces[0]))
-        bias = {name: np.median(found, axis=0) for name, found in shares.items()}
+                    fractions.setdefault(name, []).append(away / face_size(faces[0]))
+        bias = {name: np.median(found, axis=0) for name, found in fractions.items()}
         moved = {}
         for timestep, own in take.landmarks.items():
             seen = zip(own.names, own.points, strict=True)

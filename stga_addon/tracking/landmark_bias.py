@@ -1,5 +1,4 @@
-"""How far the networks' landmarks lie from where they belong on a head, by the direction that it is
-seen from."""
+"""Bias of the networks' landmarks on a head, by the direction from which a camera sees it."""
 
 from functools import cache
 from pathlib import Path

@@ -18,7 +18,7 @@ from .fit import MIN_LANDMARKS
 from .folder import PLACES_FILE
 from .footage.model import Footage, FootageCamera
 from .posed_points import SurfacePoints
-from .stages import Crew, Stage
+from .stages import Stage, Workers
 
 MIN_BARYCENTRIC = -1e-3
 """Least barycentric coordinate of a landmark's place."""
@@ -28,12 +28,12 @@ MAX_PIXELS = 1e5
 """Largest coordinate of a landmark, three times as far as the largest image reaches."""
 MAX_CONFIDENCE = 1e6
 """Largest confidence of a landmark: some detectors write scores instead of 0…1."""
-MAX_TWO_FACES_SHARE = 0.34
-"""Share of a camera's frames, or of all where each camera has one, with a second face, beyond which
-the footage is not of one person: a pattern on a wall may look like one."""
+MAX_TWO_FACES_FRACTION = 0.34
+"""Fraction of a camera's frames, or of all where each camera has one, with a second face, beyond
+which the footage is not of one person: a pattern on a wall may look like one."""
 MIN_PART_TIMESTEPS = 50
-"""Of a camera's parts, which are worked on at once, and as many as there may be helpers: each
-decodes a video from the key frame before it, or from the beginning."""
+"""Least number of timesteps in a part of a camera's take. There are as many parts as helpers at
+most: each decodes a video from the key frame before it, or from the beginning."""
 MIN_OVERLAP = 0.3  # Two faces whose boxes share this much of their area are one, found twice
 
 
@@ -63,7 +63,7 @@ def detect_landmarks(
     detector: FaceNetworks,
     unbiased: Callable[[np.ndarray, Camera], np.ndarray],
     folder: Path,
-    crew: Crew,
+    workers: Workers,
 ) -> dict[str, CameraLandmarks]:
     """Landmarks by camera; each camera's are written to `folder`, and read from there where they
     are already.
@@ -84,13 +84,13 @@ def detect_landmarks(
             parts = [(camera, part, detector) for part in parts_of(camera.timesteps, limit)]
             seen = [
                 faces
-                for part in crew.map(_detect, parts, (Stage.LANDMARKS, done, total))
+                for part in workers.map(_detect, parts, (Stage.LANDMARKS, done, total))
                 for faces in part
             ]
             several = [t for t, own in zip(camera.timesteps, seen, strict=True) if len(own) > 1]
             if len(camera.timesteps) == 1:
                 crowded += [(camera, timestep) for timestep in several]
-            elif len(several) > MAX_TWO_FACES_SHARE * len(camera.timesteps):
+            elif len(several) > MAX_TWO_FACES_FRACTION * len(camera.timesteps):
                 raise StgaError(
                     f"{camera.source(several[0])}: camera {camera.name} sees {len(several)} of "
                     f"{len(camera.timesteps)} frames with two faces, the first at timestep "
@@ -108,8 +108,8 @@ def detect_landmarks(
         # in the file's precision, whether it was detected now or before
         found[camera.name] = read_camera(path, camera)
         done += len(camera.timesteps)
-        crew.report(Stage.LANDMARKS, done, total)
-    if len(crowded) > MAX_TWO_FACES_SHARE * total:
+        workers.report(Stage.LANDMARKS, done, total)
+    if len(crowded) > MAX_TWO_FACES_FRACTION * total:
         camera, timestep = crowded[0]
         raise StgaError(
             f"{camera.source(timestep)}: is one of {len(crowded)} of {total} images with two "
@@ -196,13 +196,13 @@ def read_places(path: Path, triangles: int) -> tuple[SurfacePoints, np.ndarray]:
     barycentric = floats(path, arrays, "barycentric", (len(face), 3), "biuf")
     if not np.isfinite(barycentric).all():
         raise StgaError(f"{path}: barycentric: expected finite numbers")
-    shares = np.where(used[:, None], barycentric, 1 / 3)
-    if not (shares >= MIN_BARYCENTRIC).all():
+    fractions = np.where(used[:, None], barycentric, 1 / 3)
+    if not (fractions >= MIN_BARYCENTRIC).all():
         raise StgaError(f"{path}: barycentric: expected numbers from 0 up")
     with np.errstate(over="ignore"):
-        if not (np.abs(shares.sum(1) - 1) <= MAX_SUM_ERROR).all():
+        if not (np.abs(fractions.sum(1) - 1) <= MAX_SUM_ERROR).all():
             raise StgaError(f"{path}: barycentric: expected rows that add up to 1")
-    return SurfacePoints(np.maximum(face, 0).astype(np.int64), shares), used
+    return SurfacePoints(np.maximum(face, 0).astype(np.int64), fractions), used
 
 
 def check_count(found: Mapping[str, CameraLandmarks], places: SurfacePoints) -> None:

@@ -3,7 +3,7 @@
 A matte is the coverage of each pixel by the person whose head was tracked. What is likely the
 person (by a network, or by the difference from a clean plate) and the tracked head are the seeds of
 OpenCV's GrabCut (Rother et al. 2004), which finds the outline in between. In a band along it,
-coverage is that share of the way from the backdrop's color around the pixel to the person's that
+coverage is that fraction of the way from the backdrop's color around the pixel to the person's that
 the pixel's color lies at; where both colors are alike, the band is a smooth edge. Hair that stands
 off the head, before an even backdrop, has a wider band: the backdrop is seen between its strands.
 """
@@ -24,7 +24,7 @@ from .appearance import box_of, mean_around, reduced
 from .face_networks import PersonNetwork
 from .folder import MATTES_FILE, mask_name
 from .footage.model import Footage, FootageCamera, write_png
-from .stages import Crew, Stage
+from .stages import Stage, Workers
 
 PART_TIMESTEPS = 24
 """Timesteps of a camera that are worked on at once, at most."""
@@ -42,28 +42,28 @@ MAX_CUT_SIDE_PX = 400
 them."""
 CUT_ITERATIONS = 1
 """Iterations of GrabCut."""
-CUT_MARGIN_SHARE = 0.04
+CUT_MARGIN_FRACTION = 0.04
 """Error of the network's outline as a fraction of the head's size (root of its area in the
 image)."""
-HEAD_MARGIN_SHARE = 0.06
+HEAD_MARGIN_FRACTION = 0.06
 """Error of the tracked head's outline, of the head's size: further inside are surely persons."""
-BAND_SHARE = 0.018
+BAND_FRACTION = 0.018
 """Half of the soft band's width as a fraction of the head's size."""
-HAIR_BAND_SHARE = 0.1
+HAIR_BAND_FRACTION = 0.1
 """The same within the outline where hair stands out from the tracked head: the backdrop is seen
 between strands."""
-HAIR_ROWS_SHARE = 0.6
+HAIR_ROWS_FRACTION = 0.6
 """Of the tracked head's height, from its top, in which such hair is; below it are clothes."""
-OPAQUE_HAIR_SHARE = 0.9
+OPAQUE_HAIR_FRACTION = 0.9
 """Of the way from the backdrop's color to the hair's, from which hair is opaque: gloss is a little
 nearer to a bright backdrop."""
 EVEN_COLORS_WEIGHT = 4.0
-"""Of the variance of both sides' colors, beside SIMILAR_COLORS_LEVELS, in what hair's coverage is
-trusted: before a room and in dyed hair, a pixel's color tells nothing."""
-NEIGHBORHOOD_SHARES = (0.03, 0.12)
+"""Weight of the variance of both sides' colors, beside SIMILAR_COLORS_LEVELS, in the confidence of
+hair's coverage: before a room and in dyed hair, a pixel's color is no evidence."""
+NEIGHBORHOOD_FRACTIONS = (0.03, 0.12)
 """Standard deviations of the neighborhoods that colors are means of, as fractions of the head's
 size."""
-REACH_SHARE = 1.0
+REACH_FRACTION = 1.0
 """Distance from the head that hair reaches, as a fraction of its size; clothes reach farther,
 below."""
 SIMILAR_COLORS_LEVELS = 30.0
@@ -72,21 +72,21 @@ PLATE_NOISE_LEVELS = 10.0
 """Difference from a clean plate, of 255, that noise makes."""
 PLATE_SURE_LEVELS = 40.0
 """Difference from a clean plate, of 255, that only a person makes."""
-MAX_HOLE_SHARE = 0.01
+MAX_HOLE_FRACTION = 0.01
 """Area of a hole in the person, of the head's, that is filled: highlights, patterned cloth."""
 
 BAR_FRAMES = 8
 """Number of frames, spread over the take, in each of which a bar must be of one color."""
 BAR_LEVELS = 12
 """Largest difference of a pixel's channels from the bar's color, of 255: compression is noisy."""
-MIN_BAR_SHARE = 0.99
+MIN_BAR_FRACTION = 0.99
 """Fraction of the pixels of a row, or column, that have the bar's color."""
-MIN_END_SHARE = 0.5
+MIN_END_FRACTION = 0.5
 """Fraction of the pixels beyond a bar that have another color: a plain backdrop is no bar, because
 most of the row in which hair begins is backdrop as well."""
 BAR_END_PX = 2
 """Number of rows beyond a bar that compression mixes with it."""
-MAX_BAR_SHARE = 0.4
+MAX_BAR_FRACTION = 0.4
 """Fraction of the image's height, or width, up to which a bar is one."""
 
 Sides = tuple[int, int, int, int]
@@ -100,7 +100,7 @@ def with_mattes(
     head_pixels: HeadPixels,
     out: Path,
     source: dict[str, Any],
-    crew: Crew,
+    workers: Workers,
 ) -> tuple[Footage, tuple[str, ...]]:
     """The footage with a mask for every frame, and warnings.
 
@@ -127,9 +127,9 @@ def with_mattes(
             warnings.append(_bar_warning(camera, bars))
         work = [(camera, bars, {t: files[t] for t in part}, head_pixels) for part in parts]
         done += len(kept)
-        found = crew.map(_write_mattes, work, (Stage.MATTES, done, total))
+        found = workers.map(_write_mattes, work, (Stage.MATTES, done, total))
         done += len(left)
-        crew.report(Stage.MATTES, done, total)
+        workers.report(Stage.MATTES, done, total)
         known = {t: is_seen for part in found for t, is_seen in part.items()}
         unseen += [f"{camera.name} at timestep {t}" for t in left if not known.get(t, True)]
         mattes = {t: file for t, file in files.items() if t in kept or t in known}
@@ -168,12 +168,17 @@ def _bar(frames: np.ndarray) -> int:
     """Number of the first rows of frames (N, H, W, 3) that a bar covers, its mixed end included."""
     color = np.median(frames[:, 0], axis=(0, 1))
     count = frames.shape[1]
-    most = int(MAX_BAR_SHARE * count)
-    shares = (np.abs(frames[:, : most + BAR_END_PX + 1] - color).max(axis=3) <= BAR_LEVELS).mean(2)
-    is_bar = shares.min(axis=0) >= MIN_BAR_SHARE
+    most = int(MAX_BAR_FRACTION * count)
+    fractions = (np.abs(frames[:, : most + BAR_END_PX + 1] - color).max(axis=3) <= BAR_LEVELS).mean(
+        2
+    )
+    is_bar = fractions.min(axis=0) >= MIN_BAR_FRACTION
     depth = int(np.argmin(is_bar)) if not is_bar.all() else count
     end = depth + BAR_END_PX
-    if not 0 < depth <= most or 1 - shares[:, min(end, shares.shape[1] - 1)].mean() < MIN_END_SHARE:
+    if (
+        not 0 < depth <= most
+        or 1 - fractions[:, min(end, fractions.shape[1] - 1)].mean() < MIN_END_FRACTION
+    ):
         return 0
     return end
 
@@ -229,20 +234,20 @@ def find_matte(image: np.ndarray, probability: np.ndarray, head: np.ndarray) -> 
     cut = _cut(cv2, pixels, likely, heads > 0.5, scale * size).astype(np.float32)
     person = cv2.resize(cut, whole, interpolation=cv2.INTER_LINEAR) > 0.5
     # coverage in a band along the person's outline, and what is near it
-    band = max(1.0, BAND_SHARE * size)
+    band = max(1.0, BAND_FRACTION * size)
     matte = np.where(person, np.uint8(255), np.uint8(0))
     near = box_of(person, math.ceil(band) + 2)
     outline = person[near]
     outside = ~_grown(cv2, outline, band)
     narrow = _shrunk(cv2, outline, band)
-    is_hair = narrow & ~_shrunk(cv2, outline, HAIR_BAND_SHARE * size)
+    is_hair = narrow & ~_shrunk(cv2, outline, HAIR_BAND_FRACTION * size)
     is_hair &= _may_be_hair(cv2, head, band)[near]
     inside = narrow & ~is_hair
     unknown = np.nonzero(~inside & ~outside)
     if not (len(unknown[0]) and inside.any() and outside.any()):
         return matte
     places = np.stack([own + side.start for own, side in zip(unknown, near, strict=True)], axis=1)
-    deviations = [share * size for share in NEIGHBORHOOD_SHARES]
+    deviations = [fraction * size for fraction in NEIGHBORHOOD_FRACTIONS]
     in_hair = is_hair[unknown]
     squares = cv2.pow(image.astype(np.float32), 2)
     means = []
@@ -258,12 +263,12 @@ def find_matte(image: np.ndarray, probability: np.ndarray, head: np.ndarray) -> 
     towards = color - backdrop
     contrast = (towards**2).sum(axis=1)
     colors = image[near][unknown]
-    share = ((colors - backdrop) * towards).sum(axis=1) / np.maximum(contrast, 1e-3)
-    share[in_hair] /= OPAQUE_HAIR_SHARE
+    fraction = ((colors - backdrop) * towards).sum(axis=1) / np.maximum(contrast, 1e-3)
+    fraction[in_hair] /= OPAQUE_HAIR_FRACTION
     edge = cv2.GaussianBlur(outline.astype(np.float32), (0, 0), max(0.7, band / 3))
     doubt = 3 * SIMILAR_COLORS_LEVELS**2 + EVEN_COLORS_WEIGHT * variance
     trust = contrast / (contrast + doubt)
-    coverage = trust * np.clip(share, 0, 1) + (1 - trust) * edge[unknown]
+    coverage = trust * np.clip(fraction, 0, 1) + (1 - trust) * edge[unknown]
     matte[near][unknown] = (255 * coverage + 0.5).astype(np.uint8)
     return matte
 
@@ -274,7 +279,7 @@ def _may_be_hair(cv2: Any, head: np.ndarray, margin: float) -> np.ndarray:
     if not len(rows):
         return np.zeros_like(head)
     found = ~_grown(cv2, head, margin)
-    found[int(rows[0] + HAIR_ROWS_SHARE * np.ptp(rows)) :] = False
+    found[int(rows[0] + HAIR_ROWS_FRACTION * np.ptp(rows)) :] = False
     return np.asarray(found)
 
 
@@ -284,17 +289,17 @@ def by_plate(image: np.ndarray, plate: np.ndarray) -> np.ndarray:
 
     smooth, backdrop = (cv2.GaussianBlur(each, (0, 0), 1.0) for each in (image, plate))
     difference = np.abs(smooth.astype(np.float32) - backdrop).max(axis=2)
-    share = (difference - PLATE_NOISE_LEVELS) / (PLATE_SURE_LEVELS - PLATE_NOISE_LEVELS)
-    return np.asarray(np.clip(share, 0, 1), np.float32)
+    fraction = (difference - PLATE_NOISE_LEVELS) / (PLATE_SURE_LEVELS - PLATE_NOISE_LEVELS)
+    return np.asarray(np.clip(fraction, 0, 1), np.float32)
 
 
 def _cut(
     cv2: Any, image: np.ndarray, probability: np.ndarray, head: np.ndarray, size: float
 ) -> np.ndarray:
     """(H, W) bool: the person; size: of the head in pixels."""
-    core = _shrunk(cv2, head, HEAD_MARGIN_SHARE * size)
-    margin = max(2.0, CUT_MARGIN_SHARE * size)
-    reach = _grown(cv2, head, REACH_SHARE * size)  # of hair; the body's is all below
+    core = _shrunk(cv2, head, HEAD_MARGIN_FRACTION * size)
+    margin = max(2.0, CUT_MARGIN_FRACTION * size)
+    reach = _grown(cv2, head, REACH_FRACTION * size)  # of hair; the body's is all below
     if head.any():
         reach[int(np.flatnonzero(head.any(axis=1)).mean()) :] = True
     surely = core | _shrunk(cv2, probability > SURE, margin)
@@ -305,7 +310,7 @@ def _cut(
     if 0 < np.isin(marks, (cv2.GC_FGD, cv2.GC_PR_FGD)).mean() < 1:  # it learns the colors of both
         cv2.setRNGSeed(0)  # of the clusters that the color models begin with
         models = (np.zeros((1, 65)), np.zeros((1, 65)))
-        near = box_of(marks != cv2.GC_BGD, math.ceil(REACH_SHARE * size))
+        near = box_of(marks != cv2.GC_BGD, math.ceil(REACH_FRACTION * size))
         colors = image[near][..., ::-1].copy()
         part = marks[near].copy()
         cv2.grabCut(colors, part, None, *models, CUT_ITERATIONS, cv2.GC_INIT_WITH_MASK)
@@ -317,7 +322,7 @@ def _cut(
     kept = np.isin(label, of_head) if core.any() else found > 0
     holes = (binary_fill_holes(kept) & ~kept).astype(np.uint8)
     _, label, statistics, _ = cv2.connectedComponentsWithStats(holes, connectivity=4)
-    filled = statistics[:, cv2.CC_STAT_AREA] <= MAX_HOLE_SHARE * head.sum()
+    filled = statistics[:, cv2.CC_STAT_AREA] <= MAX_HOLE_FRACTION * head.sum()
     filled[0] = False
     return kept | filled[label]
 

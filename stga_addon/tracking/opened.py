@@ -1,4 +1,5 @@
-"""Footage that is about to be tracked: what of it is on disk already, and what is to be done."""
+"""Footage that is about to be tracked: which of its results are on disk already, and what is to be
+done."""
 
 import hashlib
 from collections.abc import Iterable
@@ -38,7 +39,7 @@ class TrackingOptions:
     person: KnownPerson | None = None
 
 
-USUAL_OPTIONS = TrackingOptions()
+DEFAULT_OPTIONS = TrackingOptions()
 
 
 @dataclass(frozen=True)

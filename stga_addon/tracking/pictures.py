@@ -1,5 +1,5 @@
-"""Pictures of the head over the footage: for whoever watches the tracking, and the contact sheet of
-a tracked take, with errors of all views and the mesh drawn over the worst."""
+"""Pictures of the head over the footage, shown while it is tracked; and the contact sheet of a
+tracked take, with errors of all views and the mesh drawn over the worst."""
 
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
@@ -71,8 +71,8 @@ class PosedHead:
 def picture_of_first_frame(
     head: HeadModel, footage: Footage, detector: FaceNetworks, take: RecordedTake
 ) -> dict[str, np.ndarray] | None:
-    """The head on the first frame, within seconds; None where no face, or several, are seen. take:
-    of which landmarks are not known yet."""
+    """The head on the first frame, within seconds; None where no face, or several, are visible.
+    take: one whose landmarks are not known yet."""
     timestep = footage.timesteps[0]
     seeing = [camera for camera in footage.cameras if timestep in camera.timesteps]
     seeing = evenly_spread(seeing, FIRST_CAMERAS)
@@ -130,7 +130,7 @@ def write_contact_sheet(
     """Write a PNG: a chart of the errors, cameras down and timesteps across, and the worst views
     with the mesh. What lies outside a view's mask is green.
 
-    misfit: region of the face -> timestep -> share of the images that is not explained; it is
+    misfit: region of the face -> timestep -> fraction of the images that is not explained; it is
     charted below, and counts as much as the reprojection error in which views are the worst. Raises
     StgaError where the file cannot be written or a frame cannot be read.
     """
@@ -185,8 +185,8 @@ def _chart(groups: Sequence[tuple[Errors, float]], timesteps: tuple[int, ...]) -
         _write(chart, (0, row * CELL_HEIGHT), name[-22:], CELL_HEIGHT - 3)
         cells = np.empty((1, len(timesteps), 3), np.uint8)
         for column, timestep in enumerate(timesteps):
-            share = own.get(timestep, 0.0) / median
-            color = [np.interp(share, stops, channel) for channel in ERROR_COLORS.T]
+            fraction = own.get(timestep, 0.0) / median
+            color = [np.interp(fraction, stops, channel) for channel in ERROR_COLORS.T]
             cells[0, column] = color if timestep in own else NO_FACE
         size = width - NAME_WIDTH, CELL_HEIGHT - 1
         strip = Image.fromarray(cells).resize(size, Image.Resampling.NEAREST)

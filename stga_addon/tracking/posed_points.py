@@ -104,7 +104,7 @@ class PosedPoints:
         turns = left_jacobians(posed.angles).astype(self._precision)
         first = self.dirs.shape[2]
         used = self._used
-        share = self._corner_weights.sum(2)
+        fraction = self._corner_weights.sum(2)
         found = np.empty((count, 3, first + RIGID_SIZE), self._precision)
         by_pose = found[..., first:-TRANSLATION_SIZE]
         # Blending and skinning are one product of (N, 3, 9) and (N, 9, K).
@@ -112,13 +112,13 @@ class PosedPoints:
         places = joint_places(self.parents, posed.rotations, self.joint_dirs)
         moved: np.ndarray = places - posed.rotations @ self.joint_dirs
         found[..., :first] = skin @ self.dirs.reshape(count, 9, first)
-        found[..., :first] += np.tensordot(share.T, moved[used], 1)
-        # Turning a joint turns about it what it and the joints below it carry, each with its share
-        # of the skin.
+        found[..., :first] += np.tensordot(fraction.T, moved[used], 1)
+        # Turning a joint turns about it what it and the joints below it carry, each with its
+        # fraction of the skin.
         turned = posed.corrected @ posed.rotations[used].swapaxes(1, 2) + posed.moved[used, None]
         corners = turned.reshape(*self._corner_weights.shape, 3)
         carried = np.einsum("jnc,jncx->jnx", self._corner_weights, corners)
-        below = (self._below[:, used] @ share)[..., None] * posed.places[:, None]
+        below = (self._below[:, used] @ fraction)[..., None] * posed.places[:, None]
         arms = np.tensordot(self._below[:, used], carried, 1) - below
         parents = [np.eye(3) if parent < 0 else posed.rotations[parent] for parent in self.parents]
         across = np.einsum("yxz,jyc->jzxc", cross_matrices(np.eye(3)), parents @ turns)

@@ -1,4 +1,4 @@
-"""What footage shows of a face: landmarks, detected or read, of a camera whose lens is known."""
+"""A face in footage: landmarks, detected or read, of a camera whose lens is known."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -28,11 +28,12 @@ from .landmarks import (
 )
 from .opened import OpenedFootage, begin_landmarks
 from .pictures import picture_of_first_frame
-from .stages import Crew, Stage
+from .stages import Stage, Workers
 
 BUNDLED_PLACES = Path(__file__).parent / "networks/bundled_head_places.npz"
-"""Of the bundled head, as `calibrate` finds them; made by `development/bundled_head.py`."""
-MIN_FACE_SHARE = 1 / 3  # Of the timesteps, at which a face has to be detected
+"""Landmarks on the bundled head, as `calibrate` finds them; made by
+`development/bundled_head.py`."""
+MIN_FACE_FRACTION = 1 / 3  # Of the timesteps, at which a face has to be detected
 FACE_REMEDY = "where the face is too small in the frame, crop the video to head and shoulders"
 MIN_FACE_PIXELS = 1.0  # Extent of the landmarks in an image, below which they are but a point
 
@@ -64,11 +65,11 @@ class RecordedFootage:
         return [name for name in self.detected if name not in sees]
 
 
-def record(opened: OpenedFootage, crew: Crew) -> RecordedFootage:
+def record(opened: OpenedFootage, workers: Workers) -> RecordedFootage:
     """The landmarks of the networks, kept in the capture's folder, or those of the options' folder.
     Raises StgaError where there are too few, and an interruption leaves what is detected."""
     given = opened.options.landmarks
-    detected, take = _detected(opened, crew) if given is None else _read(opened, given)
+    detected, take = _detected(opened, workers) if given is None else _read(opened, given)
     check_count(detected, take.places)
     neutral = _neutral(opened, take)
     if np.ptp(neutral[take.reliable], axis=0).max() < head_fit.MIN_FACE_M:
@@ -84,18 +85,20 @@ def record(opened: OpenedFootage, crew: Crew) -> RecordedFootage:
     return found
 
 
-def with_focal(recorded: RecordedFootage, crew: Crew, likely: Camera | None) -> RecordedFootage:
-    """The footage of a single camera of unknown lens with a focal length that is estimated, or that
-    of `likely` where it is within the estimate's interval."""
+def with_focal(
+    recorded: RecordedFootage, workers: Workers, likely: Camera | None
+) -> RecordedFootage:
+    """The footage of a single camera of unknown lens with a focal length that is estimated, or with
+    that of `likely` where it is within the estimate's interval."""
     footage = recorded.footage
     if footage.focal != "usual":
         return recorded
-    crew.report(Stage.FOCAL_LENGTH, 0, len(RATIOS))
+    workers.report(Stage.FOCAL_LENGTH, 0, len(RATIOS))
     (camera,) = footage.cameras
-    estimate: FocalEstimate = crew.helpers.run(
+    estimate: FocalEstimate = workers.helpers.run(
         estimated_focal,
         (recorded.opened.head, recorded.take),
-        lambda steps: crew.report(Stage.FOCAL_LENGTH, steps, len(RATIOS)),
+        lambda steps: workers.report(Stage.FOCAL_LENGTH, steps, len(RATIOS)),
     )
     pixels = estimate.pixels
     source = "estimated"
@@ -118,13 +121,15 @@ def in_world(recorded: RecordedFootage) -> RecordedFootage:
     return replace(recorded, take=replace(recorded.take, metric=metric))
 
 
-def _detected(opened: OpenedFootage, crew: Crew) -> tuple[dict[str, CameraLandmarks], RecordedTake]:
+def _detected(
+    opened: OpenedFootage, workers: Workers
+) -> tuple[dict[str, CameraLandmarks], RecordedTake]:
     """Where the networks find landmarks, kept in the folder; a take without landmarks yet."""
     out = opened.out
     footage = opened.footage
     is_begun = folder.is_begun(out)
     detector = FaceNetworks()
-    crew.report(Stage.HEAD_MODEL, 0, 1)
+    workers.report(Stage.HEAD_MODEL, 0, 1)
     model = opened.head.model
     if opened.head_file is None and opened.options.person is None:
         places, reliable = read_places(BUNDLED_PLACES, len(model.faces))
@@ -134,16 +139,16 @@ def _detected(opened: OpenedFootage, crew: Crew) -> tuple[dict[str, CameraLandma
     kept = out / folder.LANDMARKS_FOLDER
     write_places(kept / folder.PLACES_FILE, places, reliable)
     take = RecordedTake(places, reliable, {})
-    crew.show(partial(picture_of_first_frame, opened.head, footage, detector, take), {})
+    workers.show(partial(picture_of_first_frame, opened.head, footage, detector, take), {})
     try:
         neutral = places.on(model.v_template, model.faces)
         unbiased = partial(without_bias, neutral=neutral, reliable=reliable)
-        detected = detect_landmarks(footage, detector, unbiased, kept, crew)
+        detected = detect_landmarks(footage, detector, unbiased, kept, workers)
         _check_faces(footage, detected)
-        _check_share(footage, detected)
+        _check_fraction(footage, detected)
     except StgaError:
         if not is_begun:  # what it holds is of no use for other footage
-            crew.helpers.end()  # which may be writing frames
+            workers.helpers.end()  # which may be writing frames
             folder.clear(out)
         raise
     return detected, take
@@ -152,7 +157,7 @@ def _detected(opened: OpenedFootage, crew: Crew) -> tuple[dict[str, CameraLandma
 def _read(
     opened: OpenedFootage, landmarks: Path
 ) -> tuple[dict[str, CameraLandmarks], RecordedTake]:
-    """The landmarks of a folder; a take without landmarks yet."""
+    """The landmarks of a folder, and a take without landmarks yet."""
     footage = opened.footage
     detected = read_landmarks(footage, landmarks)
     _check_faces(footage, detected)
@@ -209,7 +214,7 @@ def _check_faces(footage: Footage, found: Mapping[str, CameraLandmarks]) -> None
         )
 
 
-def _check_share(footage: Footage, found: Mapping[str, CameraLandmarks]) -> None:
+def _check_fraction(footage: Footage, found: Mapping[str, CameraLandmarks]) -> None:
     """Raise StgaError where faces are detected at so few timesteps that the take would be a
     guess."""
     seen = {
@@ -218,11 +223,11 @@ def _check_share(footage: Footage, found: Mapping[str, CameraLandmarks]) -> None
         for timestep in camera.timesteps[camera.confidence.any(axis=1)].tolist()
     }
     total = len(footage.timesteps)
-    if len(seen) < MIN_FACE_SHARE * total:
+    if len(seen) < MIN_FACE_FRACTION * total:
         raise StgaError(
             f"{_first_frame(footage)}: a face, and one alone, is found at {len(seen)} of {total} "
-            f"timesteps, expected {MIN_FACE_SHARE:.0%} of them at least; {FACE_REMEDY}, or choose "
-            "the frames that show it"
+            f"timesteps, expected {MIN_FACE_FRACTION:.0%} of them at least; {FACE_REMEDY}, or "
+            "choose the frames that show it"
         )
 
 

@@ -1,4 +1,4 @@
-"""How far landmarks lie from those of the fitted head, and cameras that do not fit the others."""
+"""Distances of landmarks from those of the fitted head, and cameras that do not fit the others."""
 
 import numpy as np
 
@@ -10,9 +10,9 @@ from .posed_points import PosedPoints, face_size, split
 OUTLIER_FACTOR = 4.0
 """A camera is at fault whose landmarks miss the fitted head by this many times those of the
 others."""
-MIN_OUTLIER_SHARE = 0.03
+MIN_OUTLIER_FRACTION = 0.03
 """And by this fraction of the face's size."""
-MAX_USUAL_SHARE = 0.04
+MAX_MEDIAN_ERROR = 0.04
 """Median over the cameras, beyond which they do not see one head: up to 0.016 on sound footage; the
 demo's gives 0.06 where no camera is in step with another, and 0.2 mirrored."""
 
@@ -21,7 +21,7 @@ Errors = dict[str, dict[int, tuple[float, float]]]
 
 
 def reprojection_errors(fit: HeadFit, take: RecordedTake, footage: Footage) -> Errors:
-    """How far the landmarks of all cameras lie from those of the fitted head."""
+    """Distances of all cameras' landmarks from those of the fitted head."""
     points = PosedPoints(fit.head.model, take.places)
     errors: Errors = {camera.name: {} for camera in footage.cameras}
     for timestep, parameters in fit.parameters.items():
@@ -43,35 +43,37 @@ def median_px(errors: Errors) -> float:
 
 def misread_cameras(errors: Errors) -> list[str]:
     """Cameras whose landmarks do not fit what others see, the worst first; fewer than half."""
-    share = {
+    fraction = {
         name: float(np.median([part for _, part in own.values()]))
         for name, own in errors.items()
         if own
     }
-    if not share:
+    if not fraction:
         return []
-    least = max(MIN_OUTLIER_SHARE, OUTLIER_FACTOR * float(np.median(list(share.values()))))
-    return sorted((name for name, own in share.items() if own > least), key=lambda n: -share[n])
+    least = max(MIN_OUTLIER_FRACTION, OUTLIER_FACTOR * float(np.median(list(fraction.values()))))
+    return sorted(
+        (name for name, own in fraction.items() if own > least), key=lambda n: -fraction[n]
+    )
 
 
 def check_cameras(errors: Errors) -> None:
     """Raise StgaError for a camera that does not fit what others see, or where none fits."""
     seen = {name: [part for _, part in own.values()] for name, own in errors.items() if own}
-    share = {name: float(np.median(own)) for name, own in seen.items()}
+    fraction = {name: float(np.median(own)) for name, own in seen.items()}
 
     def at_worst(name: str) -> str:
         worst, (pixels, _) = max(errors[name].items(), key=lambda error: error[1][1])
         return f"camera {name}: its landmarks are off by {pixels:.0f} pixels at timestep {worst}"
 
-    for name, value in share.items():
-        others = [share[other] for other in share if other != name] or [value]
-        if value > max(MIN_OUTLIER_SHARE, OUTLIER_FACTOR * float(np.median(others))):
+    for name, value in fraction.items():
+        others = [fraction[other] for other in fraction if other != name] or [value]
+        if value > max(MIN_OUTLIER_FRACTION, OUTLIER_FACTOR * float(np.median(others))):
             raise StgaError(
                 f"{at_worst(name)}, far more than those of the other cameras; "
                 "check its calibration, synchronization and mirroring"
             )
-    if len(share) > 1 and float(np.median(list(share.values()))) > MAX_USUAL_SHARE:
+    if len(fraction) > 1 and float(np.median(list(fraction.values()))) > MAX_MEDIAN_ERROR:
         raise StgaError(
-            f"{at_worst(max(share, key=share.__getitem__))}, and those of the other cameras are "
-            "too; check the calibration, and whether all are synchronized and none mirrored"
+            f"{at_worst(max(fraction, key=fraction.__getitem__))}, and those of the other cameras "
+            "are too; check the calibration, and whether all are synchronized and none mirrored"
         )

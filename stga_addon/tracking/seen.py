@@ -1,4 +1,4 @@
-"""From landmarks to a head on its torso: fitted to the landmarks, then to what images show."""
+"""From landmarks to a head on its torso: fitted to the landmarks, then to the images."""
 
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
@@ -29,7 +29,7 @@ from .reprojection import (
     misread_cameras,
     reprojection_errors,
 )
-from .stages import Crew, Stage
+from .stages import Stage, Workers
 from .surface import fit_surface
 from .torso import FollowedTorso, follow_torso
 
@@ -58,17 +58,17 @@ class FittedHead:
     def errors(self) -> Errors:
         return reprojection_errors(self.fit, self.recorded.take, self.recorded.footage)
 
-    def show(self, crew: Crew, errors: Errors) -> None:
+    def show(self, workers: Workers, errors: Errors) -> None:
         """Draw the head over the footage, with figures of how well it fits."""
         quality = {"error_px": median_px(errors)}
-        shares = [share for own in self.misfits.values() for share in own.values()]
-        quality |= {"unexplained": float(np.mean(shares))} if shares else {}
-        crew.show(partial(picture_of_fit, self.fit, self.recorded.footage), quality)
+        fractions = [fraction for own in self.misfits.values() for fraction in own.values()]
+        quality |= {"unexplained": float(np.mean(fractions))} if fractions else {}
+        workers.show(partial(picture_of_fit, self.fit, self.recorded.footage), quality)
 
 
 @dataclass(frozen=True)
 class SeenHead:
-    """All that a capture is written from.
+    """All data from which a capture is written.
 
     footage   with its mattes
     warnings  one sentence each
@@ -81,19 +81,19 @@ class SeenHead:
     warnings: tuple[str, ...]
 
 
-def fit_landmarks(recorded: RecordedFootage, crew: Crew) -> FittedHead:
+def fit_landmarks(recorded: RecordedFootage, workers: Workers) -> FittedHead:
     """The head fitted to landmarks. Raises StgaError for cameras that do not see one head."""
     head = recorded.opened.head
     take = recorded.take
 
     def count(rounds: int) -> None:
-        crew.report(Stage.FIT, rounds, head_fit.ROUNDS)
+        workers.report(Stage.FIT, rounds, head_fit.ROUNDS)
 
     count(0)
     fit: HeadFit = (
-        crew.helpers.map(head_fit.fit_head, [(head, take)], count)[0]
+        workers.helpers.map(head_fit.fit_head, [(head, take)], count)[0]
         if len(take.landmarks) < LONG_TAKE
-        else crew.helpers.run(head_fit.fit_head, (head, take), count)
+        else workers.helpers.run(head_fit.fit_head, (head, take), count)
     )
     fitted = FittedHead(recorded, fit, {})
     errors = fitted.errors
@@ -104,35 +104,35 @@ def fit_landmarks(recorded: RecordedFootage, crew: Crew) -> FittedHead:
         footage = replace(footage, warnings=(*footage.warnings, unused))
         opened = replace(recorded.opened, footage=footage)
         recorded = replace(recorded, opened=opened, take=without_cameras(take, misread))
-        return fit_landmarks(recorded, crew)
+        return fit_landmarks(recorded, workers)
     check_cameras(errors)
-    fitted.show(crew, errors)
+    fitted.show(workers, errors)
     return fitted
 
 
-def fit_skin(fitted: FittedHead, crew: Crew) -> FittedHead:
+def fit_skin(fitted: FittedHead, workers: Workers) -> FittedHead:
     """The head of a person who is seen for the first time, fitted to images."""
     fitted = _with_images(fitted)
     recorded = fitted.recorded
-    fit, misfits = by_images(recorded.opened.head, fitted.fit, recorded.take, crew)
+    fit, misfits = by_images(recorded.opened.head, fitted.fit, recorded.take, workers)
     fit, warnings = with_gaze(fit, recorded.take, is_stranger=True)
     return _in_world(replace(fitted, fit=fit, misfits=misfits, warnings=warnings))
 
 
-def fit_expressions(fitted: FittedHead, person: HeadFit, crew: Crew) -> FittedHead:
+def fit_expressions(fitted: FittedHead, person: HeadFit, workers: Workers) -> FittedHead:
     """The head of a known person, whose surface need not be sought, posed as images show it."""
     fitted = _with_images(fitted)
-    dense = fit_dense(fitted.fit, fitted.recorded.take, crew)
+    dense = fit_dense(fitted.fit, fitted.recorded.take, workers)
     fit = fitted.fit if dense is None else dense.fit
     fit = replace(fit, shape=person.shape, static_offset=person.static_offset)
     fit, _ = with_gaze(fit, fitted.recorded.take, is_stranger=False)
     return _in_world(replace(fitted, fit=fit, misfits=_misfits(dense)))
 
 
-def with_torso(fitted: FittedHead, crew: Crew, bends: bool) -> SeenHead:
+def with_torso(fitted: FittedHead, workers: Workers, bends: bool) -> SeenHead:
     """The head on its torso, whose cloth may bend, in footage with mattes."""
     errors = fitted.errors
-    fitted.show(crew, errors)
+    fitted.show(workers, errors)
     recorded = fitted.recorded
     opened = recorded.opened
     footage = opened.footage
@@ -142,25 +142,25 @@ def with_torso(fitted: FittedHead, crew: Crew, bends: bool) -> SeenHead:
         plates = [camera.plate for camera in footage.cameras if camera.plate is not None]
         source = {**opened.source, "plates": [list(map(str, plates)), file_state(plates)]}
         pixels = partial(_head_pixels, fitted.fit, parameters)
-        footage, unseen = with_mattes(footage, pixels, opened.out, source, crew)
+        footage, unseen = with_mattes(footage, pixels, opened.out, source, workers)
         warnings += unseen
-    torso = follow_torso(fitted.fit, parameters, footage, crew, bends)
+    torso = follow_torso(fitted.fit, parameters, footage, workers, bends)
     return SeenHead(fitted, errors, footage, torso, warnings)
 
 
 def by_images(
-    head: HeadModel, fit: HeadFit, take: RecordedTake, crew: Crew
+    head: HeadModel, fit: HeadFit, take: RecordedTake, workers: Workers
 ) -> tuple[HeadFit, Misfits]:
     """The fit moved onto what the images show, and how badly they are explained. `fit` is what
     `fit_head` returns for `head`."""
-    dense = fit_dense(fit, take, crew)
+    dense = fit_dense(fit, take, workers)
     if dense is None:
-        return fit_surface(head, fit, take, crew), {}
+        return fit_surface(head, fit, take, workers), {}
     take = replace(take, landmarks=dense.landmarks)
-    fit = fit_surface(head, dense.fit, take, crew, dense=True)
+    fit = fit_surface(head, dense.fit, take, workers, dense=True)
     if fit is dense.fit:  # again, from where it is, would move it by hundredths of a millimeter
         return fit, _misfits(dense)
-    dense = fit_dense(fit, take, crew, settled=True)
+    dense = fit_dense(fit, take, workers, settled=True)
     assert dense is not None
     return dense.fit, _misfits(dense)
 
@@ -178,8 +178,8 @@ def interpolated(
 def _misfits(dense: DenseFit | None) -> Misfits:
     if dense is None:
         return {}
-    shares = {t: own.tolist() for t, own in dense.misfit.items()}
-    return {name: {t: own[n] for t, own in shares.items()} for n, name in enumerate(REGIONS)}
+    fractions = {t: own.tolist() for t, own in dense.misfit.items()}
+    return {name: {t: own[n] for t, own in fractions.items()} for n, name in enumerate(REGIONS)}
 
 
 def _with_images(fitted: FittedHead) -> FittedHead:
@@ -228,13 +228,13 @@ def _warnings(fitted: FittedHead) -> tuple[str, ...]:
     fit = fitted.fit
     missing = [timestep for timestep in footage.timesteps if timestep not in fit.parameters]
     listed = ", ".join(map(str, missing[:20])) + (", …" if len(missing) > 20 else "")
-    share = f"{len(missing)} of {len(footage.timesteps)} timesteps"
+    fraction = f"{len(missing)} of {len(footage.timesteps)} timesteps"
     blind = recorded.blind_cameras
     single = len(footage.cameras) == 1
     scale = f"{fit.to_capture.scale:.4g}"
     is_scaled = recorded.opened.keeps_world and not recorded.take.metric
     own = {
-        f"no face at {share}, interpolated: {listed}": bool(missing),
+        f"no face at {fraction}, interpolated: {listed}": bool(missing),
         f"no face in any frame of: {', '.join(blind)}": bool(blind),
         "one camera: size and distance of the head, and its depth, are those of the average "
         "head": single and recorded.opened.options.person is None,
@@ -250,7 +250,7 @@ def _warnings(fitted: FittedHead) -> tuple[str, ...]:
 
 
 def _focal_warning(estimate: FocalEstimate) -> str:
-    """How well the focal length is known, and what would settle it."""
+    """A sentence about how well the focal length is known, and what would determine it."""
     turn = "" if estimate.turn_deg > ENOUGH_TURN_DEG else "a head that turns by 30°, "
     return (
         f"the focal length is an estimate: {estimate.low:.0f} to {estimate.high:.0f} px with a "

@@ -1,4 +1,4 @@
-"""Where images and masks show the surface of a fitted head."""
+"""Surface of a fitted head as images and masks show it."""
 
 import math
 from dataclasses import dataclass, replace
@@ -36,11 +36,11 @@ OCCLUSION_M = 0.004
 DEPTH_IMAGE_SIDE = 300
 LUMA = np.array([0.299, 0.587, 0.114], np.float32)
 
-POINT_SHARE = 0.25
+POINT_FRACTION = 0.25
 """Weight of a surface point, whose patch has most pixels in common with its neighbors."""
 DIRECTIONS = 6
 """Steps of a direction's coordinates, about 10°."""
-MIN_PART_SHARE = 0.33
+MIN_PART_FRACTION = 0.33
 """Connected parts smaller than this fraction of the head (eyeballs, teeth) have no surface
 points."""
 MAX_OUTLINE_DISTANCE_M = 0.0005
@@ -53,7 +53,7 @@ OUTLINE_RADIUS_M = 0.01
 MAX_COSINE = 0.25
 """Cosine between normal and camera up to which a point moves the outline (15°)."""
 RIM_COSINE = 0.5
-"""The same of a triangle: those farther from the outline are not drawn."""
+"""The same for a triangle: triangles farther from the outline are not drawn."""
 PICTURE_SIDE = 600
 """Side in pixels with which the mesh's mask is drawn, since it has no soft edge."""
 MAX_ENLARGEMENT = 2
@@ -81,8 +81,8 @@ class Sweep:
 
 @dataclass(frozen=True)
 class SurfaceSearch:
-    """Surface points (N) that are looked for, by a sweep; near (N,) bool: of which masks may
-    tell."""
+    """Surface points (N) that are looked for, by a sweep; near (N,) bool: points near which masks
+    are evidence."""
 
     points: SurfacePoints
     near: np.ndarray
@@ -202,8 +202,8 @@ VisiblePoints = dict[tuple[int, ...], np.ndarray]
 
 @dataclass(frozen=True)
 class SeenSurface:
-    """Where cameras see N points of a surface: positions (N, 3) in meters, unit normals (N, 3) and
-    weights (N,)."""
+    """N visible points of a surface: positions (N, 3) in meters, unit normals (N, 3) and weights
+    (N,)."""
 
     position: np.ndarray
     normal: np.ndarray
@@ -226,7 +226,7 @@ def large_parts(model: FlameModel) -> np.ndarray:
     faces = model.faces
     numbers, part = np.unique(connected_parts(len(vertices), faces), return_inverse=True)
     extent = [np.ptp(vertices[part == number], axis=0).max() for number in range(len(numbers))]
-    large = np.array(extent) > MIN_PART_SHARE * np.ptp(vertices, axis=0).max()
+    large = np.array(extent) > MIN_PART_FRACTION * np.ptp(vertices, axis=0).max()
     return large[part[faces[:, 0]]]
 
 
@@ -260,20 +260,20 @@ def seen_surface(
             visible[key] = in_sight(camera, surface.vertices, surface.faces, at)
         cosines.append(facing(camera, at, normals) * visible[key])
     offset, correlation = surface_offsets(views, np.stack(cosines), at, normals, sweep)
-    weight = POINT_SHARE * correlation
+    weight = POINT_FRACTION * correlation
     moved = weight * offset
     close = surface._replace(points=at[near], normals=normals[near])
     for recording, mask in masks:
         camera = fit.to_capture.camera(recording)
         offset, known = outline_offsets(camera, mask, close, sweep.reach)
-        weight[near] += POINT_SHARE * known
-        moved[near] += POINT_SHARE * offset
+        weight[near] += POINT_FRACTION * known
+        moved[near] += POINT_FRACTION * offset
     mean = moved / np.maximum(weight, 1e-9)
     return SeenSurface(at + mean[:, None] * normals, normals, weight)
 
 
 def rounded_direction(direction: np.ndarray, steps: int) -> tuple[int, ...]:
-    """A direction (3,) in so many steps: within one, a head hides the same of itself."""
+    """A direction (3,), rounded to steps within which a head hides the same parts of itself."""
     return tuple(np.round(steps * direction / np.linalg.norm(direction)).astype(int).tolist())
 
 
@@ -384,5 +384,5 @@ def _crossed(
     row = np.arange(len(level))
     before = level[row, last]
     after = level[row, last + 1]
-    share = before / np.where(valid, before - after, 1)
-    return np.where(valid, steps[last] + share * (steps[1] - steps[0]), np.nan)
+    fraction = before / np.where(valid, before - after, 1)
+    return np.where(valid, steps[last] + fraction * (steps[1] - steps[0]), np.nan)

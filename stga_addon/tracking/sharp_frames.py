@@ -18,7 +18,7 @@ MIN_CORNERS = 8
 CORNER_QUALITY = 0.01
 """Least strength of a corner, relative to the strongest."""
 CORNER_DISTANCE_PX = 8
-"""Between corners."""
+"""Least distance between corners."""
 SHAKE_FRAMES = 9
 """Frames over which motion is averaged, so that a hand's shaking is none."""
 
@@ -82,7 +82,8 @@ def reduced_to(image: np.ndarray, side: int) -> np.ndarray:
 
 
 def _flow(before: np.ndarray, now: np.ndarray, last: np.ndarray) -> np.ndarray:
-    """(2,) median motion of corners, as a share of the image's longer side; `last` without any."""
+    """(2,) median motion of corners, as a fraction of the image's longer side; `last` without
+    any."""
     import cv2
 
     corners = cv2.goodFeaturesToTrack(before, CORNERS, CORNER_QUALITY, CORNER_DISTANCE_PX)

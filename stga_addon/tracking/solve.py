@@ -13,9 +13,11 @@ from .posed_points import PosedPoints, SurfacePoints, head_rotation, split
 LANDMARK_SIGMA_M = 0.002
 """Standard deviation of a landmark over people and views; coefficients have a standard deviation of
 1."""
-SCALE_SIGMA = 0.3  # Of the capture's scale, relative: the first guess comes from the average head
+SCALE_SIGMA = 0.3
+"""Relative standard deviation of the capture's scale, of which the average head gives the first
+guess."""
 SIZE_SIGMA = 0.02
-"""Standard deviation of the size of a head that one camera sees, relative to the average one's."""
+"""Standard deviation of the size of a head that one camera sees, relative to the average head."""
 JOINT_SIGMA_RAD = {
     "root": (3.0, 3.0, 3.0),
     "neck": (0.1, 0.1, 0.1),
@@ -23,40 +25,48 @@ JOINT_SIGMA_RAD = {
     "left_eye": (0.3, 0.3, 0.01),
     "right_eye": (0.3, 0.3, 0.01),
 }
-"""Landmarks of the face cannot tell the neck's rotation from the head's: nearly all of it becomes
-the root's."""
-WEIGHT_EXCESS_SIGMA = 0.1  # By which a coefficient that is a weight from 0 to 1 leaves that range
+"""Standard deviation of each joint's rotation vector. Landmarks of the face cannot distinguish the
+neck's rotation from the head's: the root takes nearly all of it."""
+WEIGHT_EXCESS_SIGMA = 0.1
+"""Standard deviation of how far a coefficient that is a weight leaves the range from 0 to 1."""
 LID_SHAPES = {"eyeBlink": 1.0, "eyeLookDown": 0.57}
-"""Shares by which shapes close an eye; it is closed where their weights, times these, add up to
-1."""
+"""Shape -> fraction by which it closes an eye at weight 1. The eye is closed where the sum of
+fraction times weight is 1."""
 TRANSLATION_SIGMA_M = 10.0
+"""Standard deviation of the head's position."""
 ABSENT_SIGMA = 1e-6
+"""Standard deviation of a joint that the head lacks, in radians."""
 EXPRESSION_ACCELERATION = 0.25
+"""Standard deviation of an expression coefficient's second difference over timesteps."""
 JOINT_ACCELERATION_RAD = 0.015
+"""Standard deviation of a joint's second difference."""
 TRANSLATION_ACCELERATION_M = 0.0015
-"""Standard deviations of second differences from one timestep to the next."""
+"""Standard deviation of the position's second difference."""
 LID_ACCELERATION = 1.0
-"""The same of LID_SHAPES: a blink closes the eyes within two or three frames of a video."""
-JUMP_SCALE = 3.0  # Standard deviations of a second difference beyond which it is a cut, no motion
+"""Standard deviation of the second difference of LID_SHAPES: a blink closes the eyes within two or
+three frames of a video."""
+JUMP_SCALE = 3.0
+"""Second difference, in standard deviations, above which it is a cut instead of motion."""
 MAX_ORDERED_CHANGE = 0.7
-"""Mean squared change of expression and jaw from one timestep to the next, as a share of that
-between any two, up to which timesteps follow each other in time."""
+"""Largest mean squared change of expression and jaw between neighboring timesteps, relative to that
+between any two, for which timesteps follow each other in time."""
 IDENTITY_ITERATIONS = 12
 TAKE_ITERATIONS = 8
+
 ROUGH_TAKE_ITERATIONS = 2
-"""Of a take whose identity is not yet known; it is solved again, from where that led."""
+"""Iterations for a take whose identity is not yet known; it is solved again from their result."""
 CONVERGED_STEP = 1e-3
 """Largest change of a parameter (standard deviations, radians, meters) after which iterations
 stop."""
 MIN_DISTANCE_M = 1e-9
-"""Distance of a landmark from the camera, below which it is the camera: it has no ray."""
+"""Distance between a landmark and the camera below which the landmark has no ray."""
 MIN_DEPTH_RATIO = 0.2
-"""Depth of a point on the head, in that of its landmark, below which residuals no longer grow: a
-head that a step moved behind the camera comes back."""
+"""Depth of a point on the head, relative to its landmark's, below which residuals no longer grow,
+so that a head that a step moved behind the camera comes back."""
 WINDOW = 192
+"""Timesteps that are solved at once, so that memory does not grow with the take."""
 OVERLAP = 24
-"""Timesteps solved at once, and how many of them two windows share: memory does not grow with the
-take."""
+"""Timesteps that two neighboring windows have in common."""
 
 
 Terms = Callable[[int, np.ndarray], tuple[np.ndarray, np.ndarray]]
@@ -277,7 +287,7 @@ def normal_equations(
 def residuals(
     points: PosedPoints, parameters: np.ndarray, observation: Observation
 ) -> tuple[np.ndarray, np.ndarray]:
-    """What landmarks miss by at parameters (K + 18,), in LANDMARK_SIGMA_M: (N, 3), and its
+    """Differences of landmarks at parameters (K + 18,), in LANDMARK_SIGMA_M: (N, 3), and their
     derivatives (N, 3, K + 18)."""
     positions, jacobian = points.linearized(*split(parameters))
     away = positions - observation.position
@@ -348,12 +358,12 @@ def _smooth_step(
     jump = second**2 * stiffness / JUMP_SCALE**2
     # a cut changes all parameters
     weight = stiffness / ((1 + jump) * (1 + jump.mean(axis=1, keepdims=True))) ** 2
-    for number, (difference, share) in enumerate(zip(second, weight, strict=True)):
+    for number, (difference, fraction) in enumerate(zip(second, weight, strict=True)):
         for row, first in enumerate((1.0, -2.0, 1.0)):
-            right[number + row] -= share * first * difference
+            right[number + row] -= fraction * first * difference
             for column, other in enumerate((1.0, -2.0, 1.0)[: row + 1]):
                 at = (number + column) * size
-                band[(row - column) * size, at : at + size] += share * first * other
+                band[(row - column) * size, at : at + size] += fraction * first * other
     return solveh_banded(band, right.ravel(), lower=True).reshape(count, size)
 
 
@@ -383,16 +393,18 @@ def prior_terms(head: HeadModel, values: np.ndarray) -> tuple[np.ndarray, np.nda
         precision[..., :-RIGID_SIZE] += (excess != 0) / WEIGHT_EXCESS_SIGMA**2
         right[..., :-RIGID_SIZE] -= excess / WEIGHT_EXCESS_SIGMA**2
         for side in ("Left", "Right"):
-            columns, shares = lid_shares(head.model, side)
-            beyond = np.maximum((weights[..., columns] * shares).sum(-1, keepdims=True) - 1, 0)
-            precision[..., columns] += (beyond > 0) * shares * shares.sum() / WEIGHT_EXCESS_SIGMA**2
-            right[..., columns] -= beyond * shares / WEIGHT_EXCESS_SIGMA**2
+            columns, fractions = lid_fractions(head.model, side)
+            beyond = np.maximum((weights[..., columns] * fractions).sum(-1, keepdims=True) - 1, 0)
+            precision[..., columns] += (
+                (beyond > 0) * fractions * fractions.sum() / WEIGHT_EXCESS_SIGMA**2
+            )
+            right[..., columns] -= beyond * fractions / WEIGHT_EXCESS_SIGMA**2
     return precision, right
 
 
-def lid_shares(model: FlameModel, side: str) -> tuple[list[int], np.ndarray]:
+def lid_fractions(model: FlameModel, side: str) -> tuple[list[int], np.ndarray]:
     """Columns (N,) of the expressions that close the eye on a side, "Left" or "Right", and their
-    shares (N,)."""
+    fractions (N,)."""
     names = model.expression_names
     known = [name for name in LID_SHAPES if name + side in names]
     columns = [names.index(name + side) for name in known]

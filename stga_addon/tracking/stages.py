@@ -1,4 +1,4 @@
-"""Stages of a tracking, and how they are reported."""
+"""Stages of a tracking, and their progress reports."""
 
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
@@ -14,7 +14,7 @@ class Stage(Enum):
     """What a tracking does, in order.
 
     title       what it is called
-    begin, end  of the progress: about its share of the time on two processors where one camera
+    begin, end  of the progress: about its part of the time on two processors where one camera
                 recorded a long video of 1080p (`stage_spans` knows of shorter ones); what precedes
                 it, where cameras are to be found, begins at -1, and what follows the capture at 1
     """
@@ -35,7 +35,7 @@ class Stage(Enum):
     REFINEMENT = ("Refinement", 0.355, 0.465)
 
     ONLY_DENSE = ("Dense tracking", 0.225, 0.465)
-    """In place of surface and refinement where one camera does not show the surface."""
+    """Instead of surface and refinement where one camera does not show the surface."""
     MATTES = ("Mattes", 0.465, 0.695)
 
     TORSO = ("Torso", 0.695, 0.83)
@@ -45,9 +45,9 @@ class Stage(Enum):
     HEADS = ("Heads", 0.98, 1.0)
 
     AVATAR = ("Avatar", 1.0, 2.0)
-    """Of a known person, whose avatar is posed in the capture."""
+    """A known person's avatar is posed in the capture."""
     CORRECTION = ("Solve", 0.0, 0.9)
-    """Of a capture, around heads that were posed by hand."""
+    """Correction of a capture around heads that were posed by hand."""
 
     def __init__(self, title: str, begin: float, end: float) -> None:
         self.title = title
@@ -78,8 +78,8 @@ def stage_spans(images: int, absent: Collection[Stage]) -> dict[Stage, tuple[flo
     times = dict[Stage, float]()
     for stage in Stage:
         if stage.begin >= 0 and stage.end <= 1 and stage not in (*absent, Stage.CORRECTION):
-            share = stage.end - stage.begin
-            times[stage] = FIXED_S.get(stage, 0.0) + IMAGE_S * images * share
+            fraction = stage.end - stage.begin
+            times[stage] = FIXED_S.get(stage, 0.0) + IMAGE_S * images * fraction
     total = sum(times.values())
     spans = {}
     begin = 0.0
@@ -100,15 +100,15 @@ Show = Callable[[Draw, Mapping[str, float]], None]
 
 
 def unreported(stage: Stage, done: int, total: int) -> None:
-    """The `ReportStage` that nobody reads."""
+    """A `ReportStage` that discards reports."""
 
 
 def unseen(draw: Draw, figures: Mapping[str, float]) -> None:
-    """The `Show` that nobody watches."""
+    """A `Show` that discards pictures."""
 
 
 @dataclass(frozen=True)
-class Crew:
+class Workers:
     """Who works on the stages of a tracking, and who is shown it."""
 
     helpers: Helpers

@@ -1,4 +1,4 @@
-"""Structure from motion (pycolmap): poses and the one lens of images of a still head, without a
+"""Structure from motion (pycolmap): poses and the common lens of images of a still head, without a
 calibration.
 
 Runs in a helping process: COLMAP has threads, and cannot be interrupted.
@@ -29,15 +29,16 @@ times as many points and an error of the focal length of 2 instead of 12 %."""
 EDGE_THRESHOLD = 20.0
 """Largest ratio of a feature's curvatures, twice COLMAP's: lashes, lips and seams are edges."""
 MAX_FEATURES = 4096
-"""Of an image, the largest ones: comparing two images takes the time of its square."""
+"""Largest number of features of an image, the largest ones: comparing two images takes a time that
+is quadratic in it."""
 NEAR_IMAGES = 10
 """Images of a video that are compared with one before them."""
 LOOP_STEP = 4
-"""Of every so many, all are compared: a camera may come back."""
+"""Every LOOP_STEP-th image is compared with all others of them: a camera may come back."""
 MIN_MODEL_IMAGES = 3
 """Images of the smallest model that COLMAP keeps."""
 LENS_GAIN = 0.03
-"""Least share by which a radial distortion lowers the residuals, for it to be believed."""
+"""Least fraction by which a radial distortion lowers the residuals, for it to be believed."""
 LENS_SHIFT_PX = 0.5
 """Least shift of an image's corners by a distortion that is believed."""
 LOSS_SCALE_PX = 1.0
@@ -45,7 +46,7 @@ LOSS_SCALE_PX = 1.0
 MIN_FACE_VIEWS = 2
 """Images in which a point lies on the face, for it to be one of the head."""
 PERSON_PROBABILITY = 0.5
-"""Of a pixel, from which on it is the person's."""
+"""Probability above which a pixel belongs to the person."""
 DATABASE = "features.db"
 IMAGES_FOLDER = "images"
 MASKS_FOLDER = "masks"
@@ -54,7 +55,7 @@ MODELS_FOLDER = "models"
 
 @dataclass(frozen=True)
 class Structure:
-    """What structure from motion found.
+    """Result of structure from motion.
 
     timesteps   (N,) of the images that have a pose
     poses       (N, 3, 4) from the world, whose unit is free, to OpenCV's camera axes
@@ -285,9 +286,9 @@ class _Search:
         return max(found.values(), key=_observations, default=None)
 
     def _mapped_again(self, found: Any) -> Any:
-        """The model, or that which COLMAP finds from its focal length, whichever sees points more
-        often: from a focal length that is far off, images are lost or placed wrong, as are the
-        first pairs of which they see points."""
+        """The model, or the one that COLMAP finds from its focal length, whichever observes points
+        more often. From a wrong focal length, images are lost or misplaced; so are the first pairs,
+        which determine the points."""
         database = self._colmap.Database.open(self._folder / DATABASE)
         (camera,) = database.read_all_cameras()
         (known,) = found.cameras.values()
@@ -298,8 +299,8 @@ class _Search:
         return found if again is None else max(found, again, key=_observations)
 
     def _with_lens(self, model: Any) -> Any:
-        """The model after a last, robust bundle adjustment; with a radial distortion where the
-        residuals clearly ask for one."""
+        """The model after a last, robust bundle adjustment, with a radial distortion where the
+        residuals clearly require one."""
         colmap = self._colmap
         radial = colmap.Reconstruction(model)
         (camera,) = radial.cameras.values()

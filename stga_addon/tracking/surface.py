@@ -1,5 +1,5 @@
-"""From a head fitted to landmarks to one fitted to the skin that the cameras see, with the person's
-own offsets."""
+"""From a head fitted to landmarks to one fitted to the skin that the cameras see, with smooth
+personal offsets."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
@@ -27,7 +27,7 @@ from .seen_surface import (
     surface_points,
 )
 from .solve import LANDMARK_SIGMA_M, Observation, person, solve_identity, solve_take
-from .stages import Crew, Stage
+from .stages import Stage, Workers
 
 IDENTITY_SWEEPS = (
     Sweep(0.010, 0.001, 0.0015),
@@ -45,19 +45,19 @@ SURFACE_POINTS = 2000
 """Points over the whole head."""
 SURFACE_TIMESTEPS = 6
 """Timesteps, spread over the take, whose surfaces identity and offsets are solved from."""
-LANDMARK_SHARE = 0.1
+LANDMARK_FRACTION = 0.1
 """Weight of landmarks beside surface points: a detector's errors are the same in every frame and
 stay."""
-TAKE_LANDMARK_SHARE = 0.2
+TAKE_LANDMARK_FRACTION = 0.2
 """The same once these errors are taken off, which takes several timesteps: where skin slides along
 itself, as brows do, only landmarks show it."""
-LIPS_LANDMARK_SHARE = 1.0
+LIPS_LANDMARK_FRACTION = 1.0
 """Weight of the lips' landmarks, beside which the surface does not show whether lips touch."""
 MIN_SEEN_POINTS = 150
 """Points of the surface that have to be found at a timestep; below it, landmarks are the better
 evidence."""
-MIN_SEEN_SHARE = 0.5
-"""Share of the timesteps in which a point must be found to be looked for at every timestep."""
+MIN_SEEN_FRACTION = 0.5
+"""Fraction of the timesteps in which a point must be found to be looked for at every timestep."""
 
 PART_TIMESTEPS = 24
 """Timesteps of a take that are searched at once, at most."""
@@ -78,7 +78,7 @@ def fit_surface(
     head: HeadModel,
     fit: HeadFit,
     take: RecordedTake,
-    crew: Crew,
+    workers: Workers,
     dense: bool = False,
 ) -> HeadFit:
     """The fit moved onto the surface that several cameras see; unchanged where no timestep has
@@ -105,7 +105,7 @@ def fit_surface(
     take = replace(take, landmarks=visible)
     points = surface_points(head, SURFACE_POINTS)
     early = (len(IDENTITY_SWEEPS) + len(OUTLINE_SWEEPS)) * len(chosen)
-    search = _Search(crew, early + len(timesteps))
+    search = _Search(workers, early + len(timesteps))
     start = replace(fit, parameters={t: fit.parameters[t] for t in chosen})
     solved = _solved_subject(head, start, take, points, search)
     if solved is None:
@@ -122,7 +122,7 @@ def fit_surface(
             poses = np.stack([fit.parameters[t] for t in observed])
             poses = solve_take(found.head, take.places, list(observed.values()), poses, fit.ordered)
             return replace(found, parameters=dict(zip(observed, poses, strict=True)))
-    often = np.mean([own.weight > 0 for own in seen.values()], axis=0) >= MIN_SEEN_SHARE
+    often = np.mean([own.weight > 0 for own in seen.values()], axis=0) >= MIN_SEEN_FRACTION
     rows = np.flatnonzero(often)
     sought = []
     for sweep, count in TAKE_SWEEPS:
@@ -135,15 +135,15 @@ class _Search:
     """Parts of a search for the surface, worked on at once by helping processes, and reported as
     so many timesteps of `total`."""
 
-    def __init__(self, crew: Crew, total: int) -> None:
+    def __init__(self, workers: Workers, total: int) -> None:
         self.done = 0
-        self._crew = crew
+        self._workers = workers
         self._total = total
 
     def __call__(self, work: Callable[..., list], parts: Sequence[tuple]) -> list:
         """The results of the parts' timesteps, in order."""
         at = Stage.SURFACE, self.done, self._total
-        found = [one for result in self._crew.map(work, parts, at) for one in result]
+        found = [one for result in self._workers.map(work, parts, at) for one in result]
         self.done += len(found)
         return found
 
@@ -151,8 +151,8 @@ class _Search:
 def _solved_subject(
     head: HeadModel, start: HeadFit, take: RecordedTake, points: SurfacePoints, search: _Search
 ) -> tuple[RecordedTake, HeadFit, dict[int, SeenSurface]] | None:
-    """Of `_identity`, by the skin, and by the masks' outlines where they are those of the skin; and
-    the take, without masks where they are not."""
+    """Result of `_identity` by the skin, and by the masks' outlines where these agree with the
+    skin; and the take, without masks where they do not."""
     near = near_landmarks(head, points, take)
     by_skin, by_outline = (
         [SurfaceSearch(points, near, sweep) for sweep in sweeps]
@@ -202,9 +202,9 @@ def _identity(
         if np.median([(own.weight > 0).sum() for own in seen.values()]) < MIN_SEEN_POINTS:
             return None
         base = with_offset(head, offset)
-        share = _landmark_shares(base, take.places)
+        fraction = _landmark_fractions(base, take.places)
         together = [
-            _joined(head_fit.landmarks_in_capture(take.landmarks[t], take, fit), share, own)
+            _joined(head_fit.landmarks_in_capture(take.landmarks[t], take, fit), fraction, own)
             for t, own in seen.items()
         ]
         starts = np.stack([fit.parameters[t][-RIGID_SIZE:] for t in seen])
@@ -264,11 +264,11 @@ def _whole_take(
     start[:, -RIGID_SIZE:] = [head_fit.rigid_start(at, own) for own in landmarks]
     start = solve_take(fit.head, take.places, landmarks, start, fit.ordered)
     rough = replace(fit, parameters=dict(zip(timesteps, start, strict=True)))
-    share = np.full(len(take.reliable), TAKE_LANDMARK_SHARE)
+    fraction = np.full(len(take.reliable), TAKE_LANDMARK_FRACTION)
     if len(fit.parameters) == 1:
-        share = _landmark_shares(fit.head, take.places)
+        fraction = _landmark_fractions(fit.head, take.places)
     parts = [
-        (*head_fit.excerpt(rough, take, part), [corrected[t] for t in part], share, sought)
+        (*head_fit.excerpt(rough, take, part), [corrected[t] for t in part], fraction, sought)
         for part in parts_of(timesteps, PART_TIMESTEPS)
     ]
     found, together = zip(*search(_found_part, parts), strict=True)
@@ -281,7 +281,7 @@ def _found_part(
     fit: HeadFit,
     take: RecordedTake,
     landmarks: Sequence[Observation],
-    share: np.ndarray,
+    fraction: np.ndarray,
     sought: Sequence[SurfaceSearch],
     step: Step,
 ) -> list[tuple[np.ndarray, Observation]]:
@@ -293,7 +293,7 @@ def _found_part(
         pictures = take.images(t), take.masks(t, MAX_OUTLINE_CAMERAS)
         for on, visible in zip(sought, visible_points, strict=True):
             rough = replace(fit, parameters={t: here})
-            joined = _joined(own, share, seen_surface(rough, t, on, *pictures, visible))
+            joined = _joined(own, fraction, seen_surface(rough, t, on, *pictures, visible))
             places = take.places + on.points
             (here,) = solve_take(fit.head, places, [joined], here[None], ordered=False)
         results.append((here, joined))
@@ -302,7 +302,7 @@ def _found_part(
 
 
 def _fitted_landmarks(fit: HeadFit, first: HeadFit, take: RecordedTake) -> dict[int, Observation]:
-    """Where the head of `first` has the landmarks at every timestep, in the world of the fit."""
+    """The landmarks of the fit `first` at every timestep, in the world of the fit."""
     points = PosedPoints(first.head.model, take.places)
     count = len(take.reliable)
     scale = fit.to_capture.scale / first.to_capture.scale
@@ -313,22 +313,22 @@ def _fitted_landmarks(fit: HeadFit, first: HeadFit, take: RecordedTake) -> dict[
     return found
 
 
-def _landmark_shares(head: HeadModel, places: SurfacePoints) -> np.ndarray:
-    """(N,) of the landmarks' weights: LIPS_LANDMARK_SHARE where the model's lips are, else
-    LANDMARK_SHARE."""
+def _landmark_fractions(head: HeadModel, places: SurfacePoints) -> np.ndarray:
+    """(N,) of the landmarks' weights: LIPS_LANDMARK_FRACTION where the model's lips are, else
+    LANDMARK_FRACTION."""
     lips = faces_within(head.model.faces, head.model.masks.get("lips", np.zeros(0, np.int64)))
-    return np.where(lips[places.face], LIPS_LANDMARK_SHARE, LANDMARK_SHARE)
+    return np.where(lips[places.face], LIPS_LANDMARK_FRACTION, LANDMARK_FRACTION)
 
 
-def _joined(landmarks: Observation, share: np.ndarray, surface: SeenSurface) -> Observation:
-    """Both as one observation, landmarks at shares (N,) of their weight; the surface counts along
-    its normal."""
+def _joined(landmarks: Observation, fraction: np.ndarray, surface: SeenSurface) -> Observation:
+    """Both as one observation, landmarks at fractions (N,) of their weight; the surface counts
+    along its normal."""
     along = surface.normal[:, :, None] * surface.normal[:, None, :]
     root = LANDMARK_SIGMA_M / SURFACE_SIGMA_M * along
     return Observation(
         np.concatenate([landmarks.position, surface.position]),
         np.concatenate([landmarks.root, root]),
-        np.concatenate([share * landmarks.weight, surface.weight]),
+        np.concatenate([fraction * landmarks.weight, surface.weight]),
     )
 
 
@@ -352,8 +352,8 @@ def smooth_offsets(
     rows = np.repeat(np.arange(len(points)), 3)
     places = rows, faces[points.face].ravel()
     at = coo_array((points.barycentric.ravel(), places), shape=(len(points), count)).tocsr()
-    share = np.linalg.norm(triangle_normals(vertices[faces]), axis=1) / 6
-    area = np.bincount(faces.ravel(), np.repeat(share, 3), count)
+    fraction = np.linalg.norm(triangle_normals(vertices[faces]), axis=1) / 6
+    area = np.bincount(faces.ravel(), np.repeat(fraction, 3), count)
     laplacian = _laplacian(vertices, faces, area)
     smooth = SMOOTHING_M**4 * laplacian.T @ diags_array(area) @ laplacian
     small = diags_array((SMOOTHING_M / OFFSET_SIGMA_M) ** 4 * np.maximum(area, 1e-9))

@@ -1,4 +1,5 @@
-"""The torso's motion: whether what is below the head turns with it, stays, or moves on its own.
+"""The torso's motion: whether the body below the head turns with the head, is still, or moves
+independently.
 
 Landmarks of a face cannot tell the neck's rotation from the head's, so that a tracked head and the
 ring of shoulders that its neck ends in turn as one. Here the root joint, which carries that ring,
@@ -22,7 +23,7 @@ from .appearance import NOISE_LEVELS, flow_weights, point_weights, projection_de
 from .fit import HeadFit, posed_mesh
 from .folder import TorsoMotion, TorsoPoints
 from .footage.model import Footage
-from .stages import Crew, Stage
+from .stages import Stage, Workers
 from .surface import with_offset
 from .torso_cloth import Bending, found_bending
 from .torso_take import NECK, Motion, PosedTorso, TorsoPose, TorsoTake, axis_angle, head_turn
@@ -89,7 +90,7 @@ def follow_torso(
     fit: HeadFit,
     parameters: Mapping[int, np.ndarray],
     footage: Footage,
-    crew: Crew,
+    workers: Workers,
     bends: bool = True,
 ) -> FollowedTorso:
     """The torso's motion in a take of heads whose parameters (E + 18,) are given by timestep.
@@ -116,7 +117,7 @@ def follow_torso(
     seen = torso_take.seen_points(take, middle)
     if sum(map(len, seen.rows.values())) < MIN_POINTS:
         return FollowedTorso(fit, unchanged)
-    walk = torso_take.BothWays(crew, Stage.TORSO, 3 * len(some) + len(unchanged))
+    walk = torso_take.BothWays(workers, Stage.TORSO, 3 * len(some) + len(unchanged))
     motions = _motions(take, seen, some, walk)
     deep = torso_take.at_depth(take, seen, motions)
     found = torso_take.compared(take, deep, motions, some)
@@ -133,7 +134,7 @@ def follow_torso(
     points = TorsoPoints(middle, deep[name].at)
     bending = None
     if bends and name == "shifted":
-        walk = torso_take.BothWays(crew, Stage.CLOTH, len(unchanged))
+        walk = torso_take.BothWays(workers, Stage.CLOTH, len(unchanged))
         bending = found_bending(take, posed, points, some, walk)
     return replace(_followed(fit, take, posed, bending, decided), points=points)
 
@@ -167,8 +168,8 @@ def _followed(
 def _motions(
     take: TorsoTake, seen: torso_take.SeenPoints, some: Sequence[int], walk: torso_take.BothWays
 ) -> dict[str, Motion]:
-    """The motions that a torso may have, at some timesteps and at that of the points, whose depth
-    one of them tells first."""
+    """The possible motions of a torso, at some timesteps and at the timestep of the points, whose
+    depth is determined first by one of these motions."""
     seen = torso_take.at_depth(take, seen, {})["stereo"]
     (rough,) = _poses(walk, [_Follower(take, seen, False)], some)
     seen = torso_take.at_depth(take, seen, {"own": take.motion(rough, rigid=False)})["own"]
@@ -198,7 +199,7 @@ def _everywhere(
 def _poses(
     walk: torso_take.BothWays, followers: Sequence["_Follower"], timesteps: Iterable[int]
 ) -> list[dict[int, TorsoPose]]:
-    """For each follower, the torso's pose by timestep."""
+    """The torso's poses by timestep, for each follower."""
     found = walk.along(_Follower.follow, followers, followers[0].seen.timestep, timesteps)
     return [{timestep: TorsoPose(**arrays) for timestep, arrays in own.items()} for own in found]
 
@@ -237,9 +238,9 @@ class _Follower:
         misfits = []
         for start in starts:
             at = self._posed(now.timestep, start)
-            share, shown = self.seen.unexplained(now, at, START_LEVEL)
+            fraction, shown = self.seen.unexplained(now, at, START_LEVEL)
             use = shown & self.seen.fitted
-            misfits.append(float(share[use].mean()) if use.any() else 1.0)
+            misfits.append(float(fraction[use].mean()) if use.any() else 1.0)
         best = starts[int(np.argmin(misfits))]
         found = self._descended(now, best, pose, FINE_STEPS)
         return found.points() + self._pivot(now.timestep)
@@ -271,7 +272,7 @@ class _Follower:
     def _by_flow(
         self, shot: torso_take.TorsoShot, before: torso_take.TorsoShot, pose: TorsoPose
     ) -> TorsoPose:
-        """The pose to which optical flow leads from `pose`, that at the timestep before."""
+        """The pose to which optical flow leads from `pose`, the pose at the timestep before."""
         old = self._posed(before.timestep, pose)
         found = pose
         views = list(before.views.values()), list(shot.views.values())

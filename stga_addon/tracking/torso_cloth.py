@@ -34,7 +34,7 @@ BEND_SIGMA_M = 0.02
 """Standard deviation of a vertex from the rigid torso."""
 FLOW_SIGMA_PX = 0.5
 """Standard deviation of optical flow."""
-FLOW_SHARE = 0.3
+FLOW_FRACTION = 0.3
 """Fraction of the fitted pixels that are independent of each other."""
 FLOW_OUTLIER_PX = 4.0
 """Distance beyond which flow is wrong."""
@@ -58,7 +58,8 @@ DEPTH_SIGMA_M = 0.02
 MIN_WEIGHT = 0.5
 """Sum of weights from which the surface is observed."""
 DIRECTIONS_RAD = np.radians(np.arange(-80, 81, 5))
-"""From the base of the neck, as seen from the front: from straight down to the person's left."""
+"""Directions from the base of the neck, seen from the front: from straight down to the person's
+left."""
 SLOPE = 0.8
 """Factor on the angle around the neck, because shoulders slope down."""
 REACH_RAD = np.radians(10)
@@ -67,10 +68,10 @@ DIRECTION_SIGMA = 1.0
 """Standard deviation, in steps, of the smoothing of what is found in the directions."""
 MIN_POINTS = 5
 """Points without which a direction is not observed."""
-FARTHEST_SHARE = 0.98
+FARTHEST_FRACTION = 0.98
 """Fraction of a direction's points that the mesh reaches."""
 BEYOND_M = 0.015
-"""How far beyond these the mesh reaches."""
+"""Distance that the mesh reaches beyond these."""
 FULL_HEIGHT = 0.5  # Height (see `TorsoSheet`) from which vertices lie on the surface alone
 
 
@@ -132,21 +133,21 @@ def draped(sheet: TorsoSheet, at: np.ndarray, points: np.ndarray) -> np.ndarray:
     for number, own in enumerate(DIRECTIONS_RAD):
         near = np.abs(angle - own) < REACH_RAD
         if near.sum() >= MIN_POINTS:
-            found[number] = np.quantile(distance[near], FARTHEST_SHARE) + BEYOND_M
+            found[number] = np.quantile(distance[near], FARTHEST_FRACTION) + BEYOND_M
             seen[number] = 1
     sure = gaussian_filter1d(seen, DIRECTION_SIGMA, mode="constant")
     found = gaussian_filter1d(found, DIRECTION_SIGMA, mode="constant") / np.maximum(sure, 1e-6)
     around = SLOPE * np.arctan2(at[:, 0], at[:, 2])
     directions = (np.interp(around, DIRECTIONS_RAD, own, 0, 0) for own in (seen, found, sure))
-    known, farthest, share = directions
-    trust = np.where(known > 0.5, share, 0.0)
+    known, farthest, fraction = directions
+    trust = np.where(known > 0.5, fraction, 0.0)
     outer = farthest[:, None] * np.stack([np.sin(around), -np.cos(around)], axis=1)
     flat = at[:, :2] + sheet.height[:, None] * (outer - at[:, :2])
     near = np.exp(-((flat[:, None] - points[:, :2]) ** 2).sum(2) / (2 * DEPTH_SIGMA_M**2))
     weight = near.sum(1)
     target = np.column_stack([flat, near @ points[:, 2] / np.maximum(weight, 1e-9)])
-    share = np.minimum(sheet.height / FULL_HEIGHT, 1) * trust * (weight > MIN_WEIGHT)
-    return at + share[:, None] * (target - at)
+    fraction = np.minimum(sheet.height / FULL_HEIGHT, 1) * trust * (weight > MIN_WEIGHT)
+    return at + fraction[:, None] * (target - at)
 
 
 def _edges(faces: np.ndarray) -> np.ndarray:
@@ -177,7 +178,7 @@ class Bending:
 def found_bending(
     take: TorsoTake, motion: Motion, points: TorsoPoints, some: Sequence[int], walk: BothWays
 ) -> Bending | None:
-    """How a torso with a rigid motion bends; None where images are not explained better so."""
+    """The bending of a torso with a rigid motion; None where it does not explain images better."""
     sheet = torso_sheet(take.model)
     if sheet is None:
         return None
@@ -284,7 +285,8 @@ class _Cloth:
         return {"bend": states_along(self._take, way, first, bent, step)}
 
     def misfit(self, bends: Mapping[int, np.ndarray], timesteps: Sequence[int]) -> list[float]:
-        """Share, 0 to 1, of pixels that were not fitted that is not explained: rigid, and bent."""
+        """Fraction in 0…1 of held-out pixels that is not explained: by the rigid torso, and by the
+        bent one."""
         total = np.zeros(2)
         count = 0
         rigid = np.zeros_like(self._drape)
@@ -327,10 +329,10 @@ class _Cloth:
         size = np.array([finest.width, finest.height])
         mask = shot.masks[number]
         head = shot.heads[number]
-        share = sampled([mask], pixels * (mask.shape[::-1] / size))[0]
+        fraction = sampled([mask], pixels * (mask.shape[::-1] / size))[0]
         (height, width) = head.shape
         x, y = np.clip(pixels * ([width, height] / size), 0, [width - 1, height - 1]).astype(int).T
-        return inside(finest, pixels, depth) & (share > 127) & ~head[y, x]
+        return inside(finest, pixels, depth) & (fraction > 127) & ~head[y, x]
 
     def _returned(self, shot: TorsoShot, number: int, bend: np.ndarray) -> _Returned:
         reference = self._references[number]
@@ -363,7 +365,7 @@ class _Cloth:
             moved = 3 * reference.corners[used][..., None] + np.arange(3)
             places = rows.ravel(), np.broadcast_to(moved[:, None], rates.shape).ravel()
             rate = csr_array((rates.ravel(), places), shape=(2 * len(used), bend.size))
-            precision = np.repeat(FLOW_SHARE / FLOW_SIGMA_PX**2 * weight[used], 2)
+            precision = np.repeat(FLOW_FRACTION / FLOW_SIGMA_PX**2 * weight[used], 2)
             weighted = rate.T @ diags_array(precision)
             matrix = matrix + weighted @ rate
             right = right + weighted @ miss[used].ravel()
@@ -389,7 +391,7 @@ def _solved(matrix: Any, right: np.ndarray) -> np.ndarray:
 
 
 def _missed(reference: _Reference, now: _Returned) -> tuple[np.ndarray, np.ndarray]:
-    """Pixels (P, 2) from points to where the images show them, and weights (P,), 0 to 1."""
+    """Pixels (P, 2) from points to where images show them, and weights (P,), 0 to 1."""
     import cv2
 
     opencv: Any = cv2  # whose type stubs lack DIS

@@ -21,7 +21,7 @@ from .appearance import NOISE_LEVELS, PyramidView, inside, sampled, unexplained
 from .fit import HeadFit, posed_mesh
 from .footage.model import FootageCamera
 from .posed_points import PosedPoints, SurfacePoints, head_rotation, split
-from .stages import Crew, Stage
+from .stages import Stage, Workers
 
 ROOT = JOINTS.index("root")
 NECK = JOINTS.index("neck")
@@ -157,10 +157,10 @@ class TorsoTake:
         model = self.model
         parameters = torso.parameters.copy()
         offset = np.zeros_like(model.v_template)
-        share = np.minimum(model.weights[:, ROOT] / MIN_TORSO_WEIGHT, 1)
-        moved = np.flatnonzero(share)
+        fraction = np.minimum(model.weights[:, ROOT] / MIN_TORSO_WEIGHT, 1)
+        moved = np.flatnonzero(fraction)
         before = posed_mesh(self.fit, parameters)[moved]
-        wanted = before + share[moved, None] * (self.rigid(torso, moved) - before)
+        wanted = before + fraction[moved, None] * (self.rigid(torso, moved) - before)
         wanted += np.broadcast_to(bend, offset.shape)[moved] @ head_rotation(parameters).T
         turns = world_turns(model.parents, joint_turns(parameters))
         skin = np.einsum("vj,jab->vab", model.weights[moved], turns)
@@ -218,16 +218,16 @@ def masked(image: np.ndarray, mask: np.ndarray) -> np.ndarray:
     found = np.full_like(image, PLAIN_LEVEL)
     cv2.copyTo(image, cv2.inRange(mask, 255, 255), found)
     edge = np.nonzero(cv2.inRange(mask, 1, 254))
-    share = mask[edge][:, None].astype(np.float32) / 255
-    found[edge] = image[edge] * share + PLAIN_LEVEL * (1 - share) + 0.5
+    fraction = mask[edge][:, None].astype(np.float32) / 255
+    found[edge] = image[edge] * fraction + PLAIN_LEVEL * (1 - fraction) + 0.5
     return found
 
 
 class BothWays:
     """Work along a take, from one timestep to both ends, by helping processes, each on a way."""
 
-    def __init__(self, crew: Crew, stage: Stage, total: int) -> None:
-        self._crew = crew
+    def __init__(self, workers: Workers, stage: Stage, total: int) -> None:
+        self._workers = workers
         self._stage = stage
         self._done = 0
         self._total = total
@@ -239,7 +239,7 @@ class BothWays:
         later = [first, *sorted(t for t in timesteps if t > first)]
         earlier = [first, *sorted((t for t in timesteps if t < first), reverse=True)]
         every = [(own, way) for own in who for way in (later, earlier)]
-        found = self._crew.map(follow, every, (self._stage, self._done, self._total), keep=True)
+        found = self._workers.map(follow, every, (self._stage, self._done, self._total), keep=True)
         self._done += len(who) * (len(later) + len(earlier) - 2)
         results: list[dict[int, Rows]] = [{} for _ in who]
         for number, ((_, way), own) in enumerate(zip(every, found, strict=True)):
@@ -324,9 +324,9 @@ def axis_angle(rotation: np.ndarray) -> np.ndarray:
     return to_axis_angle(from_matrices(rotation[None]))[0]
 
 
-def grown(where: np.ndarray, share: float) -> np.ndarray:
-    """The pixels (H, W) bool with those around them, as far as a share of the image's height."""
-    return binary_dilation(where, iterations=max(1, round(share * len(where))))
+def grown(where: np.ndarray, fraction: float) -> np.ndarray:
+    """The pixels (H, W) bool with those around them, as far as a fraction of the image's height."""
+    return binary_dilation(where, iterations=max(1, round(fraction * len(where))))
 
 
 @dataclass(frozen=True)
@@ -349,16 +349,16 @@ class SeenPoints:
     def unexplained(
         self, shot: TorsoShot, at: np.ndarray, level: int
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Share (N,) from 0 to 1 of each point, moved to `at` (N, 3), that the images do not
+        """Fraction (N,) from 0 to 1 of each point, moved to `at` (N, 3), that the images do not
         explain, and (N,) bool whether it is seen."""
-        share = np.zeros(len(at))
+        fraction = np.zeros(len(at))
         seen = np.zeros(len(at), bool)
         for number, rows in self.rows.items():
             if number in shot.views:
                 residual = self.residual(shot, number, rows, at[rows], level)
-                share[rows] = unexplained(residual, level)
+                fraction[rows] = unexplained(residual, level)
                 seen[rows] = shot.shows(number, at[rows])
-        return share, seen
+        return fraction, seen
 
     def residual(
         self, shot: TorsoShot, number: int, rows: np.ndarray, at: np.ndarray, level: int
@@ -460,10 +460,10 @@ def compared(
         for name, own in motions.items():
             at = carriers[name].carried(own[timestep])(seen[name].at)
             found.append(seen[name].unexplained(shot, at, EVIDENCE_LEVEL))
-        shares, shown = map(np.stack, zip(*found, strict=True))
+        fractions, shown = map(np.stack, zip(*found, strict=True))
         use = shown.all(0) & ~seen["head"].fitted
         count = count + int(use.sum())
-        total = total + shares[:, use].sum(1)
+        total = total + fractions[:, use].sum(1)
     return dict(zip(motions, (total / max(count, 1)).tolist(), strict=True))
 
 
@@ -479,8 +479,8 @@ def at_depth(
         for other in shot.views.keys() - {number}:
             for cost, at in zip(stereo, candidates, strict=True):
                 residual = seen.residual(shot, other, rows, at[rows], EVIDENCE_LEVEL)
-                share = unexplained(residual, EVIDENCE_LEVEL, ALONG_CAMERAS)
-                cost[rows] += np.where(shot.shows(other, at[rows]), share, UNSEEN_COST)
+                fraction = unexplained(residual, EVIDENCE_LEVEL, ALONG_CAMERAS)
+                cost[rows] += np.where(shot.shows(other, at[rows]), fraction, UNSEEN_COST)
     costs = {"stereo": stereo, **{name: stereo.copy() for name in motions}}
     carriers = {name: Carrier(take, own[seen.timestep], seen.at) for name, own in motions.items()}
     known = sorted(set.intersection(*(set(own) for own in motions.values()))) if motions else []
@@ -489,8 +489,8 @@ def at_depth(
         for name, own in motions.items():
             carried = carriers[name].carried(own[timestep])
             for cost, at in zip(costs[name], candidates, strict=True):
-                share, shown = seen.unexplained(shot, carried(at), EVIDENCE_LEVEL)
-                cost += np.where(shown, share, UNSEEN_COST)
+                fraction, shown = seen.unexplained(shot, carried(at), EVIDENCE_LEVEL)
+                cost += np.where(shown, fraction, UNSEEN_COST)
     return {name: _moved_in_depth(seen, cost) for name, cost in costs.items()}
 
 

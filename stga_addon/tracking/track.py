@@ -13,12 +13,12 @@ from . import folder
 from .footage.model import Footage
 from .known_person import KnownPerson, without_own_bias
 from .landmarks import landmark_file, write_camera, write_places
-from .opened import USUAL_OPTIONS, OpenedFootage, TrackingOptions, open_take
+from .opened import DEFAULT_OPTIONS, OpenedFootage, TrackingOptions, open_take
 from .pictures import PosedHead, write_contact_sheet
 from .recorded import RecordedFootage, in_world, record, with_focal
 from .reprojection import median_px
 from .seen import SeenHead, fit_expressions, fit_landmarks, fit_skin, with_torso
-from .stages import Crew, ReportStage, Show, Stage, unreported, unseen
+from .stages import ReportStage, Show, Stage, Workers, unreported, unseen
 from .write_capture import write_capture
 
 
@@ -44,7 +44,7 @@ def track(
     footage: Footage,
     head_file: Path | None,
     out: Path,
-    options: TrackingOptions = USUAL_OPTIONS,
+    options: TrackingOptions = DEFAULT_OPTIONS,
     report: ReportStage = unreported,
     show: Show = unseen,
 ) -> TrackingReport:
@@ -60,33 +60,33 @@ def track(
     opened = open_take(footage, head_file, out, options)
     person = options.person
     with Helpers(folder=out / folder.KEPT_FOLDER) as helpers:
-        crew = Crew(helpers, report, show)
-        head = _stranger(opened, crew) if person is None else _known(opened, person, crew)
-    written = _write(head, crew)
+        workers = Workers(helpers, report, show)
+        head = _stranger(opened, workers) if person is None else _known(opened, person, workers)
+    written = _write(head, workers)
     if person is None or person.draw is None:
         end_tracking(out)
     return written
 
 
-def _stranger(opened: OpenedFootage, crew: Crew) -> SeenHead:
+def _stranger(opened: OpenedFootage, workers: Workers) -> SeenHead:
     """The stages of a person who is seen for the first time."""
-    recorded = record(opened, crew)
-    recorded = in_world(with_focal(recorded, crew, None))
-    fitted = fit_landmarks(recorded, crew)
-    fitted = fit_skin(fitted, crew)
-    return with_torso(fitted, crew, bends=True)
+    recorded = record(opened, workers)
+    recorded = in_world(with_focal(recorded, workers, None))
+    fitted = fit_landmarks(recorded, workers)
+    fitted = fit_skin(fitted, workers)
+    return with_torso(fitted, workers, bends=True)
 
 
-def _known(opened: OpenedFootage, person: KnownPerson, crew: Crew) -> SeenHead:
+def _known(opened: OpenedFootage, person: KnownPerson, workers: Workers) -> SeenHead:
     """The stages of a person who is known. The only camera has the focal length of the person's,
     where its file does not tell it and the landmarks allow it."""
-    recorded = record(opened, crew)
-    recorded = in_world(with_focal(recorded, crew, person.camera))
+    recorded = record(opened, workers)
+    recorded = in_world(with_focal(recorded, workers, person.camera))
     if opened.options.landmarks is None and person.draw is not None:
-        recorded = replace(recorded, take=without_own_bias(recorded.take, person, crew))
-    fitted = fit_landmarks(recorded, crew)
-    fitted = fit_expressions(fitted, person.fit, crew)
-    return with_torso(fitted, crew, bends=False)
+        recorded = replace(recorded, take=without_own_bias(recorded.take, person, workers))
+    fitted = fit_landmarks(recorded, workers)
+    fitted = fit_expressions(fitted, person.fit, workers)
+    return with_torso(fitted, workers, bends=False)
 
 
 def end_tracking(out: Path) -> None:
@@ -94,7 +94,7 @@ def end_tracking(out: Path) -> None:
     shutil.rmtree(out / folder.KEPT_FOLDER, ignore_errors=True)
 
 
-def _write(head: SeenHead, crew: Crew) -> TrackingReport:
+def _write(head: SeenHead, workers: Workers) -> TrackingReport:
     """The last stage: report, contact sheet, and the capture."""
     recorded = head.fitted.recorded
     opened = recorded.opened
@@ -117,7 +117,7 @@ def _write(head: SeenHead, crew: Crew) -> TrackingReport:
         folder.TORSO_KEY: None if torso.motion is None else to_json(torso.motion),
     }
     write_json(out / folder.REPORT_FILE, values)
-    crew.report(Stage.CONTACT_SHEET, 0, 1)
+    workers.report(Stage.CONTACT_SHEET, 0, 1)
     cameras = {own.name: fit.to_capture.camera(own.camera) for own in head.footage.cameras}
     posed = PosedHead(cameras, torso.mesh, fit.head.model.faces)
     sheet = out / folder.SHEET_FILE
@@ -129,7 +129,7 @@ def _write(head: SeenHead, crew: Crew) -> TrackingReport:
     if opened.head_file is None:
         with replacing(out / BUNDLED_MODEL) as copy:
             shutil.copyfile(BUNDLED_HEAD, copy)
-    write_capture(out, head.footage, torso, opened.options.meshes, crew.report)
+    write_capture(out, head.footage, torso, opened.options.meshes, workers.report)
     return TrackingReport(median, fit.to_capture.scale, head.warnings, torso.motion, focal)
 
 

@@ -35,7 +35,7 @@ class Effect:
 RELIGHT = "relight"
 """The capture's light is estimated after training, so that a scene's lights can take its place."""
 WORLD = "world"
-"""What stands still behind the person becomes splats of its own, after training."""
+"""The static background becomes splats of its own, after training."""
 _SHAPES = "shape keys and drivers in Blender"
 _STRAIN = "and the strain of every frame"
 

@@ -27,7 +27,7 @@ CALIBRATION_VIEWS = 8
 WARM_UP_ITERATIONS = 3
 """First iterations that are not measured: they allocate memory."""
 TRACKED_TIMESTEPS = 3
-"""By which the time of tracking by the avatar is measured."""
+"""Number of timesteps with which the time of tracking by the avatar is measured."""
 MAX_ITERATIONS = 2000
 """Limit for captures of a few pixels."""
 
@@ -79,11 +79,11 @@ def seconds_per_iteration(
     selection = select_capture(capture, settings.selection) if selective else {}
     trainer = Trainer(capture, settings, selection, device=device)
     trainer.prepare_hooks()
-    # shares of the run at which splats are split: by its own count, this one hardly ever would
+    # fractions of the run at which splats are split: by its own count, this one hardly ever would
     (start, end) = settings.density_span
     interval = settings.density_interval
     turns = [n / iterations for n in range(interval, iterations, interval)] if interval else []
-    turns = [share for share in turns if start <= share < end]
+    turns = [fraction for fraction in turns if start <= fraction < end]
     left = deque(turns)
     split_s = list[float]()
     density = density_control(settings)
@@ -104,8 +104,8 @@ def seconds_per_iteration(
         begin = perf_counter()
         trainer.step(view, image, progress, mask, mesh)
         times.append(perf_counter() - begin)
-    # Each stands for the share of the schedule that it takes here: cheap ones are as many as they
-    # are quick.
+    # Each stands for the fraction of the schedule that it takes here: cheap ones are as many as
+    # they are quick.
     measured = times[WARM_UP_ITERATIONS:]
     step_s = float(np.average(measured, weights=measured))
     once_s = max(0.0, sum(split_s) - len(split_s) * step_s)

@@ -51,7 +51,7 @@ def take_order(
 
 
 def sh_degree(settings: TrainingSettings, progress: float) -> int:
-    """Degree of spherical harmonics in use at a share of the budget."""
+    """Degree of spherical harmonics in use at a fraction of the budget."""
     return min(settings.sh_degree, sum(progress >= step for step in settings.sh_steps))
 
 

@@ -29,7 +29,7 @@ one."""
 MAX_WEIGHT = 1e6
 """Largest weight or limit of a loss; larger ones overflow float32."""
 MAX_RATE = 1e3
-MAX_GROWTH = 100
+MAX_ADDED_RATIO = 100
 
 
 @dataclass(frozen=True)
@@ -93,48 +93,50 @@ class TrainingSettings:
                      paper's batches)
     global_interval, global_unit   a global iteration after every so many local iterations, or
                                    "frame" visits
-    warm_up_share  share of the budget trained globally before the first local iteration
+    warm_up_share  fraction of the budget trained globally before the first local iteration
     selection      which triangles a frame trains
     ssim_weight    of the image loss (1 − w)·L1 + w·(1 − SSIM)
     scale_weight, scale_limit   weight of ‖ReLU(scale − limit)‖₂ and the limit
     distance_weight, distance_limit   the same for the distance from the triangle's origin
-    unbound_scale_limit  the scale limit of unbound splats, a multiple of the distance between hull
-                         points
-    unseen_opacity_weight  of the mean of opacity times unseen share (`TrainState`): hull points
-                   that few cameras see fade, unless nothing else explains what these cameras see
+    unbound_scale_limit  the scale limit of unbound splats, a multiple of the distance between
+                         visual-hull points
+    unseen_opacity_weight  of the mean of opacity times unseen fraction (`TrainState`): visual-hull
+                   points that few cameras see fade, unless nothing else explains what these cameras
+                   see
     adam_beta2     decay of Adam's second moment: at 0.999 it is an average over more iterations
                    than a detail takes to be learned
     adam_nesterov  Adam with Nesterov's momentum (Dozat 2016)
-    adam_epsilon   Adam's ε as a share of the weight of one of an image's values in the loss: splats
-                   that hardly show in an image, and whose gradients are below it, hardly move
-    ema_share      share of the latest step in each splat's exponential moving average, which the
+    adam_epsilon   Adam's ε as a fraction of the weight of one of an image's values in the loss:
+                   splats that hardly show in an image, and whose gradients are below it, hardly
+                   move
+    ema_share      fraction of the latest step in each splat's exponential moving average, which the
                    avatar is made of; 1: no averaging
     stray_reset_interval, stray_limit, stray_reset_share   every so many iterations (0: never), a
-                   splat farther than the limit from its triangle's origin is put back to this share
-                   of the limit; 0: onto the origin, as in the paper. On the scalp, the height of
-                   hair is added. All limits but
-                   `unbound_scale_limit` are multiples of sqrt(2·triangle area) for "stga", of the
-                   triangle's own unit of length for "gaussian_avatars"
-    sh_degree, sh_steps   highest SH degree, and the shares of the budget at which the degree rises
-                          by one
-    hull_points    add hull points for what the mesh does not cover
+                   splat farther than the limit from its triangle's origin is put back to this
+                   fraction of the limit; 0: onto the origin, as in the paper. On the scalp, the
+                   height of hair is added. All limits but `unbound_scale_limit` are multiples of
+                   sqrt(2·triangle area) for "stga", of the triangle's own unit of length for
+                   "gaussian_avatars"
+    sh_degree, sh_steps   highest SH degree, and the fractions of the budget at which the degree
+                          rises by one
+    hull_points    add visual-hull points for what the mesh does not cover
     density_interval  iterations between density control, 0 never; it works during `density_span` of
                       the budget
-    split_share    largest share of the splats that one round of density control splits
-    growth         most splats that density control may add, as a share of the whole lattice and the
-                   hull points
+    split_share    largest fraction of the splats that one round of density control splits
+    growth         most splats that density control may add, as a fraction of the whole lattice and
+                   the visual-hull points
     background     color behind the head in the capture's images, and behind transparent ones
     random_background  where there are masks, put a random color behind the head in every iteration,
                    so that splats of the background's color cannot hide in it and alpha is learned
     backdrop       what is behind the head in the images, one of BACKDROPS: but for "plain",
                    training and evaluations see the head over the color `background`
-    scale, coarse_share   size of the images trained on, as a share of the captured ones; during the
-                          first `coarse_share` of the budget half of that
+    scale, coarse_share   size of the images trained on, as a fraction of the captured ones; during
+                          the first `coarse_share` of the budget half of that
     driven_offsets  names of `avatar.offsets.OFFSETS`: splats follow signals of the pose
     antialiased    splats narrower than a pixel lose opacity instead of growing (`render_forward`)
     teeth          put splats on the rows of teeth that FLAME's mesh is given
-    torso          hull points below the neck follow FLAME's root joint, not the head's nearest
-                   triangle
+    torso          visual-hull points below the neck follow FLAME's root joint, not the head's
+                   nearest triangle
     exposure       per training camera: its index, and gain and offset (levels of 255) of red, green
                    and blue in its images, which are corrected when they are read; where it drifts,
                    several rows with their timestep
@@ -196,7 +198,7 @@ class TrainingSettings:
     density_interval: int = setting(100, 0, MAX_COUNT)
     density_span: tuple[float, float] = setting((0.1, 0.6), 0)
     split_share: float = setting(0.2, 0, 1)
-    growth: float = setting(0.25, 0, MAX_GROWTH)
+    growth: float = setting(0.25, 0, MAX_ADDED_RATIO)
     background: tuple[float, float, float] = setting((1.0, 1.0, 1.0), 0, 1)
     random_background: bool = True
     backdrop: str = setting("plain", choices=BACKDROPS)

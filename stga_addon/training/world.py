@@ -24,10 +24,10 @@ MAX_PLATE_VIEWS = 24
 """Views of a camera that its plate is the median of."""
 MAX_PLATE_PIXELS = 500_000
 """Larger images are read smaller."""
-MATTE_MARGIN_SHARE = 0.008
-"""Around the person, where a matte is uncertain; share of the image's height."""
+MATTE_MARGIN_FRACTION = 0.008
+"""Around the person, where a matte is uncertain; fraction of the image's height."""
 PERSON = 256
-"""Above every level of a pixel: sorts behind them."""
+"""Value above every level of a pixel, so that it is sorted behind them."""
 RADII = 24
 """Shells that are tried."""
 NEAREST_RADIUS = 0.3
@@ -35,15 +35,16 @@ NEAREST_RADIUS = 0.3
 FARTHEST_RADIUS = 12.0
 """Radius of the largest shell, in the same unit."""
 DEFAULT_RADIUS = 3.0
-"""Where the plates do not tell, because a wall is of one color or a single camera sees it."""
+"""Radius where the plates do not determine it, because a wall has one color or a single camera sees
+it."""
 SAMPLED_POINTS = 4000
 """Pixels of each plate by which shells are compared."""
 MIN_SHARED = 0.1
 """Fraction of the sampled pixels that another plate must contain for a shell to tell the world's
 distance."""
-MIN_LIKENESS = 0.3
+MIN_SIMILARITY = 0.3
 """Correlation of what both plates show there at least."""
-DETAIL_SHARES = 0.003, 0.03
+DETAIL_FRACTIONS = 0.003, 0.03
 """Filters between which lie the details that plates are compared by; of the image's height."""
 LARGEST_BLOCK = 16
 """Side of the largest block of the image that one splat stands for, in pixels."""
@@ -57,7 +58,7 @@ SAME_LEVELS = 8.0
 """A block is left out whose color another plate shows there, to so many of 255 levels."""
 BLOCK_WIDTH = 0.8
 """Standard deviation of a block's splat, in sides of the block."""
-THICKNESS_SHARE = 0.2
+THICKNESS_FRACTION = 0.2
 """Thickness of a splat as a fraction of its block's side."""
 START_OPACITY = 5.0
 """Logit of the opacity that splats begin with."""
@@ -101,7 +102,7 @@ def clean_plates(capture: Capture, correct: Correction | None = None) -> list[Cl
             if correct is not None:
                 image = correct(view, image, None)
             assert mask is not None
-            margin = max(1, round(MATTE_MARGIN_SHARE * len(mask)))
+            margin = max(1, round(MATTE_MARGIN_FRACTION * len(mask)))
             person = binary_dilation(mask > 0, iterations=margin)
             stack.append(np.where(person[..., None], PERSON, image).astype(np.uint16))
         levels = np.sort(np.stack(stack, axis=-1), axis=-1)
@@ -188,17 +189,19 @@ def shell_radius(plates: Sequence[CleanPlate], center: np.ndarray) -> float:
     """Meters from the person's center (3,) to the shell on which plates look most alike."""
     details = []  # without coarse colors, which light and exposure change, and without noise
     for plate in plates:
-        sizes = [np.array([share, share, 0.0]) * len(plate.image) for share in DETAIL_SHARES]
+        sizes = [
+            np.array([fraction, fraction, 0.0]) * len(plate.image) for fraction in DETAIL_FRACTIONS
+        ]
         fine, coarse = (gaussian_filter(plate.image, size) for size in sizes)
         details.append(fine - coarse)
     distance = np.median([np.linalg.norm(plate.camera.position - center) for plate in plates])
     radii = distance * np.geomspace(NEAREST_RADIUS, FARTHEST_RADIUS, RADII)
-    likeness = [_likeness(plates, details, center, radius) for radius in radii]
-    best = int(np.argmax(likeness))
-    return float(radii[best] if likeness[best] > MIN_LIKENESS else DEFAULT_RADIUS * distance)
+    similarity = [_similarity(plates, details, center, radius) for radius in radii]
+    best = int(np.argmax(similarity))
+    return float(radii[best] if similarity[best] > MIN_SIMILARITY else DEFAULT_RADIUS * distance)
 
 
-def _likeness(
+def _similarity(
     plates: Sequence[CleanPlate], details: Sequence[np.ndarray], center: np.ndarray, radius: float
 ) -> float:
     """Correlation of plates at the same points of a shell; 0 where they share too few."""
@@ -256,7 +259,7 @@ def first_splats(plates: Sequence[CleanPlate], center: np.ndarray) -> Splats:
             points = points[new]
             count = int(new.sum())
             width = BLOCK_WIDTH * sides[new] * camera.project(points)[1] / camera.fl_x
-            log_scale = np.log(np.stack([width, width, THICKNESS_SHARE * width], axis=1))
+            log_scale = np.log(np.stack([width, width, THICKNESS_FRACTION * width], axis=1))
             turn = from_matrices(camera.world_to_camera[None, :3, :3].transpose(0, 2, 1))
             sh = np.zeros((count, (SH_DEGREE + 1) ** 2, 3), np.float32)
             sh[:, 0] = (colors[new] - 0.5) / SH_C0

@@ -16,11 +16,11 @@ from ..files import file_size
 ACQUIRE_TIMEOUT_S = 0.3
 """Patience for a lock that a process which only asks has for a moment."""
 PROBE_TIMEOUT_S = 0.03
-"""The same between processes that only ask, as Blender's timer does."""
+"""The same between processes that only query, as Blender's timer does."""
 RETRY_INTERVAL_S = 0.002
 
 NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP)
-"""What a file system without working locks answers: some NFS and parallel file systems."""
+"""Errors of a file system without working locks: some NFS and parallel file systems."""
 BEAT_S = 5.0
 """Seconds between two renewals of a lease."""
 EXPIRY_S = 30.0

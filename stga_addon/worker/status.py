@@ -219,7 +219,7 @@ class StatusWriter:
             figures = self._clock.reported(progress)
             said = {"message": progress.stage, "detail": progress.detail, "figures": figures}
             self._written_s = now
-            self._write(0.0, progress=self._clock.share, **said)
+            self._write(0.0, progress=self._clock.fraction, **said)
         if progress.preview is not None and now - self._previewed_s > PREVIEW_INTERVAL_S:
             progress.preview(self.folder / PREVIEW)
             self._previewed_s = time.monotonic()

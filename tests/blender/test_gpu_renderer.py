@@ -211,7 +211,7 @@ def relit_layers(mode):
         dim = tuple(replace(light, color=0.15 * light.color) for light in lights)
         light = Lighting(uniform((0.6, 0.5, 0.4)), dim, exposure=0.7)
     relit = Relit(Relighter(avatar), mesh, light, (wall,))
-    assert (relit.relighter.distant_in_head(mesh, light)[1].share > 0.2) == (mode == "kept")
+    assert (relit.relighter.distant_in_head(mesh, light)[1].fraction > 0.2) == (mode == "kept")
     shown = SceneLayer(avatar.splats, avatar.frames(mesh), TURNED, relit=relit)
     half = np.diag([0.5, 0.5, 0.5, 1]) + np.eye(4, k=3) * 0.2
     recorded = SceneLayer(avatar.splats, avatar.frames(mesh), half)

@@ -141,7 +141,7 @@ def test_a_word_for_the_quality_and_more_training(extension, trained, tmp_path):
 def test_what_is_said_of_an_operator(extension, head):
     """Catches *Not Done* over what was done, and all warnings but the last forgotten."""
     operator = SimpleNamespace(report=lambda kind, sentence: None)
-    tell = extension.operators.common.Action.tell
+    notify = extension.operators.common.Action.tell
     manager = bpy.context.window_manager
     ops.select(threshold=0.0005)
     for kind, sentence, expected in (
@@ -149,7 +149,7 @@ def test_what_is_said_of_an_operator(extension, head):
         ("WARNING", "So is one mask", ["Done", "One image is missing", "So is one mask"]),
         ("ERROR", "The disk is full", ["Not Done", "The disk is full"]),
     ):
-        tell(operator, kind, sentence)
+        notify(operator, kind, sentence)
         texts = draw(extension, "next_step")
         assert [text for text in texts if text in {*expected, "Done", "Not Done"}] == expected
     ops.select(threshold=0.0005)

@@ -11,7 +11,7 @@ from stga_addon.scene import tags
 from stga_addon.scene.arrays import evaluated_vertices, mesh_triangles, read_values
 from stga_addon.scene.display.splat_attributes import read_attribute
 from stga_addon.scene.rig.head import import_head
-from stga_addon.scene.vertex_groups import HEAT, SHARE, read_selection, write_selection
+from stga_addon.scene.vertex_groups import FRACTION, HEAT, read_selection, write_selection
 from stga_addon.selection import SelectionOptions, select_capture
 
 from .captures import closure, flame_model, flame_sequence, mesh_capture, motion_capture
@@ -102,7 +102,7 @@ def test_heat_map(head, tmp_path):
     ops.heat_map()
     ops.select(threshold=0.0015)
     expected = np.mean(list(read_selection(head).values()), axis=0)
-    assert_allclose(read_attribute(head.data, SHARE), expected, atol=1e-6)
+    assert_allclose(read_attribute(head.data, FRACTION), expected, atol=1e-6)
     assert head.data.color_attributes.active_color.name == HEAT
     color = read_attribute(head.data, HEAT).reshape(-1, 3, 4)
     assert (color == color[:, :1]).all(), "a triangle's corners differ"
@@ -112,7 +112,7 @@ def test_heat_map(head, tmp_path):
     assert materials_of(head) == {"STGA Heat Map"}
     ops.heat_map(show=False)
     assert not head.modifiers
-    assert not {SHARE, HEAT} & set(head.data.attributes.keys())
+    assert not {FRACTION, HEAT} & set(head.data.attributes.keys())
     assert materials_of(head) == {"skin"}
     show_ball(tmp_path / "a.npz", order=2)
     for show in (True, False):

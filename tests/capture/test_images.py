@@ -231,7 +231,7 @@ STORED = {
     ),
     "cICP of PQ": ((148, 148, 148), [chunk(b"cICP", bytes([9, 16, 0, 1]))], (255, 255, 255)),
     "linear gAMA": ((55, 55, 55), [LINEAR], (128, 128, 128)),
-    "usual gAMA": ((55, 55, 55), [chunk(b"gAMA", struct.pack(">I", 45455))], (55, 55, 55)),
+    "sRGB gAMA": ((55, 55, 55), [chunk(b"gAMA", struct.pack(">I", 45455))], (55, 55, 55)),
     "gAMA beside sRGB": ((55, 55, 55), [LINEAR, chunk(b"sRGB", b"\0")], (55, 55, 55)),
 }
 

@@ -189,7 +189,7 @@ def test_messages_have_lines_of_their_own(capsys):
     with ProgressBar() as bar:
         bar.report(Progress(0.5, "Training"))
         logging.getLogger("stga_addon").warning("the GPU failed")
-        bar.say("a warning")
+        bar.log("a warning")
         bar.report(Progress(0.6, "Training"))
     written = capsys.readouterr()
     lines = (written.err + "\n" + written.out).replace("\r", "\n").splitlines()

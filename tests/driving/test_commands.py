@@ -151,7 +151,7 @@ def test_a_performers_avatar_tracks_a_video(files, tmp_path, monkeypatch, misfit
             for _ in range(20):
                 append(np.full((64, 64, 3), shade, np.uint8))
 
-    def tracked(request, report, say):
+    def tracked(request, report, log):
         steps.append(request.step)
         leave(request.out, request.footage, request.step, misfit, avatar_version(run))
 

@@ -175,10 +175,10 @@ def test_command_line(folder, monkeypatch, part):
                 patch.setenv(name, value)
             problem = find_problem(arguments, [case, scratch])
         if problem:
-            tell = f"case {number}: {variables!a} stga {ascii(arguments)[:600]}"
-            tell += f"\n  after {ascii(damages)[:600]}"
-            failures.setdefault(problem, []).append(tell)
-            print(f"{tell}\n  {problem}", flush=True)
+            described = f"case {number}: {variables!a} stga {ascii(arguments)[:600]}"
+            described += f"\n  after {ascii(damages)[:600]}"
+            failures.setdefault(problem, []).append(described)
+            print(f"{described}\n  {problem}", flush=True)
     report = [f"{len(found)} x {problem}\n{found[0]}" for problem, found in failures.items()]
     assert not failures, "\n\n".join(report[:REPORTED_FAILURES])
 

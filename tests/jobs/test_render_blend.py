@@ -64,7 +64,7 @@ def test_only_missing_frames_are_rendered(shot, tmp_path):
     shot.output.mkdir()
     (shot.output / "000010.png").write_text("half 10")
     shares = []
-    perform(shot, lambda progress: bool(shares.append(progress.share)))
+    perform(shot, lambda progress: bool(shares.append(progress.fraction)))
     assert pictures(shot.output) == WHOLE
     same = ["STGA_SPLATS", sys.executable]
     assert calls(tmp_path) == [["8", "9", *same], ["11", "12", *same]]
@@ -102,7 +102,7 @@ def test_cancelling_ends_blender(shot, tmp_path, monkeypatch):
     monkeypatch.setenv("PAUSE", "0.3")
 
     def report(progress):
-        return progress.share >= 0.4
+        return progress.fraction >= 0.4
 
     with pytest.raises(Cancelled):
         perform(shot, report)
@@ -114,7 +114,7 @@ def test_cancelling_ends_blender(shot, tmp_path, monkeypatch):
 
 def test_a_film_cancelled_with_its_last_picture_is_whole(shot):
     """Catches a job that is reported as cancelled, and done again, though no picture is missing."""
-    result = perform(shot, lambda progress: progress.share == 1)
+    result = perform(shot, lambda progress: progress.fraction == 1)
     assert result == Written(shot.output)
     assert pictures(shot.output) == WHOLE
 
@@ -151,7 +151,7 @@ def test_two_jobs_with_one_output(shot):
     other = replace(shot, frames=(20, 21))
 
     def report(progress):
-        if progress.share == 0.2:  # the first Blender has four pictures to go
+        if progress.fraction == 0.2:  # the first Blender has four pictures to go
             perform(other)
         return False
 

@@ -297,7 +297,7 @@ def test_an_analysis_says_how_long_it_takes(monkeypatch):
     told = []
     analysis.analyze(Analyze(Path("capture"), timed=True), told.append, print)
     left = [progress.figures().get("left_s", 0.0) for progress in told]
-    shares = [progress.share for progress in told]
+    shares = [progress.fraction for progress in told]
     assert shares == sorted(shares)
     for gone_s, share, left_s in zip((10.0, 30.0, 50.0), shares[1:], left[1:], strict=True):
         assert gone_s / (gone_s + left_s) == pytest.approx(share)
@@ -332,7 +332,7 @@ def test_what_follows_training_is_told_ahead(tmp_path, monkeypatch):
     told = []
 
     def report(progress):
-        told.append((progress.share, progress.figures()["left_s"]))
+        told.append((progress.fraction, progress.figures()["left_s"]))
         return False
 
     train.train_and_finish(Prepared.request, report, print)

@@ -9,7 +9,7 @@ from stga_addon.avatar.file import Avatar, AvatarLight
 from stga_addon.avatar.splats import SH_C0
 from stga_addon.capture.color import linear_to_srgb
 from stga_addon.light.harmonics import uniform
-from stga_addon.light.relight import HIGHLIGHT_SHARE
+from stga_addon.light.relight import HIGHLIGHT_FRACTION
 from stga_addon.light.surface import Bounce, transfer_of
 
 RADIUS = 0.1
@@ -53,6 +53,8 @@ def lit_avatar(albedo=(0.5, 0.3, 0.2), radiance=0.5, degree=0):
     recorded = arriving.astype(np.float32)
     avatar_light = AvatarLight(light.astype(np.float32), transfer, occlusion, recorded, skin, 0.0)
     splats = middle_splats(np.arange(len(faces)), -6, (degree + 1) ** 2)
-    color = linear_to_srgb(arriving[faces].mean(1) / np.pi * (np.array(albedo) + HIGHLIGHT_SHARE))
+    color = linear_to_srgb(
+        arriving[faces].mean(1) / np.pi * (np.array(albedo) + HIGHLIGHT_FRACTION)
+    )
     splats.sh[:, 0] = (color - 0.5) / SH_C0
     return Avatar(splats, "stga", vertices.astype(np.float32), faces, light=avatar_light)

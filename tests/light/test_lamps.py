@@ -180,6 +180,6 @@ def test_shadow_maps(light):
     for step in (0.0, 1.0, 2.0):
         lit = [np.empty(len(places), np.float32) for _ in range(2)]
         for one, kernels in zip(lit, (shadow, array_kernels), strict=True):
-            kernels.lit_shares(depth[0], places, bias, np.float32(step), one)
+            kernels.lit_fractions(depth[0], places, bias, np.float32(step), one)
         assert 0.05 < lit[0].mean() < 0.95
         assert_allclose(lit[1], lit[0], atol=1e-5)

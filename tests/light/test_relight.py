@@ -13,7 +13,7 @@ from stga_addon.capture.color import srgb_to_linear
 from stga_addon.capture.mesh_geometry import vertex_normals
 from stga_addon.light import relight
 from stga_addon.light.harmonics import basis, even_directions, rotated, uniform
-from stga_addon.light.relight import Relighter, kept, kept_shares
+from stga_addon.light.relight import Relighter, kept, kept_fractions
 from stga_addon.light.values import Light, Lighting
 
 EYE = np.array([0.0, 0.0, 1.0])
@@ -107,7 +107,7 @@ def test_only_recorded_colors_follow_the_normals(relighter):
     ends = np.repeat([[-2.0, -0.05], [2.0, 0.03]], 3, axis=1).astype(np.float32)
     avatar = replace(relighter.avatar, strain_range=np.tile(ends, (count, 1, 1)))
     sun = Lighting(lights=(Light("sun", np.full(3, 3.0), direction=(1, 0, 0)),))
-    assert not relighter.distant_in_head(mesh, sun)[1].share
+    assert not relighter.distant_in_head(mesh, sun)[1].fraction
 
     def colors(mode, *names):
         driven = replace(avatar, driven_offsets={name: values[name] for name in names})
@@ -180,7 +180,7 @@ def test_what_is_kept_of_recorded_colors():
     there = relighter.radiance(aside, EYE, replace(along, mode="recorded"))
     assert_allclose(relighter.radiance(aside, EYE, along), there, rtol=0.03)
     assert share_kept(relighter, studio()) > 0.99
-    assert relighter.distant_in_head(aside, Lighting(studio()))[1].share < 0.1
+    assert relighter.distant_in_head(aside, Lighting(studio()))[1].fraction < 0.1
     assert_allclose(relighter.recorded_light, studio(), atol=0.01)
     lamps = [Light("sun", np.full(3, x), direction=(1, 0.2, 0)) for x in np.linspace(0, 3, 61)]
     shares = [share_kept(relighter, studio(), lamp) for lamp in lamps]
@@ -195,7 +195,7 @@ def test_what_is_kept_of_recorded_colors():
 
 def share_kept(relighter, world, *lights, **options):
     lighting = Lighting(world, lights, **options)
-    return relighter.distant_in_head(relighter.avatar.neutral, lighting)[1].share
+    return relighter.distant_in_head(relighter.avatar.neutral, lighting)[1].fraction
 
 
 def test_shadows_of_other_objects_stay():
@@ -203,4 +203,4 @@ def test_shadows_of_other_objects_stay():
     same = kept(studio(), 2 * studio())
     irradiance = np.maximum(basis(np.eye(3)) @ studio(), 0.1).astype(np.float32)
     arriving = irradiance * np.float32([[2], [1.9], [0.3]])
-    assert_allclose(kept_shares(same, arriving, irradiance), [1, 1, 0], atol=1e-6)
+    assert_allclose(kept_fractions(same, arriving, irradiance), [1, 1, 0], atol=1e-6)

@@ -249,8 +249,8 @@ def test_an_interrupt_leaves_the_threads_usable():
 def test_an_interrupt_as_helpers_are_taken_gives_them_back(monkeypatch):
     """Catches a Ctrl-C after which all kernels run on one thread, for ever."""
     set_threads(3)
-    team = kernel_threads._team
-    lock = team._busy
+    pool = kernel_threads._pool
+    lock = pool._busy
 
     class Interrupted:
         release = lock.release
@@ -259,10 +259,10 @@ def test_an_interrupt_as_helpers_are_taken_gives_them_back(monkeypatch):
             assert lock.acquire(blocking)
             raise KeyboardInterrupt
 
-    monkeypatch.setattr(team, "_busy", Interrupted())
+    monkeypatch.setattr(pool, "_busy", Interrupted())
     with pytest.raises(KeyboardInterrupt):
         meet(np.zeros(4, np.int64), 1)
-    monkeypatch.setattr(team, "_busy", lock)
+    monkeypatch.setattr(pool, "_busy", lock)
     taken = []
     other = threading.Thread(target=lambda: taken.append(lock.acquire(blocking=False)))
     other.start()

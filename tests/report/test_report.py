@@ -147,7 +147,8 @@ def test_report_of_a_finished_run(toy, tmp_path, monkeypatch):
 
 
 def test_the_curve_is_drawn_while_training(tmp_path, monkeypatch):
-    """Catches a picture only at the end, drawn without need, or that takes more than its share."""
+    """Catches a picture only at the end, drawn without need, or that takes more than its
+    fraction."""
     now = [0.0]
     drawn = []
     lines = []

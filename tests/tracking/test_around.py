@@ -15,7 +15,7 @@ from stga_addon.tracking import around, structure_from_motion
 from stga_addon.tracking.around import Recognition, take_of, with_found_cameras
 from stga_addon.tracking.footage.open import open_footage
 from stga_addon.tracking.sharp_frames import sharpest
-from stga_addon.tracking.stages import Crew
+from stga_addon.tracking.stages import Workers
 from stga_addon.worker.helpers import Helpers
 
 from .scenes import encode
@@ -52,7 +52,7 @@ def pictures():
 
 def found(folder, out, take="auto"):
     with Helpers(1) as helpers:
-        footage, lines = with_found_cameras(open_footage(folder), out, take, Crew(helpers))
+        footage, lines = with_found_cameras(open_footage(folder), out, take, Workers(helpers))
     return footage, " ".join(lines)
 
 
@@ -124,7 +124,7 @@ def test_many_photos_from_behind_ear_to_ear(tmp_path):
     """Catches photos in small steps, of which those that are looked at share no room."""
     photos = write_pictures(tmp_path / "photos", [picture(own) for own in walk(32, 200.0)])
     with Helpers(1) as helpers:
-        kind, why = take_of(open_footage(photos), Crew(helpers))
+        kind, why = take_of(open_footage(photos), Workers(helpers))
     assert (kind, "the room moves with it" in why) == ("around", True)
 
 
@@ -155,7 +155,7 @@ def test_photos_before_a_plain_wall(tmp_path, monkeypatch, seen, expected):
     folder = write_pictures(tmp_path / "photos", [np.zeros((8, 8, 3), np.uint8)] * COUNT)
     monkeypatch.setattr(around, "_recognized", lambda *_: Recognition(*seen))
     with Helpers(1) as helpers:
-        kind, why = take_of(open_footage(folder), Crew(helpers))
+        kind, why = take_of(open_footage(folder), Workers(helpers))
     assert kind == expected[0]
     assert expected[1] in why
 

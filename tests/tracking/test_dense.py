@@ -34,7 +34,7 @@ from stga_addon.tracking.solve import (
     smoothed,
     solve_take,
 )
-from stga_addon.tracking.stages import Crew
+from stga_addon.tracking.stages import Workers
 from stga_addon.worker.helpers import Helpers
 
 from .test_fit import in_cameras_world, places_on, seen, shown
@@ -184,7 +184,7 @@ def test_smoothing_stays_at_the_solution_of_its_own_terms(head):
 def test_a_short_take_is_left_to_landmarks_and_surface():
     """Catches a texture averaged over the very frames that it judges."""
     take = RecordedTake(None, None, dict.fromkeys(range(5)), no_image)
-    assert fit_dense(None, take, Crew(Helpers(1))) is None
+    assert fit_dense(None, take, Workers(Helpers(1))) is None
 
 
 @pytest.mark.slow
@@ -193,7 +193,7 @@ def test_a_jaw_that_landmarks_leave_too_little_open_is_opened():
     thirds. Three cameras 60 degrees apart, and a surface whose poses are worse."""
     take = scene(np.radians([-60, 0, 60]))
     first = fit_head(take.head, take.take)
-    found, misfit = by_images(take.head, first, take.take, Crew(Helpers(1)))
+    found, misfit = by_images(take.head, first, take.take, Workers(Helpers(1)))
     wide = np.argsort(OPENINGS)[-3:]
     before = jaw_errors(take, first)
     after = jaw_errors(take, found)
@@ -222,7 +222,7 @@ def test_a_timestep_is_moved_as_those_beside_it_unless_it_looks_otherwise(monkey
         take = scene(eyes, openings, size=(150, 195))
         first = fit_head(take.head, take.take)
         solved.clear()
-        found = fit_dense(first, take.take, Crew(Helpers(1)))
+        found = fit_dense(first, take.take, Workers(Helpers(1)))
         errors.append((len(solved), jaw_errors(take, first), jaw_errors(take, found.fit)))
     (count, before, after), (every, shut, opened) = errors
     assert count == 4
@@ -245,7 +245,7 @@ def test_a_settled_timestep_is_moved_as_little_with_its_neighbors_as_alone(monke
     monkeypatch.setattr(dense._Solver, "carried", noted)
     monkeypatch.setattr(dense, "SETTLED_GAIN", 1.0)
     take = scene(np.radians([-50, 0, 50]), np.linspace(0, 0.3, 7), size=(115, 150))
-    fit_dense(fit_head(take.head, take.take), take.take, Crew(Helpers(1)), settled=True)
+    fit_dense(fit_head(take.head, take.take), take.take, Workers(Helpers(1)), settled=True)
     assert kept == [True] * 3
 
 
@@ -256,17 +256,17 @@ def test_result_depends_on_neither_processes_nor_interruptions(tmp_path, monkeyp
     monkeypatch.setattr(dense, "TEXTURE_PART_TIMESTEPS", 3)
     take = scene(np.radians([-40, 40]), openings=OPENINGS[:6], size=(115, 150))
     first = fit_head(take.head, take.take)
-    alone = fit_dense(first, take.take, Crew(Helpers(1)))
+    alone = fit_dense(first, take.take, Workers(Helpers(1)))
 
     def interrupt(stage, done, total):
         if done == total - 2:
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        fit_dense(first, take.take, Crew(Helpers(1, tmp_path), interrupt))
+        fit_dense(first, take.take, Workers(Helpers(1, tmp_path), interrupt))
     assert len(list(tmp_path.iterdir())) == 1
     with Helpers(2, tmp_path) as helpers:
-        together = fit_dense(first, take.take, Crew(helpers))
+        together = fit_dense(first, take.take, Workers(helpers))
     assert len(list(tmp_path.iterdir())) == 2
     for t in alone.fit.parameters:
         one, other = (
@@ -289,7 +289,7 @@ def test_raised_brows_are_not_lowered_by_images_that_prove_little():
         mixed.append([(c, (0.4 * up + 0.6 * low).astype(np.uint8)) for (c, up), (_, low) in pairs])
     images = partial(shown, mixed)
     first = fit_head(take.head, take.take)
-    found = fit_dense(first, replace(take.take, images=images), Crew(Helpers(1)))
+    found = fit_dense(first, replace(take.take, images=images), Workers(Helpers(1)))
     assert brow_errors(take, first).max() < 1
     assert brow_errors(take, found.fit).max() < 3
 
@@ -300,14 +300,14 @@ def test_a_surface_that_is_not_found_is_not_refined(monkeypatch):
     fit = object()
     rounds = []
 
-    def fit_once(fit, take, crew, settled=False):
+    def fit_once(fit, take, workers, settled=False):
         rounds.append(settled)
         return dense.DenseFit(fit, {}, {0: np.arange(len(REGIONS))})
 
     monkeypatch.setattr("stga_addon.tracking.seen.fit_dense", fit_once)
     monkeypatch.setattr("stga_addon.tracking.seen.fit_surface", lambda _, fit, *__, **___: fit)
     take = RecordedTake(None, None, {}, no_image)
-    found, misfit = by_images(None, fit, take, Crew(Helpers(1)))
+    found, misfit = by_images(None, fit, take, Workers(Helpers(1)))
     assert found is fit
     assert rounds == [False]
     assert misfit == {name: {0: row} for row, name in enumerate(REGIONS)}

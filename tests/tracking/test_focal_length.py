@@ -14,7 +14,7 @@ from stga_addon.flame.forward import FlameFrame, flame_forward
 from stga_addon.tracking.fit import HeadFit, RecordedTake, TimestepLandmarks
 from stga_addon.tracking.focal_length import estimated_focal
 from stga_addon.tracking.folder import describe_focal_length
-from stga_addon.tracking.footage.open import open_footage, usual_focal
+from stga_addon.tracking.footage.open import open_footage, typical_focal
 from stga_addon.tracking.footage.video import VideoFrames
 from stga_addon.tracking.known_person import KnownPerson
 from stga_addon.tracking.opened import TrackingOptions
@@ -60,7 +60,7 @@ def test_focal_length_of_photos(tmp_path, tags, expected):
     write_photo(tmp_path / "a.jpg", tags)
     footage = open_footage(tmp_path)
     camera = footage.cameras[0].camera
-    focal = pytest.approx(expected or usual_focal(WIDTH, HEIGHT), rel=2e-3)
+    focal = pytest.approx(expected or typical_focal(WIDTH, HEIGHT), rel=2e-3)
     assert camera.fl_x == camera.fl_y == focal
     assert footage.focal == ("file" if expected else "usual")
     assert open_footage(tmp_path, focal=50.0).cameras[0].camera.fl_x == 50
@@ -148,10 +148,10 @@ def turning(head, focal, turn_deg, size=(1080, 1920), count=30):
     places = places_on(head, 300)
     shape = rng.normal(0, 0.7, head.model.n_identity)
     own = rng.normal(0, 0.002, (300, 3))
-    usual = usual_focal(*size)
+    typical = typical_focal(*size)
     (width, height) = size
     camera, guessed = (
-        camera_from_gl(np.eye(4), size, (f, f), (width / 2, height / 2)) for f in (focal, usual)
+        camera_from_gl(np.eye(4), size, (f, f), (width / 2, height / 2)) for f in (focal, typical)
     )
     take = {}
     for timestep, share in enumerate(np.sin(np.linspace(0, 7, count))):
@@ -174,7 +174,7 @@ def test_focal_length_of_a_head_that_turns(head, factor, turn_deg):
     """Catches a head that is taken for one at a phone's distance: its depth would be that much too
     large or small; and, of people who sit still, the shape of a face taken for perspective, or a
     narrow interval that does not hold the truth."""
-    truth = factor * usual_focal(1080, 1920)
+    truth = factor * typical_focal(1080, 1920)
     places, take = turning(head, truth, turn_deg)
     found = estimated_focal(head, RecordedTake(places, np.ones(300, bool), take))
     assert turn_deg < found.turn_deg < 2 * turn_deg + 5
@@ -194,7 +194,7 @@ def film(folder, head, turn_deg):
     """A video, head.npz and points of a head that turns so far before a lens of 1.6 times a
     phone's focal length."""
     pytest.importorskip("av")
-    places, take = turning(head, 1.6 * usual_focal(*SIZE), turn_deg, SIZE, COUNT)
+    places, take = turning(head, 1.6 * typical_focal(*SIZE), turn_deg, SIZE, COUNT)
     write_video(folder / "phone.mp4", range(60, 60 + 10 * COUNT, 10), size=SIZE, gop=COUNT)
     write_flame(head.model, folder / "head.npz")
     points = np.concatenate([take[t].points for t in range(COUNT)])
@@ -237,7 +237,7 @@ def test_a_phones_video_is_decoded_once_and_its_lens_is_told(tmp_path, head, mon
     )
     assert decoded == list(range(COUNT))
     assert found.focal_length.source == "estimated"
-    assert found.focal_length.pixels == pytest.approx(1.6 * usual_focal(*SIZE), rel=0.1)
+    assert found.focal_length.pixels == pytest.approx(1.6 * typical_focal(*SIZE), rel=0.1)
     report = read_json(tmp_path / "out/tracking.json")
     assert report["focal_length_px"] == found.focal_length.pixels
     assert report["focal_length_from"] == "estimated"

@@ -11,7 +11,7 @@ from refusal import refusal
 from stga_addon.tracking import mattes
 from stga_addon.tracking.footage.open import open_footage
 from stga_addon.tracking.mattes import with_mattes
-from stga_addon.tracking.stages import Crew
+from stga_addon.tracking.stages import Workers
 from stga_addon.worker.helpers import Helpers
 
 from .scenes import HEIGHT, WIDTH, write_image, write_video
@@ -64,7 +64,7 @@ def take(folder, frames=3):
 
 def made(footage, folder, source=None):
     """The footage with mattes, and warnings."""
-    return with_mattes(footage, head, folder / "out", source or {}, Crew(Helpers(1)))
+    return with_mattes(footage, head, folder / "out", source or {}, Workers(Helpers(1)))
 
 
 def brightest(footage):

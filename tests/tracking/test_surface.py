@@ -29,7 +29,7 @@ from stga_addon.tracking.seen_surface import (
     surface_points,
 )
 from stga_addon.tracking.solve import person
-from stga_addon.tracking.stages import Crew
+from stga_addon.tracking.stages import Workers
 from stga_addon.tracking.surface import fit_surface, smooth_offsets
 from stga_addon.worker.helpers import Helpers
 
@@ -197,7 +197,7 @@ def test_a_head_is_moved_onto_the_skin_that_the_cameras_see(head):
     wrong = rng.normal(0, 0.0018, (150, 3))
     take = recorded(head, cameras, meshes, places_on(head, 150), wrong=wrong, images=images)
     first = fit_head(head, take)
-    fit = fit_surface(head, first, take, Crew(Helpers(1)))
+    fit = fit_surface(head, first, take, Workers(Helpers(1)))
     before, after = (
         [distances(one, t, mesh, head, front) for t, mesh in enumerate(meshes)]
         for one in (first, fit)
@@ -206,7 +206,7 @@ def test_a_head_is_moved_onto_the_skin_that_the_cameras_see(head):
     assert fit.static_offset is not None
     assert np.abs(fit.static_offset).max() > 0.001
     blank = replace(take, images=lambda t, most=None: [(c, 0 * i + 90) for c, i in images(t)])
-    assert fit_surface(head, first, blank, Crew(Helpers(1))) is first
+    assert fit_surface(head, first, blank, Workers(Helpers(1))) is first
 
 
 def test_one_timestep_does_not_tell_the_errors_of_landmarks(head, monkeypatch):
@@ -221,8 +221,8 @@ def test_one_timestep_does_not_tell_the_errors_of_landmarks(head, monkeypatch):
     first = fit_head(head, take)
     found = []
     for share in (0.2, 5.0):
-        monkeypatch.setattr("stga_addon.tracking.surface.TAKE_LANDMARK_SHARE", share)
-        found.append(fit_surface(head, first, take, Crew(Helpers(1))).parameters[0])
+        monkeypatch.setattr("stga_addon.tracking.surface.TAKE_LANDMARK_FRACTION", share)
+        found.append(fit_surface(head, first, take, Workers(Helpers(1))).parameters[0])
     assert np.abs(found[0] - first.parameters[0]).max() > 0.001
     assert np.array_equal(*found)
 
@@ -253,7 +253,7 @@ def test_skin_slides_as_dense_tracking_has_it(head, count, share):
     take = RecordedTake(places, np.ones(150, bool), wrong, images, metric=True)
     for dense, landmarks in ((False, wrong), (True, right)):
         first = fit_head(head, replace(take, landmarks=landmarks))
-        fit = fit_surface(head, first, take, Crew(Helpers(1)), dense=dense)
+        fit = fit_surface(head, first, take, Workers(Helpers(1)), dense=dense)
         assert fit.static_offset is not None
         slips = [in_cameras_world(fit, t) - mesh for t, mesh in enumerate(meshes)]
         errors.append(norm(slips, axis=2)[:, front].mean())

@@ -41,7 +41,7 @@ from stga_addon.tracking.footage.open import open_footage
 from stga_addon.tracking.head_model import HeadModel
 from stga_addon.tracking.opened import TrackingOptions
 from stga_addon.tracking.solve import person
-from stga_addon.tracking.stages import Crew, Stage
+from stga_addon.tracking.stages import Stage, Workers
 from stga_addon.tracking.surface import with_offset
 from stga_addon.tracking.torso import _followed, follow_torso
 from stga_addon.tracking.torso_cloth import Bending, draped, found_bending, torso_sheet
@@ -77,7 +77,7 @@ CHEST_CENTER_M = np.array([0.0, -0.215, -0.04])
 
 
 def follow(fit, parameters, footage):
-    return follow_torso(fit, parameters, footage, Crew(Helpers(1)))
+    return follow_torso(fit, parameters, footage, Workers(Helpers(1)))
 
 
 def assert_head_stays(fit, parameters, meshes):
@@ -260,7 +260,7 @@ def test_cloth_that_slides_over_the_shoulders_is_followed(fine_head):
     first = 3
     moved = np.arange(TIMESTEPS)[:, None] * [0.002, 0, 0] + LIFT_M
     shown = (cloth + slides[first] + moved[first])[cloth[:, 2] > CHEST_CENTER_M[2] + 0.02]
-    walk = BothWays(Crew(Helpers(1)), Stage.CLOTH, TIMESTEPS)
+    walk = BothWays(Workers(Helpers(1)), Stage.CLOTH, TIMESTEPS)
     bending = found_bending(posed, motion, TorsoPoints(first, shown), sorted(parameters), walk)
     meshes = {}
     for timestep, torso in motion.items():

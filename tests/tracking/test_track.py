@@ -32,7 +32,7 @@ from stga_addon.tracking.head_model import HeadModel, read_head_model
 from stga_addon.tracking.landmarks import detect_landmarks, landmark_file, read_camera
 from stga_addon.tracking.opened import TrackingOptions
 from stga_addon.tracking.solve import person
-from stga_addon.tracking.stages import Crew, Stage
+from stga_addon.tracking.stages import Stage, Workers
 from stga_addon.tracking.track import track
 from stga_addon.worker.helpers import Helpers
 
@@ -111,7 +111,7 @@ def test_the_capture_opens_and_projects_where_the_landmarks_were(recorded, head)
     vertices = np.array([line.split()[1:] for line in mesh if line.startswith("v ")], float)
     assert_allclose(vertices, capture.mesh(1), atol=2e-6)
     assert (folder / "out/contact_sheet.png").is_file()
-    shares = [progress.share for progress in told]
+    shares = [progress.fraction for progress in told]
     assert shares == sorted(shares)
     assert {progress.stage for progress in told} <= {*(stage.title for stage in Stage), "Tracked"}
     quality = {progress.stage: progress.figures().get("error_px") for progress in told}
@@ -348,10 +348,10 @@ def test_detection_resumes_camera_by_camera(recorded):
     footage = open_footage(folder / "footage")
     detector = Detector([np.ones((3, 2))] * 2)
     with pytest.raises(KeyboardInterrupt):
-        detect_landmarks(footage, detector, unmoved, folder / "found", Crew(Helpers(1), cancel))
+        detect_landmarks(footage, detector, unmoved, folder / "found", Workers(Helpers(1), cancel))
     assert len(list((folder / "found").iterdir())) == 2
     detector.calls = 0
-    found = detect_landmarks(footage, detector, unmoved, folder / "found", Crew(Helpers(1)))
+    found = detect_landmarks(footage, detector, unmoved, folder / "found", Workers(Helpers(1)))
     assert detector.calls == 15
     # the same face twice is one face
     assert all(camera.confidence.all() for camera in found.values())
@@ -360,7 +360,7 @@ def test_detection_resumes_camera_by_camera(recorded):
     assert_array_equal(written.points, 1)
     two = np.array([[0.0, 0.0], [9.0, 9.0]])
     with refusal(r"camera cam0 sees 5 of 5 frames with two faces, the first at timestep 0"):
-        detect_landmarks(footage, Detector([two, two + 30]), unmoved, folder, Crew(Helpers(1)))
+        detect_landmarks(footage, Detector([two, two + 30]), unmoved, folder, Workers(Helpers(1)))
 
 
 def cancel(stage, done, total):

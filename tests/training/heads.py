@@ -46,8 +46,8 @@ def parameters_of(capture, timesteps):
 def tracked_as(timesteps, parameters, **more):
     """What an avatar has tracked: parameters (T, P), and of all else nothing."""
     count = len(parameters)
-    usual = {"misfit": np.zeros(count), "shift": np.zeros((count, 3)), "scale": np.ones(count)}
-    values = {**usual, "information": np.eye(1), **more}
+    typical = {"misfit": np.zeros(count), "shift": np.zeros((count, 3)), "scale": np.ones(count)}
+    values = {**typical, "information": np.eye(1), **more}
     return AvatarTracking(tuple(timesteps), parameters, **values)
 
 

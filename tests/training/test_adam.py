@@ -115,7 +115,7 @@ def test_colors_step_by_their_gradients(degree, ahead, bad):
     assert_allclose(state.parameters.sh[stepped, in_use], value, rtol=1e-5, atol=1e-5)
 
 
-def test_epsilon_is_the_same_share_at_every_image_size():
+def test_epsilon_is_the_same_fraction_at_every_image_size():
     """Catches splats that hardly show learning at another speed on images of another size."""
     camera = Camera(200, 100, 300.0, 300.0, 100.0, 50.0, np.eye(4))
     epsilon = adam.adam_options(TrainingSettings(adam_epsilon=0.003), camera).epsilon

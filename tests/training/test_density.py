@@ -153,7 +153,7 @@ def test_a_split_covers_about_what_its_parent_did(opacity):
 @pytest.mark.parametrize(
     ("budget", "share", "split"), [(0, 1.0, 0), (2, 1.0, 2), (1000, 0.05, 2), (1000, 1.0, 5)]
 )
-def test_budget_and_share_bound_the_growth(budget, share, split):
+def test_budget_and_fraction_bound_the_growth(budget, share, split):
     """Catches unbounded growth, and splits of others than have the largest screen gradient."""
     listed = [20, 4, 33, 11, 26]
     state = busy_state(listed)

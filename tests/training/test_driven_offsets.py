@@ -112,7 +112,7 @@ def test_the_step_is_adam_in_float64():
             g = smoothed[f][:, None] * gradient[rows[face[rows] == f]].astype(float).sum(0)
             if np.isfinite(g).all():
                 own = (value[f], first[f], second[f])
-                own = adam_step(own, g, steps[f], offset.rate_share * rate, options)
+                own = adam_step(own, g, steps[f], offset.rate_fraction * rate, options)
                 value[f], first[f], second[f] = own
                 average[f] += max(0.1, 4 / (steps[f] + 3)) * (value[f] - average[f])
     assert_array_equal(state.steps, steps)

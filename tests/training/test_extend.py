@@ -21,7 +21,7 @@ from stga_addon.jobs.train import Extend, Train, prepare
 from stga_addon.progress import ignore
 from stga_addon.training.run import continuation
 from stga_addon.training.run.checkpoint import read_checkpoint
-from stga_addon.training.run.continuation import START_SHARE
+from stga_addon.training.run.continuation import START_FRACTION
 from stga_addon.training.run.folder import open_run, read_run
 from stga_addon.training.run.metrics_log import read_metrics
 from stga_addon.training.run.session import train_run
@@ -153,7 +153,7 @@ def test_an_extension_begins_with_its_parents_rates(takes, parent):
     """Catches rates that jump, and colors that cannot follow the strain of a new take."""
     original = read_run(parent).settings.rates
     extended = prepare_extension(parent, (takes[1],)).run.settings.rates
-    middle = learning_rates(original, START_SHARE)
+    middle = learning_rates(original, START_FRACTION)
     assert learning_rates(extended, 0.0) == pytest.approx(
         {**middle, "strain_color": original.strain_color}
     )

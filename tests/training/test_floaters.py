@@ -83,24 +83,24 @@ def test_what_fills_no_view_floats(toy):
         assert kept[state.unbound & ~tiny].mean() > 0.3  # others are hidden in all views
 
 
-@pytest.mark.parametrize("usual", [1.0, 10.0])
-def test_after_a_short_training(usual, toy):
+@pytest.mark.parametrize("typical", [1.0, 10.0])
+def test_after_a_short_training(typical, toy):
     """Catches floaters that have not faded yet, beside fuller hair, and hair that has faded."""
     state = Trainer(toy, quick_settings("global", lattice=0), {}).state
     state.unbound[:] = True
     state.gradient_count[:] = np.arange(len(state))
-    weight = np.full(len(state), usual, np.float32)
+    weight = np.full(len(state), typical, np.float32)
     weight[::5] = 0.6
     backend = Rows(state)
     backend.blend_weights = lambda view: weight
     FloaterPruning(toy).apply(backend, Schedule(200, PRUNING_TIMES[0], len(state)))
     kept = np.isin(np.arange(len(weight)), backend.state.gradient_count)
-    assert_array_equal(kept, (weight > 0.6) | (usual < 5))
+    assert_array_equal(kept, (weight > 0.6) | (typical < 5))
 
 
 def test_a_pruning_comes_once(toy):
-    """Catches a look that is missed or made twice where steps take different shares of the budget,
-    or where a run is resumed between two steps."""
+    """Catches a look that is missed or made twice where steps take different fractions of the
+    budget, or where a run is resumed between two steps."""
     shares = np.cumsum(np.random.default_rng(0).uniform(0.001, 0.05, 60))
     shares = shares[shares < 1]
     begun = Trainer(toy, quick_settings("global", lattice=0), {})

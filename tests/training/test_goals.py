@@ -9,7 +9,7 @@ import pytest
 from stga_addon.avatar.file import read_avatar
 from stga_addon.training import schedule
 from stga_addon.training.evaluate import evaluator
-from stga_addon.training.evaluate.evaluator import EVALUATION_SHARE
+from stga_addon.training.evaluate.evaluator import EVALUATION_FRACTION
 from stga_addon.training.evaluate.forecast import checked_forecasts
 from stga_addon.training.evaluate.metrics import Quality
 from stga_addon.training.run import session
@@ -54,13 +54,13 @@ def clock(monkeypatch):
     return clock
 
 
-def test_evaluation_keeps_to_its_share_of_the_time(toy, tmp_path, clock):
+def test_evaluation_keeps_to_its_fraction_of_the_time(toy, tmp_path, clock):
     """Catches evaluations that eat the budget, are counted as training, or hardly ever come."""
     train_run(toy, tmp_path, run_of(toy, lattice=0, iterations=None, seconds=400.0))
     lines = read_metrics(tmp_path)
     assert read_checkpoint(tmp_path).elapsed_s == 400 == read_checkpoint(tmp_path).iteration
     assert [line["evaluation_s"] for line in lines] == [3.0] * len(lines)
-    assert EVALUATION_SHARE - 0.01 < 3.0 * (len(lines) - 1) / 400 <= EVALUATION_SHARE
+    assert EVALUATION_FRACTION - 0.01 < 3.0 * (len(lines) - 1) / 400 <= EVALUATION_FRACTION
     assert lines[-1]["wall_s"] == 400 + 3 * len(lines)
     assert {"peak_memory_mb", "iteration", "seconds", "splats", "psnr"} <= set(lines[-1])
 

@@ -274,7 +274,7 @@ def test_rows_change_as_the_cpus(toy):
 
 
 def assert_near(got, want):
-    """All values and moments, as shares of the largest of their name."""
+    """All values and moments, as fractions of the largest of their name."""
     for name, expected in following(want).items():
         off = np.abs(following(got)[name] - expected)
         assert (off <= 0 if name.endswith("steps") else 2e-4 * np.abs(expected).max()).all(), name

@@ -1,4 +1,5 @@
-"""Hull points of an analytic scene: a ball beside the mesh, seen in masks from all around."""
+"""Visual-hull points of an analytic scene: a ball beside the mesh, seen in masks from all
+around."""
 
 from dataclasses import replace
 
@@ -24,7 +25,7 @@ from stga_addon.training.optimize.initial_splats import (
     SEEN_COPIES,
     VOXEL_SIZE_M,
     flat_points,
-    hull_points,
+    visual_hull_points,
 )
 
 SIZE = 120
@@ -101,7 +102,7 @@ def in_world(capture, points, convention="stga"):
 def test_points_stand_on_the_balls_surface(beside, convention):
     """Catches swapped image axes, an ignored principal point, points in the wrong frame, and a
     shell with holes."""
-    points = hull_points(beside, beside.views["train"], convention, 1)
+    points = visual_hull_points(beside, beside.views["train"], convention, 1)
     world = in_world(beside, points, convention)
     height = norm(world.xyz - CENTRE, axis=1) - RADIUS
     assert len(world) > 300
@@ -125,7 +126,7 @@ def test_points_stand_on_the_balls_surface(beside, convention):
 
 def test_points_are_unbound_gray_and_embedded_in_the_nearest_triangle(beside):
     """Catches limits that pull hair onto the skin or a far face, and captures without masks."""
-    points = hull_points(beside, beside.views["train"], "stga", 2)
+    points = visual_hull_points(beside, beside.views["train"], "stga", 2)
     assert points.unbound.all()
     assert points.sh.shape == (len(points), 9, 3)
     assert not points.sh.any()
@@ -139,7 +140,9 @@ def test_points_are_unbound_gray_and_embedded_in_the_nearest_triangle(beside):
     # The nearest triangle need not have the nearest centroid, but on this even mesh it nearly does.
     assert_allclose(bound, distances.min(axis=1), atol=3e-4)
     views = [replace(view, mask=None) for view in beside.views["train"]]
-    bare, masked = (hull_points(beside, v, "stga", 0) for v in (views, beside.views["train"]))
+    bare, masked = (
+        visual_hull_points(beside, v, "stga", 0) for v in (views, beside.views["train"])
+    )
     assert_array_equal(bare.xyz, masked.xyz)
 
 
@@ -159,7 +162,7 @@ def test_blocks_leave_nothing_out(beside, tmp_path, monkeypatch, whole, shift):
     found = []
     for voxels in (1, 5):
         monkeypatch.setattr("stga_addon.training.optimize.initial_splats.BLOCK_VOXELS", voxels)
-        found.append(hull_points(capture, views, "stga", 0).xyz)
+        found.append(visual_hull_points(capture, views, "stga", 0).xyz)
     assert len(found[0]) > 100
     assert np.array_equal(*found)
 
@@ -168,7 +171,7 @@ def test_nothing_near_the_mesh(tmp_path):
     """Catches points on the skin itself, where the mesh's own splats are; here the ball is half
     inside the head."""
     capture = scene(tmp_path, np.array([0.04, 0.04, 0.02]), 0.04)
-    world = in_world(capture, hull_points(capture, capture.views["train"], "stga", 0))
+    world = in_world(capture, visual_hull_points(capture, capture.views["train"], "stga", 0))
     head = norm(world.xyz - capture.mesh(TIMESTEP).mean(0), axis=1) - 1.1 * 0.06
     assert len(world) > 100
     # The clearance is measured to vertices and centroids, 2 mm from any point of a triangle of this
@@ -183,7 +186,7 @@ def test_one_mask_that_says_no_is_enough(beside, tmp_path):
     black = tmp_path / "black.png"
     Image.fromarray(np.zeros((SIZE, SIZE), np.uint8)).save(black)
     views[7] = replace(views[7], mask=black)
-    assert len(hull_points(beside, views, "stga", 0)) == 0
+    assert len(visual_hull_points(beside, views, "stga", 0)) == 0
 
 
 def turned(model):
@@ -218,7 +221,7 @@ def test_what_lies_below_the_neck_follows_the_torso(tmp_path, one):
         views = scene(tmp_path, np.array(centre), 0.015).views
         side = max(views["train"], key=lambda view: float(view.camera.position[0]))
         capture = capture_of(tmp_path, head, views)
-        place, shown = (flat_points, side) if one else (hull_points, views["train"])
+        place, shown = (flat_points, side) if one else (visual_hull_points, views["train"])
         before, after = (place(capture, shown, "stga", 0, torso) for torso in (False, True))
         assert len(before) == len(after) > 20
         assert not torso_faces(model)[before.face].all()
@@ -238,17 +241,19 @@ def test_few_cameras_take_the_torso_from_where_it_was_seen(tmp_path):
     views = scene(tmp_path, np.array([0.0, -0.175, 0.115]), 0.015).views["train"]
     neutral = sequence_mesh(head, TIMESTEP + 1)
     capture = capture_of(tmp_path, head, {"train": views}, neutral)
-    hull, many = (hull_points(capture, own, "stga", 0, torso=True) for own in (views[:3], views))
+    hull, many = (
+        visual_hull_points(capture, own, "stga", 0, torso=True) for own in (views[:3], views)
+    )
     at = np.array([0.0, -0.16, 0.09]) + np.random.default_rng(0).uniform(-0.01, 0.01, (200, 3))
     write_torso_points(tmp_path, TorsoPoints(TIMESTEP + 1, at))
-    few = hull_points(capture, views[:3], "stga", 0, torso=True)
+    few = visual_hull_points(capture, views[:3], "stga", 0, torso=True)
     seen = few.rows(slice(-SEEN_COPIES * len(at), None))
     assert len(few) - len(seen) < 0.2 * len(hull)  # above the neck
     assert torso_faces(model)[seen.face].all()
     neutral = face_frames(capture.mesh(TIMESTEP + 1), capture.faces, capture.neutral)
     assert norm(to_world(seen, neutral).xyz - at.mean(0), axis=1).max() < 0.03
     assert norm(in_world(capture, seen).xyz - at.mean(0), axis=1).min() > 0.01
-    assert_array_equal(hull_points(capture, views, "stga", 0, torso=True).xyz, many.xyz)
+    assert_array_equal(visual_hull_points(capture, views, "stga", 0, torso=True).xyz, many.xyz)
 
 
 @pytest.mark.parametrize("convention", ["stga", "gaussian_avatars"])
@@ -308,8 +313,8 @@ def test_no_layer_where_nothing_lies_beside_the_mesh(tmp_path, beside):
     capture = scene(tmp_path, CENTRE, 0.0)
     for points in (
         flat_points(capture, capture.views["train"][0], "stga", 1),
-        hull_points(capture, capture.views["train"], "stga", 1),
+        visual_hull_points(capture, capture.views["train"], "stga", 1),
     ):
         assert points.sh.shape == (0, 4, 3)
     huge = replace(beside, mesh=lambda timestep: 1000 * beside.mesh(timestep))
-    assert len(hull_points(huge, beside.views["train"][:2], "stga", 0)) < 100_000
+    assert len(visual_hull_points(huge, beside.views["train"][:2], "stga", 0)) < 100_000

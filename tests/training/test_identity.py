@@ -29,9 +29,9 @@ ITERATIONS = 12
 
 
 def make_run(capture, flame=None, **changes):
-    usual = {"iterations": ITERATIONS, "lattice": 0, "sh_degree": 0}
-    usual["driven_offsets"] = ("strain_color",)
-    return replace(run_of(capture, **{**usual, **changes}), flame=flame)
+    typical = {"iterations": ITERATIONS, "lattice": 0, "sh_degree": 0}
+    typical["driven_offsets"] = ("strain_color",)
+    return replace(run_of(capture, **{**typical, **changes}), flame=flame)
 
 
 @pytest.fixture(scope="session")

@@ -28,7 +28,7 @@ class Stopwatch:
 
 @pytest.fixture
 def shares(monkeypatch):
-    """Shares of the budget that the steps were made at."""
+    """Fractions of the budget that the steps were made at."""
     watch = Stopwatch()
     seen = []
 

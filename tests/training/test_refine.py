@@ -18,7 +18,7 @@ from stga_addon.training.optimize.state import arrays_of
 from stga_addon.training.run import continuation as module
 from stga_addon.training.run.checkpoint import read_checkpoint
 from stga_addon.training.run.continuation import (
-    START_SHARE,
+    START_FRACTION,
     continued_order,
     continued_settings,
     distinct_timesteps,
@@ -39,7 +39,7 @@ ITERATIONS = 16
 
 @pytest.fixture(scope="module")
 def finished(toy, tmp_path_factory):
-    """With strain color, density control and hull points; the avatar is the last state's."""
+    """With strain color, density control and visual-hull points; the avatar is the last state's."""
     out = tmp_path_factory.mktemp("finished") / "run"
     without_held_out = replace(toy, views={"train": toy.views["train"]})
     run = run_of(
@@ -182,7 +182,7 @@ def test_late_rates_are_the_rest_of_the_schedule():
     rates = Rates()
     late = continued_settings(TrainingSettings(iterations=9), "refine", 0.0, None, 5, 0).rates
     for progress in (0.0, 0.3, 1.0):
-        expected = learning_rates(rates, START_SHARE + (1 - START_SHARE) * progress)
+        expected = learning_rates(rates, START_FRACTION + (1 - START_FRACTION) * progress)
         assert learning_rates(late, progress) == pytest.approx(expected)
 
 

@@ -278,7 +278,7 @@ def test_a_budget_in_seconds(toy, tmp_path, monkeypatch):
     shares = []
 
     def note(progress):
-        shares.append(progress.share)
+        shares.append(progress.fraction)
         return iteration_of(progress) == 6
 
     run = make_run(toy, iterations=None, seconds=0.6)
@@ -301,7 +301,7 @@ def test_more_training(toy, unbroken, tmp_path, monkeypatch):
 
     def note(progress):
         if progress.stage == "Training":
-            shares.append(progress.share)
+            shares.append(progress.fraction)
             left.append(progress.figures()["left_s"])
         return False
 
@@ -351,7 +351,7 @@ def test_progress_tells_what_a_person_wants_to_know(toy, tmp_path):
     train_run(toy, tmp_path, make_run(toy), report=report)
     training = [found for found, p in zip(figures, told, strict=True) if p.stage == "Training"]
     assert [found["iteration"] for found in training] == list(range(1, ITERATIONS + 1))
-    assert [p.share for p in told if p.stage == "Training"][-1] == 1.0
+    assert [p.fraction for p in told if p.stage == "Training"][-1] == 1.0
     evaluating_s = read_metrics(tmp_path)[-2]["evaluation_s"]
     assert training[-1]["left_s"] == pytest.approx(2 * evaluating_s)
     assert all(found["per_second"] > 0 and np.isfinite(found["loss"]) for found in training)

@@ -29,7 +29,7 @@ from stga_addon.training.optimize.hidden_layers import (
     hidden_splats,
     splats_behind,
 )
-from stga_addon.training.optimize.initial_splats import hull_points, voxel_size
+from stga_addon.training.optimize.initial_splats import visual_hull_points, voxel_size
 from stga_addon.training.optimize.state import new_state
 from stga_addon.training.optimize.step_hook import Schedule
 from stga_addon.training.optimize.surface import GRAZING_COSINE, Surface
@@ -224,13 +224,13 @@ def test_hidden_sides_are_closed(filmed, convention):
 
 
 def test_no_tuft_hangs_behind_the_head(filmed):
-    """Catches hull points behind a head, where masks from in front do not end the hull: in the air,
-    for all cameras that nobody has put there. Those of hair that outlines show stay."""
+    """Catches visual-hull points behind a head, where masks from in front do not end the hull: in
+    the air, for all cameras that nobody has put there. Those of hair that outlines show stay."""
     views = filmed.views["train"]
     views = tuple(replace(view, timestep=0, camera_index=view.timestep) for view in views)
     capture = replace(filmed, views={"train": views}, timesteps=(0,))
     frames = FrameStore(capture, "stga")
-    splats = hull_points(capture, views, "stga", 0)
+    splats = visual_hull_points(capture, views, "stga", 0)
     gone = above_unseen_hair(frames, splats)
     at = to_world(splats, frames.of(0)).xyz
     distance = cKDTree(filmed.neutral).query(at)[0]

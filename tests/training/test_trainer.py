@@ -16,7 +16,7 @@ from stga_addon.capture.images import read_image
 from stga_addon.capture.open import open_capture
 from stga_addon.training.optimize.backend import RenderOptions
 from stga_addon.training.optimize.frames import (
-    UNSEEN_LIMIT_SHARE,
+    UNSEEN_LIMIT_FRACTION,
     FrameStore,
 )
 from stga_addon.training.optimize.initial_splats import initial_splats, unseen_share
@@ -165,7 +165,7 @@ def test_outlier_resets_and_density_control_come_when_due(toy):
 
 
 def test_initial_splats_with_hull_points(tmp_path):
-    """Catches hull points mixed up with the lattice, which would escape its limits."""
+    """Catches visual-hull points mixed up with the lattice, which would escape its limits."""
     hairy = open_capture(factory.write_mesh_capture(tmp_path / "hairy"))
     rows, columns = np.mgrid[: factory.HEIGHT, : factory.WIDTH] + 0.5
     mask = np.hypot(columns - factory.CX, rows - factory.CY) < 29  # the ball itself: 20 pixels
@@ -198,8 +198,8 @@ def test_splats_of_a_triangle_by_the_mesh(toy, monkeypatch, most, first, whole):
     assert len(initial_splats(toy, quick_settings(lattice=0))) == triangles
 
 
-def test_unseen_share(toy):
-    """Catches seen taken for unseen, another timestep, and shares of bound splats."""
+def test_unseen_fraction(toy):
+    """Catches seen taken for unseen, another timestep, and fractions of bound splats."""
     splats = initial_splats(toy, quick_settings(lattice=0))
     splats.unbound[::2] = True
     splats.xyz[:] += default_rng(0).normal(0, 0.1, splats.xyz.shape).astype(np.float32)
@@ -228,7 +228,7 @@ def test_scale_limits_in_meters(toy, convention):
     store = FrameStore(toy, convention)
     bound, unbound = store.scale_limits(settings)
     facing = store.surface.facing
-    share = np.interp(facing, (UNSEEN_COSINE, GRAZING_COSINE), (UNSEEN_LIMIT_SHARE, 1))
+    share = np.interp(facing, (UNSEEN_COSINE, GRAZING_COSINE), (UNSEEN_LIMIT_FRACTION, 1))
     assert 0 < (share < 1).mean() < 0.8
     assert_allclose(bound, 3 * share * store.units, rtol=1e-6)
     diagonal = norm(toy.neutral.max(0) - toy.neutral.min(0))

@@ -49,7 +49,7 @@ def adam_step(arrays, gradient, count, rate, options):
 
 
 def quick_settings(strategy="selective", **changes):
-    """Without hull points, which have tests of their own."""
+    """Without visual-hull points, which have tests of their own."""
     return make_settings(strategy, **{"iterations": 100, "hull_points": False, **changes})
 
 
@@ -132,7 +132,7 @@ class Rows(CpuBackend):
 
 def hidden_layer_size(frames):
     """How many splats lie on triangles that no camera faces: points of a lattice at most as far
-    apart as hull points, 15 a triangle at most."""
+    apart as visual-hull points, 15 a triangle at most."""
     capture = frames.capture
     corners = np.asarray(capture.neutral)[capture.faces[frames.surface.hidden]]
     sides = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])

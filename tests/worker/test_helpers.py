@@ -46,7 +46,7 @@ def is_own(value, function, step):
         "stga_addon.format",
     ):
         raise ZeroDivisionError
-    if function(value.share) != "45 s":
+    if function(value.fraction) != "45 s":
         raise StgaError("expected 45 seconds")
     return value
 

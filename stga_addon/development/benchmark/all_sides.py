@@ -23,7 +23,9 @@ from ..demo.make_capture import ELEVATIONS_DEG, Act, camera_at, frame_of_act
 from ..demo.run import side_by_side
 
 DIRECTIONS = 8
+"""Directions around the head in which it is compared."""
 JPEG_QUALITY = 88
+"""Pillow's quality of the written JPEG pictures, 0 to 100."""
 PICTURE_FORMATS = {".jpg": "JPEG", ".jpeg": "JPEG", ".png": "PNG"}
 """Suffix of a picture -> Pillow's name of its format."""
 NEUTRAL = Act({})

@@ -13,7 +13,7 @@ from ...errors import StgaError
 from ...files import replacing, write_json
 from ...format import format_duration
 from ...jobs.batch.plan import Plan
-from ...report import evaluation_share, finish_axes, psnr_axes
+from ...report import evaluation_fraction, finish_axes, psnr_axes
 from ...schema import to_json
 from ...training.evaluate.forecast import FITTED_HEADS
 from .statistics import (
@@ -33,8 +33,9 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 MAX_SEEDS = 1000
+"""Largest number of seeds of a variant."""
 MEMORY_GB = 1.0
-"""Of a variant's process; all variants of a slice have one at the same time."""
+"""Memory of a variant's process. All variants of a slice run at the same time."""
 COLUMNS = {
     "iterations": ("iterations", 0),
     "ms_per_iteration": ("ms/it", 1),
@@ -152,9 +153,9 @@ def report_text(
         if checked
         else []
     )
-    share = float(np.mean([evaluation_share(outcome.lines) for outcome in runs]))
+    fraction = float(np.mean([evaluation_fraction(outcome.lines) for outcome in runs]))
     lines.append(
-        f"Evaluation while training took {share:.1%} of the training time, which excludes it."
+        f"Evaluation while training took {fraction:.1%} of the training time, which excludes it."
     )
     return "\n".join(lines)
 

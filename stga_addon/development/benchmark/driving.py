@@ -36,11 +36,15 @@ from ...flame.sequence import FlameSequence, with_identity
 from ...tracking.posed_points import PosedPoints
 
 IDENTITIES = 3
+"""Random heads that are driven."""
 FREE_STEPS = 3
+"""Gauss–Newton steps of the free fit."""
 SINGULAR = 1e-12
 """Ridge of the free fit, which only keeps its equations solvable."""
 LEAK_RIDGE_M = 1e-4
+"""Ridge of the leak's least squares, in meters."""
 QUIET_FRAMES = 100
+"""Frames of nearly neutral poses before the measured ones."""
 JAW = 3 * JOINTS.index("jaw")
 
 

@@ -232,9 +232,9 @@ def compare(name: str, prepared: Prepared, arm: Arm, options: argparse.Namespace
     ) as loader:
         while True:
             if spent >= due:
-                share = min(1.0, spent / budget) if arm.anew else 1.0
+                fraction = min(1.0, spent / budget) if arm.anew else 1.0
                 quality = evaluate(
-                    partial(trainer.render, progress=share), evaluation_views, exposure=exposure
+                    partial(trainer.render, progress=fraction), evaluation_views, exposure=exposure
                 )
                 lines.append(
                     {
@@ -295,11 +295,14 @@ def table(runs: dict[str, list[list[Line]]]) -> list[str]:
         )
         row = [arm, f"{count:.0f}", f"{1000 * seconds / count:.0f}"]
         row += [spread([end[f"psnr_{name}"] for end in ends]) for name in figures]
-        for quality, others, share in goals.values():
+        for quality, others, fraction in goals.values():
             pairs = zip(of_seeds, others or [], strict=False)
             row.append(
                 spread(
-                    [time_to(lines, quality, share * other[-1][quality]) for lines, other in pairs],
+                    [
+                        time_to(lines, quality, fraction * other[-1][quality])
+                        for lines, other in pairs
+                    ],
                     1,
                 )
             )
@@ -314,11 +317,11 @@ def differences(runs: dict[str, list[list[Line]]]) -> list[str]:
     found = list[str]()
     if {"extend", "anew"} <= set(runs):
         pairs = list(zip(runs["extend"], runs["anew"], strict=True))
-        shares = [
+        fractions = [
             time_to(lines, "psnr", 0.98 * anew[-1]["psnr"]) / anew[-1]["seconds"]
             for lines, anew in pairs
         ]
-        percent = spread([100 * share for share in shares], 1)
+        percent = spread([100 * fraction for fraction in fractions], 1)
         found.append(f"- 98 % of the PSNR of anew: after {percent} % of its time")
     for name, of_seeds in runs.items():
         if "refine" in name and "psnr_region" in of_seeds[0][-1]:

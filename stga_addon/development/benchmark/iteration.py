@@ -58,19 +58,20 @@ from ...training.schedule import learning_rates
 from ...training.settings import make_settings
 
 RATES = dict.fromkeys(learning_rates(make_settings(iterations=1).rates, 0), 1e-9)
+"""Learning rates, so small that the splats do not change while they are timed."""
 SSIM_WEIGHT = 0.2
-"""Of the image loss."""
+"""Weight of SSIM in the image loss."""
 LOSS_STAGE = "L1 + SSIM, both ways"
+"""Name of the image loss in the table."""
 LOSS_OPERATIONS = 3 * (14 * 11 + 28 + 12)
-"""Additions, multiplications, multiply-adds and the like that the image loss needs of a pixel: in
-each channel 14 blurs of 11, SSIM with its derivatives, and the rest.
-`tests/raster/test_assembly.py` counts them in the assembly."""
+"""Arithmetic operations of the image loss per pixel: in each channel, 14 blurs of 11 values, SSIM
+with its derivatives, and the rest. `tests/raster/test_assembly.py` counts them in the assembly."""
 
 REGIONS = {
     "bundled": ([0.031, 0.036, 0.09], [0.0, -0.034, 0.11]),
     "ellipsoid": ([0.03, -0.04, 0.08], [0.0, 0.06, 0.07]),
 }
-"""Where each head's selected regions lie: an eye and the mouth."""
+"""Head -> centers of its selected regions: an eye and the mouth."""
 
 
 def bundled_head(count: int, rng: np.random.Generator) -> tuple[Splats, np.ndarray, np.ndarray]:
@@ -142,7 +143,7 @@ def copy_bandwidth() -> float:
 
 
 MULTIPLY_ADDS = 16
-"""Of one value in `multiply_add_rows`, one after the other."""
+"""Multiply-adds in sequence of each value in `multiply_add_rows`."""
 
 
 @parallel(lambda rows: len(rows), piece=16)
@@ -174,7 +175,7 @@ def arithmetic_rate(clock: Callable[[], float]) -> float:
 
 
 Stage = tuple[Callable[[], object], int]
-"""What a stage does, and the bytes that it must move at least."""
+"""A stage's function, and the least number of bytes that it must move."""
 BACKGROUND = np.ones(3, np.float32)
 
 
@@ -351,13 +352,13 @@ def global_step(
 
 
 def two_regions(
-    splats: Splats, mesh: np.ndarray, faces: np.ndarray, share: float, head: str = "bundled"
+    splats: Splats, mesh: np.ndarray, faces: np.ndarray, fraction: float, head: str = "bundled"
 ) -> np.ndarray:
-    """(F,) bool: triangles nearest to two points on the front (an eye, the mouth), with `share` of
-    the splats."""
+    """(F,) bool: triangles nearest to two points on the front (an eye, the mouth), with `fraction`
+    of the splats."""
     center = mesh[faces].mean(1)
     away = np.minimum(*(np.linalg.norm(center - p, axis=1) for p in REGIONS[head]))
-    return np.asarray(away <= np.quantile(away[splats.face], share))
+    return np.asarray(away <= np.quantile(away[splats.face], fraction))
 
 
 def main() -> None:
@@ -396,10 +397,10 @@ def main() -> None:
 
     whole = measure(batch)
     print(f"{'whole iteration':<31}{whole:8.2f}")
-    for share in (0.05, 0.1, 0.2, 0.4):
-        selected = two_regions(splats, mesh, faces, share, options.head)
+    for fraction in (0.05, 0.1, 0.2, 0.4):
+        selected = two_regions(splats, mesh, faces, fraction, options.head)
         part = measure(replace(batch, selected=selected))
-        name = f"local, {share:4.0%} selected"
+        name = f"local, {fraction:4.0%} selected"
         print(f"{name:<31}{part:8.2f}   {part / whole:.2f} of a global one")
 
 

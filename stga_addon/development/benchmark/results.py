@@ -1,12 +1,12 @@
 """Writes the section Quality of docs/benchmarks.md: tables, each with the version and the command
 that measured it.
 
-    python -m stga_addon.development.benchmark.results CAPTURE [--share 1]
+    python -m stga_addon.development.benchmark.results CAPTURE [--fraction 1]
         [--out docs/benchmarks.md] [--folder out/results]
 
 CAPTURE: one with a tracked mesh and the splits val and test, as `studio_head`. Takes less than 25
 minutes on two otherwise idle cores. What was measured stays in --folder and is not measured again.
---share 0.05 tries it with a twentieth of all budgets. STGA_LPIPS names the weights of LPIPS
+--fraction 0.05 tries it with a twentieth of all budgets. STGA_LPIPS names the weights of LPIPS
 (docs/dependencies.md).
 """
 
@@ -36,6 +36,7 @@ triangles that the default selection (2 mm) picks in that frame. ±: standard de
 `studio_head`, not in this repository: a path-traced head with 12 training timesteps, 15 training
 cameras at 275×401 and a tracked mesh of 10,696 triangles.
 """
+
 EXTENDING = """
 The training timesteps become two takes. *before* is an avatar of the first, which the arms continue
 for the same time: *extend* trains all splats in views of both takes; *anew* trains another avatar
@@ -43,8 +44,9 @@ on both, three times as long; *refine* trains the mouth (*region*) alone, *all* 
 same*: seconds until the region is as good as *all* leaves it; *s to 98 %*: until both takes have
 98 % of the PSNR of *anew*.
 """
+
 END = "\n<!-- What benchmark.results writes ends here. -->\n"
-"""What stands after it in the page stays."""
+"""Mark at the end of what is written; the page keeps what follows it."""
 PARTS = (("whole image", ""), ("head", "_mask"), ("moving", "_moving"))
 """Row of the table, and suffix of the metrics as `stga eval` writes them."""
 
@@ -60,15 +62,15 @@ class Section:
     note: str = ""
 
 
-def sections(capture: str, share: float) -> dict[str, Section]:
-    """Folder -> section; share: of the budgets."""
+def sections(capture: str, fraction: float) -> dict[str, Section]:
+    """Folder -> section; fraction: of the budgets."""
 
     def seconds(budget: float) -> str:
-        return f"{budget * share:g}"
+        return f"{budget * fraction:g}"
 
     extend = (
-        f"python -m stga_addon.development.benchmark.extend {capture} --base {round(1200 * share)}"
-        f" --seconds {seconds(20)} --seeds 0 1 --refine mouth"
+        f"python -m stga_addon.development.benchmark.extend {capture}"
+        f" --base {round(1200 * fraction)} --seconds {seconds(20)} --seeds 0 1 --refine mouth"
         " --folder RUN --report RUN/report.txt"
     )
     return {
@@ -145,14 +147,14 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("capture", type=Path)
-    parser.add_argument("--share", type=float, default=1.0, help="of all budgets")
+    parser.add_argument("--fraction", "--share", type=float, default=1.0, help="of all budgets")
     parser.add_argument("--out", type=Path, default=Path("docs/benchmarks.md"))
     parser.add_argument("--folder", type=Path, default=Path("out/results"))
     options = parser.parse_args()
     capture = options.capture.resolve()
     folder = options.folder.resolve()
     text = [HEADER.format(capture=capture.name, machine=machine())]
-    for name, section in sections(capture.name, options.share).items():
+    for name, section in sections(capture.name, options.fraction).items():
         done = folder / f"{name}.md"
         if not done.exists():
             measure(section.commands, folder / name, capture)

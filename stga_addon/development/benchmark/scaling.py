@@ -1,4 +1,4 @@
-"""What one iteration's time grows with: splats, pixels, the selected share and threads.
+"""What one iteration's time grows with: splats, pixels, the selected fraction and threads.
 
     python -m stga_addon.development.benchmark.scaling [--repeats 15]
         [--out docs/pictures/scaling.png]
@@ -43,17 +43,17 @@ class Point:
 
 
 def measure(
-    x: float, repeats: int, splats: int = SPLATS, zoom: float = 1.0, share: float | None = None
+    x: float, repeats: int, splats: int = SPLATS, zoom: float = 1.0, fraction: float | None = None
 ) -> Point:
-    """An iteration of `splats` splats at `zoom` times the image size; share: of the splats,
+    """An iteration of `splats` splats at `zoom` times the image size; fraction: of the splats,
     selected; None: global."""
     rng = np.random.default_rng(0)
     head, mesh, faces = bundled_head(splats, rng)
     camera = front_camera(round(zoom * WIDTH), round(zoom * HEIGHT))
     target = rng.integers(0, 256, (camera.height, camera.width, 3)).astype(np.uint8)
     step, batch = global_step(head, mesh, faces, camera, target)
-    if share is not None:
-        batch = replace(batch, selected=two_regions(head, mesh, faces, share))
+    if fraction is not None:
+        batch = replace(batch, selected=two_regions(head, mesh, faces, fraction))
     arrays = Parameters(*(getattr(head, name) for name in Parameters._fields))
     frames = frames_in_camera(face_frames(mesh, faces, mesh), camera)
     pairs = len(render_forward(arrays, head.face, frames, 3).lists.pair_splat)
@@ -81,8 +81,8 @@ def series(repeats: int) -> dict[str, list[Point]]:
             partial(measure, z * z * WIDTH * HEIGHT, repeats, zoom=z)
             for z in (0.25, 0.5, 1.0, 1.5, 2.0)
         ],
-        "selected share": [
-            partial(measure, s, repeats, share=s) for s in (0.02, 0.05, 0.1, 0.2, 0.4, 0.7, 1.0)
+        "selected fraction": [
+            partial(measure, s, repeats, fraction=s) for s in (0.02, 0.05, 0.1, 0.2, 0.4, 0.7, 1.0)
         ],
         "threads": [partial(on_threads, n, repeats) for n in range(1, threads() + 1)],
     }

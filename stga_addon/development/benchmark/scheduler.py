@@ -14,7 +14,7 @@ from pathlib import Path
 from ...errors import StgaError
 from ...jobs.perform import request_folder, write_request
 from ...jobs.train import Train
-from ...progress import Cancelled, Progress, Report, Say, ignore
+from ...progress import Cancelled, Log, Progress, Report, ignore
 from ...raster.cpu.threads import threads
 from ...training.run.folder import has_run, read_run
 from ...worker.launch import same_interpreter_environment
@@ -59,7 +59,7 @@ class BenchmarkRun:
 
 
 def train_in_turns(
-    runs: Sequence[BenchmarkRun], say: Say, report: Report = ignore
+    runs: Sequence[BenchmarkRun], log: Log, report: Report = ignore
 ) -> dict[str, str]:
     """Train all runs, `TURN_S` at a time, in a random order that changes with every round.
 
@@ -71,7 +71,7 @@ def train_in_turns(
     workers = [_Worker(run) for run in runs if not run.finished]
     try:
         for worker in workers:  # one at a time, because starting loads the processor too
-            say(f"Starting {worker.name}")
+            log(f"Starting {worker.name}")
             report(Progress(stage="Starting", detail=worker.name))
             worker.start()
         rounds = max(
@@ -79,10 +79,10 @@ def train_in_turns(
         )
         rng = random.Random(0)
         for turn in range(1, rounds + 1):
-            say(f"Training, turn {turn} of {rounds}")
+            log(f"Training, turn {turn} of {rounds}")
             for number, worker in enumerate(rng.sample(workers, len(workers))):
-                share = (turn - 1 + number / len(workers)) / rounds
-                if report(Progress(share, "Training", f"Turn {turn} of {rounds}")):
+                fraction = (turn - 1 + number / len(workers)) / rounds
+                if report(Progress(fraction, "Training", f"Turn {turn} of {rounds}")):
                     raise Cancelled
                 worker.train_until(turn / rounds)
     finally:
@@ -109,12 +109,12 @@ class _Worker:
             write_request(request_folder(self._run.out), self._run.request)
         # A session of its own: Ctrl-C reaches only the scheduler, which lets the workers save.
         options = [f"{THREADS}={threads()}", *([FIT_EXPOSURE] if self._run.fits_exposure else [])]
-        with (self._run.out / "log.txt").open("a", encoding="utf-8") as log:
+        with (self._run.out / "log.txt").open("a", encoding="utf-8") as output:
             self._process = subprocess.Popen(
                 [sys.executable, "-m", f"{__package__}.worker", str(self._run.out), *options],
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
-                stderr=log,
+                stderr=output,
                 text=True,
                 encoding="utf-8",
                 env=same_interpreter_environment(os.environ),
@@ -122,13 +122,13 @@ class _Worker:
             )
         self._read_reply()
 
-    def train_until(self, share: float) -> None:
-        """Train up to a share of the budget; returns when that is done."""
+    def train_until(self, fraction: float) -> None:
+        """Train up to a fraction of the budget; returns when that is done."""
         if self._ready:
             assert self._process is not None
             assert self._process.stdin is not None
             with suppress(OSError):  # the process has ended, which reading its reply reports
-                self._process.stdin.write(f"{share!r}\n")
+                self._process.stdin.write(f"{fraction!r}\n")
                 self._process.stdin.flush()
             self._read_reply()
 
@@ -154,9 +154,11 @@ class _Worker:
         assert self._process is not None
         assert self._process.stdout is not None
         line = self._process.stdout.readline()
-        log = self._run.out / "log.txt"
-        reply = json.loads(line) if line else {"error": f"Worker exited unexpectedly. Log: {log}"}
-        self._ready = "share" in reply
+        output = self._run.out / "log.txt"
+        reply = (
+            json.loads(line) if line else {"error": f"Worker exited unexpectedly. Log: {output}"}
+        )
+        self._ready = "fraction" in reply
         self.error = reply.get("error", "")
         # it ends: left unawaited, it would stay a process until the last run is trained
         if not self._ready:

@@ -5,13 +5,13 @@ from pathlib import Path
 
 from ...errors import StgaError
 from ...jobs.train import Train, prepare
-from ...progress import Progress, Report, Say, Written, ignore
+from ...progress import Log, Progress, Report, Written, ignore
 from ...training.settings import TrainingSettings
 from .scheduler import BenchmarkRun, train_in_turns
 from .variants import Benchmark, settings_of, variants_of, without_choices
 
 
-def train_slice(request: Benchmark, report: Report, say: Say) -> Written:
+def train_slice(request: Benchmark, report: Report, log: Log) -> Written:
     """Train and measure the runs that are not finished.
 
     Raises Cancelled when the report stops it and the runs are saved, and StgaError where a run has
@@ -21,7 +21,7 @@ def train_slice(request: Benchmark, report: Report, say: Say) -> Written:
     runs = runs_of(request)
     for run in runs:
         run.check()
-    failures = train_in_turns(runs, say, report)
+    failures = train_in_turns(runs, log, report)
     if failures:
         raise StgaError("; ".join(f"{name} failed: {error}" for name, error in failures.items()))
     return Written(request.out)

@@ -9,9 +9,9 @@ FLAME's open template (`v_template`, `shapedirs`, `faces`); without it, the bund
 millimeters, within 9 cm of the landmarks' center: how far what the cameras see of the capture's
 mesh, by its triangles' centers, is from the tracked surface and, where both have the same topology,
 vertices from each other. Of several timesteps with the bundled head, also how the true motion about
-its mean shows in the tracked one, the head held still: the share that is followed, correlation and
-median error of what moves by brows, lids, lips and jaw. Landmarks are detected, or read from the
-folder of --landmarks; --cameras: as many of those nearest to the middle, every second one.
+its mean shows in the tracked one, the head held still: the fraction that is followed, correlation
+and median error of what moves by brows, lids, lips and jaw. Landmarks are detected, or read from
+the folder of --landmarks; --cameras: as many of those nearest to the middle, every second one.
 """
 
 import argparse
@@ -37,16 +37,17 @@ from ...tracking.seen_surface import in_sight
 from ...tracking.track import track
 
 SHAPES = {"brows": "brow", "lids": "eyeBlink", "lips": "mouth", "jaw": "jaw"}
-"""Of ARKit's shapes, how the names of those begin that move a part of the face."""
+"""Part of the face -> first letters of the ARKit shapes that move it."""
 MIN_MOTION = 0.5
-STILL_SHARE = 0.35
+"""Least motion of a vertex that belongs to a part, relative to the part's largest motion."""
+STILL_FRACTION = 0.35
+"""Fraction of the face, the part that moves least, by which heads are aligned."""
 MAX_DISTANCE_M = 0.006
-"""Of the largest motion by such shapes, from which on a vertex belongs to the part; share of the
-face that moves least, by which heads are laid on each other; of a true vertex from the tracked
-surface, up to which it lies on it."""
+"""Largest distance from the tracked surface of a true vertex that lies on it."""
 FACE_RADIUS_M = 0.09
+"""Radius of the face about its middle."""
 MIN_COSINE = 0.2
-"""Of the angle between normal and camera, from which on a camera sees a triangle."""
+"""Least cosine of the angle between a triangle's normal and a camera that sees it."""
 
 
 def head_file(path: Path | None, folder: Path) -> Path | None:
@@ -158,7 +159,7 @@ def report_motion(true: np.ndarray, tracked: np.ndarray, faces: np.ndarray, scal
     face &= np.linalg.norm(true[0] - middle, axis=1) * scale < FACE_RADIUS_M
     parts["face"] = face
     moved = places.on(np.sqrt(shapes.sum(1)), faces)
-    still = face & (moved <= np.quantile(moved[face], STILL_SHARE))
+    still = face & (moved <= np.quantile(moved[face], STILL_FRACTION))
     motion = []
     for heads in (true, followed):
         first = heads[0][still]

@@ -58,7 +58,7 @@ SETTING_VARIANTS: dict[str, Changes] = {
     "no-dssim": {"ssim_weight": 0.0},
     "no-density": {"density_interval": 0},
     "density-x2": {"growth": 0.5},
-    "no-strays": {"stray_reset_interval": 0},
+    "no-outlier-reset": {"stray_reset_interval": 0},
     "frame-batches": {"views_per_visit": 0},
     "selective": {"strategy": "selective"},
     "selective-every-2": {"strategy": "selective", "global_interval": 2},

@@ -3,9 +3,9 @@
     python -m stga_addon.development.benchmark.worker FOLDER --threads=N [--fit-exposure]
 
 Trains as the request in FOLDER asks (`jobs.perform`), or resumes the run in FOLDER. Each line on
-stdin is a share of the budget to train up to; the end of stdin means save and end. Each line, and
-the start, is answered by a line of JSON on stdout: {"share": …, "iteration": …} when ready for the
-next, {"done": …} at the end, or {"error": …}.
+stdin is a fraction of the budget to train up to; the end of stdin means save and end. Each line,
+and the start, is answered by a line of JSON on stdout: {"fraction": …, "iteration": …} when ready
+for the next, {"done": …} at the end, or {"error": …}.
 """
 
 import json
@@ -29,14 +29,16 @@ if TYPE_CHECKING:
 WARM_UP_S = 1.0
 """Seconds of training before the run, not counted: caches fill and the processor's clock rises."""
 FIT_EXPOSURE = "--fit-exposure"
+"""Option that fits exposure before views are compared."""
 THREADS = "--threads"
+"""Option that limits the threads of a variant."""
 QUALITY = "quality.json"
 """Metrics of the finished avatar on all views of "val" and "test"; the run is finished when the
 file exists."""
 
 
 class Turns:
-    """Makes a run wait at the shares of its budget that it reads.
+    """Makes a run wait at the fractions of its budget that it reads.
 
     stopped  the end of the requests was read
     """
@@ -49,12 +51,12 @@ class Turns:
 
     def report(self, progress: "Progress") -> bool:
         """Call after every iteration; True where the run is to stop."""
-        if self._until > progress.share or progress.share >= 1:
+        if self._until > progress.fraction or progress.fraction >= 1:
             return False
         iteration = int(progress.figures().get("iteration", 0))
         if iteration == 0:
             return False
-        self.reply({"share": progress.share, "iteration": iteration})
+        self.reply({"fraction": progress.fraction, "iteration": iteration})
         request = self._requests.readline()
         self.stopped = not request
         self._until = float(request or 1)

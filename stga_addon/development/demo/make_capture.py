@@ -31,16 +31,20 @@ from .person import Person, make_person
 from .studio import Studio
 
 CAMERAS = 9
+"""Cameras on an arc in front of the head."""
 HELD_OUT = 4
-"""On an arc in front of the head; the middle one is `val`."""
+"""Index of the camera of `val`: the middle one."""
 TURNING_ACTS = 40
+"""Timesteps of the capture of one camera, before which the head turns."""
 TURN_DEG = 50.0
+"""Largest turn of the head before one camera, to both sides."""
 NOD_DEG = 12.0
-"""Of the head before one camera, to both sides."""
+"""Largest nod of the head before one camera, up and down."""
 WIDTH = 320
 HEIGHT = 400
+
 FOCAL = 3.7
-"""In image widths."""
+"""Focal length in image widths."""
 ARC_DEG = 70.0
 ELEVATIONS_DEG = (8.0, -9.0)
 DISTANCE_M = 1.1
@@ -68,9 +72,9 @@ class Act:
 
 
 RELAXED = {"eyeBlink": 0.13, "eyeSquint": 0.08, "mouthSmile": 0.18}
-"""What an act has where it says nothing else."""
+"""Weights of an act that does not set them otherwise."""
 CONVERGENCE_DEG = 2.5
-"""By which each eye turns to the nose."""
+"""Angle by which each eye turns to the nose."""
 TRAIN_ACTS = (
     Act({}),
     Act(
@@ -106,6 +110,7 @@ TRAIN_ACTS = (
         gaze=(-12, 3),
     ),
 )
+"""Poses that are trained: an expression, a turn of head and neck, a gaze."""
 TEST_ACTS = (
     Act(
         {"mouthSmile": 0.8, "jawOpen": 0.3, "browOuterUp": 0.5, "cheekSquint": 0.4},
@@ -114,6 +119,7 @@ TEST_ACTS = (
     ),
     Act({"mouthFunnel": 0.6, "jawOpen": 0.15, "browInnerUp": 0.6, "mouthSmile": 0}, neck=(5, 0)),
 )
+"""Held-out poses."""
 SMALL_WEIGHTS: tuple[dict[str, float], ...] = (
     {},
     {"mouthSmile": 0.5},

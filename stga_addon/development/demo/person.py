@@ -27,13 +27,19 @@ from ..bundled_head import (
 )
 
 SURFACES = ("skin", "mouth", "gums", "teeth", "eyes")
+"""Surfaces with a color each."""
 IDENTITY_SEED = 14
+"""Seed of the random identity."""
 IDENTITIES = 40
+"""Identity components that are drawn at random."""
 IDENTITY_DEVIATION = 0.68
+"""Standard deviation of their coefficients."""
 EYES_IDENTITY = 10
+"""Identity component that is set, because with it the lids close over the eyes."""
 EYES = -0.3
-"""Component, and its coefficient, with which the lids close over the eyes."""
+"""Coefficient of EYES_IDENTITY."""
 SEED = 7
+
 # Linear RGB.
 SKIN_COLOR = np.array([0.66, 0.41, 0.305])
 LIP_COLOR = np.array([0.48, 0.17, 0.155])
@@ -43,6 +49,7 @@ MOUTH_COLOR = np.array([0.30, 0.075, 0.07])
 GUM_COLOR = np.array([0.42, 0.12, 0.11])
 TOOTH_COLOR = np.array([0.80, 0.75, 0.66])
 SCALP_COLOR = np.array([0.06, 0.038, 0.025])
+
 PARTS = (
     ("skin", SKIN),
     ("mouth", MOUTH_INSIDE),
@@ -51,15 +58,20 @@ PARTS = (
     ("eyes", LEFT_EYEBALL),
     ("eyes", RIGHT_EYEBALL),
 )
+"""(surface, first and last vertex of ICT-FaceKit's)"""
+
+# Heights are above the eyes.
 LIP_LINE_CM = -3.35
 LIP_HALF_WIDTH_CM = 2.35
 UPPER_LIP_CM = 0.98
 LOWER_LIP_CM = 1.28
+
 NECKLINE_CM = -10.6
+"""Height on the axis of the head above which there is no cloth."""
 NECKLINE_SLOPE = 0.30
-"""Height above which there is no cloth, on the axis of the head, and by how much it falls to the
-front."""
+"""Slope by which the neckline falls to the front."""
 HEAD_AXIS_Z_CM = -1.0
+"""Depth of the head's axis."""
 HAIRLINE = (
     (0, 35, 55, 68, 78, 88, 97, 106, 115, 130, 150, 180),
     (6.6, 6.5, 5.0, 3.5, -1.0, 1.0, 1.5, -1.5, -5.0, -8.0, -9.5, -10.0),
@@ -296,8 +308,8 @@ def _scatter(
     density."""
     skin = np.flatnonzero((paint.faces < MOUTH_INSIDE[0]).all(1))
     corners = paint.at[paint.faces[skin]]
-    share = density(corners.mean(1)) * face_areas(paint.at, paint.faces[skin])
-    triangle = rng.choice(len(skin), 2 * count, p=share / share.sum())
+    fraction = density(corners.mean(1)) * face_areas(paint.at, paint.faces[skin])
+    triangle = rng.choice(len(skin), 2 * count, p=fraction / fraction.sum())
     inside = rng.dirichlet((1, 1, 1), len(triangle))
     kept = rng.random(len(triangle)) < density(np.einsum("nk,nka->na", inside, corners[triangle]))
     return skin[triangle[kept][:count]], inside[kept][:count]
@@ -313,7 +325,7 @@ class _Growth:
     rise       degrees over the skin at the root, which `lift` (roots -> (N,)) scales, and at the
                tip
     disorder   standard deviation of each hair's own direction
-    clump      share by which tips gather at that of one in HAIRS_PER_CLUMP hairs
+    clump      fraction by which tips gather at that of one in HAIRS_PER_CLUMP hairs
     clearance  meters that tips keep from the skin
     """
 
@@ -352,9 +364,9 @@ def _grow(
         along = growth.heading(root_cm, normal) + own
         along -= (along * normal).sum(1, keepdims=True) * normal
         along /= np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-9)
-        share = (number - 1) / (POINTS_PER_HAIR - 2)
+        fraction = (number - 1) / (POINTS_PER_HAIR - 2)
         rise = np.radians(
-            growth.rise[0] * growth.lift(root_cm) * (1 - share) + growth.rise[1] * share
+            growth.rise[0] * growth.lift(root_cm) * (1 - fraction) + growth.rise[1] * fraction
         )[:, None]
         at = at + step[:, None] * (np.cos(rise) * along + np.sin(rise) * normal)
         height = ((at - neutral[near]) * normal).sum(1)
@@ -418,8 +430,8 @@ def _all_strands(paint: _Paint, neutral: np.ndarray) -> tuple[Strands, ...]:
         """To the person's left over the top; down and back at the sides and behind."""
         crown = np.tile([1.0, 0.0, -0.3], (len(root), 1))
         falling = np.tile([0.0, -1.0, -0.45], (len(root), 1))
-        share = (top(root) * _step(normal[:, 1], 0.2, 0.7))[:, None]
-        return np.asarray(share * crown + (1 - share) * falling)
+        fraction = (top(root) * _step(normal[:, 1], 0.2, 0.7))[:, None]
+        return np.asarray(fraction * crown + (1 - fraction) * falling)
 
     hair = _Growth(
         combed,

@@ -35,10 +35,11 @@ from ...training.settings import make_settings
 from .capture import unpack_capture, unpack_takes
 
 SEED = 0
+
 POSES_PER_SECOND = 1.5
-"""At which the web page plays the capture's expressions, which are single poses."""
+"""Rate at which the web page plays the capture's expressions, which are single poses."""
 FRAMES_PER_SECOND = 8
-"""Of demo.blend: its capture has a second of motion at this rate."""
+"""Frame rate of demo.blend: its capture has a second of motion at this rate."""
 ANGLES_DEG = (0.0, 45.0, 90.0, 135.0, 180.0)
 """Angles from the talk's camera, around the head, of the pictures in phone.png."""
 MAX_POSITION_ERROR_M = 1e-5

@@ -23,9 +23,9 @@ from ...scene.render.viewport_display import ENGINE
 FRAMES = 96
 FRAMES_PER_SECOND = 24
 SIZE_PX = 960, 540
-SAMPLES = 16
-"""Of the lens, for each image."""
 
+SAMPLES = 16
+"""Samples of the lens for each image."""
 RINGS = (
     (-0.45, 0.150, 0.100),
     (-0.25, 0.165, 0.105),
@@ -41,11 +41,11 @@ RINGS = (
 """The body from the waist to the collar: height from the head's lower end, half a width and half a
 depth, in meters."""
 NECK_BEHIND_M = 0.03
-"""From the middle of the head's box to the neck."""
+"""Distance from the middle of the head's box back to the neck."""
 FACE_M = 0.0, -0.07, 0.04
-"""From there to the face, which the camera looks at."""
+"""Offset from the neck to the face, at which the camera looks."""
 CORNERS = 32
-"""Of a ring."""
+"""Corners of a ring."""
 SPEECH = {
     1: {},
     8: {"jawOpen": 0.35},
@@ -172,8 +172,8 @@ def _body(neck: Vector) -> Any:
     torso = _painted(_placed("Torso", _lathe("Torso", RINGS)), (0.02, 0.07, 0.075), 0.9)
     torso.parent = armature
     heights = np.repeat([ring[0] for ring in RINGS], CORNERS)
-    share = np.clip((heights - RINGS[0][0]) / (-0.1 - RINGS[0][0]), 0, 1)
-    for name, weights in (("spine", 1 - share), ("chest", share)):
+    fraction = np.clip((heights - RINGS[0][0]) / (-0.1 - RINGS[0][0]), 0, 1)
+    for name, weights in (("spine", 1 - fraction), ("chest", fraction)):
         group = torso.vertex_groups.new(name=name)
         for index, weight in enumerate(weights.tolist()):
             group.add([index], weight, "REPLACE")

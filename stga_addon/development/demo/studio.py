@@ -38,8 +38,9 @@ NOISE_THRESHOLD = 0.03
 CLOTH_M = 0.0035
 COLLAR_CM = 1.5
 CLOTH_COLOR = (0.045, 0.12, 0.13)
+
 STRAND_TIP = 0.35
-"""Of a hair's radius at its root."""
+"""Radius of a hair's tip, relative to that of its root."""
 
 
 class Studio:

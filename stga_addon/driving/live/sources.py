@@ -284,8 +284,9 @@ RESTING_PACKETS = 15
 MIN_STEP_S = 2 / MAX_FPS
 """Time between rows: a file's times are rounded, and rows at MAX_FPS could be refused."""
 MAX_LEAD_S = 5.0
-"""By which a source's clock may be ahead of the packets' arrival: a socket keeps packets for
-4 s while Blender is busy. Beyond it, the clock was set, or is another's."""
+"""Largest time by which a source's clock may be ahead of the packets' arrival: a socket keeps
+packets for 4 s while Blender is busy. Beyond it, the clock was set, or belongs to another
+source."""
 
 
 def row_of(*packets: FacePacket) -> Performance:
@@ -307,9 +308,11 @@ def eased(
     """The row through a low-pass filter of time constant `smoothing_s` after the one before."""
     if before is None or smoothing_s <= 0:
         return row
-    share = 1 - np.exp(-step_s / smoothing_s)
-    head = before.head + share * (row.head - before.head)
-    return replace(row, weights=before.weights + share * (row.weights - before.weights), head=head)
+    fraction = 1 - np.exp(-step_s / smoothing_s)
+    head = before.head + fraction * (row.head - before.head)
+    return replace(
+        row, weights=before.weights + fraction * (row.weights - before.weights), head=head
+    )
 
 
 @dataclass

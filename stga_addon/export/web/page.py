@@ -35,7 +35,7 @@ TYPES = re.compile(
 NOTES = re.compile(r"^ *//.*\n|^ +", re.MULTILINE)
 """Comments and indents, which a page is smaller without."""
 HTML_SAFE = str.maketrans("&<>", ",.:")
-"""Of base 85's digits."""
+"""Translation of those base 85 digits that have a meaning in HTML."""
 
 
 @cache

@@ -15,7 +15,7 @@ from ...worker.training_python import find_training_python
 from ..perform import worker_arguments
 from .plan import Ended, Engine, Job
 
-MEMORY_SHARE = 0.9  # Share of the memory that is free at the start that workers may use
+MEMORY_FRACTION = 0.9  # Fraction of the memory that is free at the start that workers may use
 GPUS = 1  # Jobs at once that need a GPU to themselves
 IS_WINDOWS = os.name == "nt"  # There, a kill is an exit status like others: 1 by the task manager
 
@@ -32,7 +32,7 @@ class LocalEngine(Engine):
         self, cores: int | None = None, memory_gb: float | None = None, python: str | None = None
     ) -> None:
         self._cores = cores or processors()
-        self._memory_gb = MEMORY_SHARE * free_memory_gb() if memory_gb is None else memory_gb
+        self._memory_gb = MEMORY_FRACTION * free_memory_gb() if memory_gb is None else memory_gb
         self._python = python or find_training_python(sys.executable)
         self._jobs: dict[str, tuple[Job, subprocess.Popen[bytes] | None]] = {}
 

@@ -22,7 +22,7 @@ from .plan import Ended, Engine, Job, job_command
 MAX_WAITING = 1000
 """Tasks that are submitted at once: more wait here, not in Ray's memory."""
 NODE_RETRIES = 5
-"""How often Ray begins a task again elsewhere whose machine has gone."""
+"""How often Ray restarts a task elsewhere after its machine has gone."""
 TOKEN_MODE = "RAY_AUTH_MODE"
 """Environment variable by which a cluster asks for a token (Ray 2.52)."""
 TOKEN = "RAY_AUTH_TOKEN"

@@ -16,7 +16,7 @@ MAX_RETRIES = 5  # How often a job whose worker was killed is tried again in one
 SHOW_INTERVAL_S = 1.0
 MAX_BEGUN = 64  # Jobs that are begun before the next look at what has ended
 MAX_MISSES = 50  # Jobs that are asked for in vain, in a row, before the next look at what has ended
-Say = Callable[[str], None]
+Log = Callable[[str], None]
 
 
 class JobState(StrEnum):
@@ -58,7 +58,8 @@ class Entry:
 
     @property
     def left_s(self) -> float | None:
-        """Seconds until it is finished, by its share done, else by its forecast; None: unknown."""
+        """Seconds until it is finished, by its fraction done, else by its forecast; None:
+        unknown."""
         if self.state.is_over:
             return 0.0
         spent = self.status.seconds if self.state == JobState.RUNNING else 0.0
@@ -97,7 +98,7 @@ class Batch:
 class BatchRun:
     """Carries out the jobs of a batch that are not finished; each that fails fails alone.
 
-    show: called now and then; say: called with lines about what happened.
+    show: called now and then; log: called with lines about what happened.
     """
 
     def __init__(
@@ -106,13 +107,13 @@ class BatchRun:
         engine: Engine,
         lease: SoftFileLease,
         show: Callable[[Batch], None],
-        say: Say,
+        log: Log,
     ) -> None:
         self._batch = batch
         self._engine = engine
         self._lease = lease
         self._show = show
-        self._say = say
+        self._log = log
         self._entries = batch.entries
         self._shown_s = 0.0
 
@@ -122,7 +123,7 @@ class BatchRun:
         try:
             self._work()
         except KeyboardInterrupt:
-            self._say(
+            self._log(
                 "Stopping: the running jobs save what they have; Ctrl-C again leaves them to it"
             )
             self._stop()
@@ -135,7 +136,7 @@ class BatchRun:
             if self._is_free(entry) and is_running(entry.job, entry.digest):
                 entry.state = JobState.RUNNING
                 self._engine.adopt(entry.job)
-                self._say(f"{name}: goes on in the worker of an earlier start")
+                self._log(f"{name}: goes on in the worker of an earlier start")
         while self._batch.unfinished:
             if self._lease.compromise is not None:
                 raise StgaError(
@@ -195,7 +196,7 @@ class BatchRun:
             try:
                 moved = prepare(entry.job, entry.digest)
                 if moved is not None:
-                    self._say(f"{name}: has changed; what it wrote before is in {moved}")
+                    self._log(f"{name}: has changed; what it wrote before is in {moved}")
                 self._engine.submit(entry.job)
             except StgaError as error:
                 self._over(entry, JobState.FAILED, str(error))
@@ -220,11 +221,11 @@ class BatchRun:
                 try:
                     write_record(entry.job, new)
                 except StgaError as error:
-                    self._say(f"warning: {error}")
+                    self._log(f"warning: {error}")
             if retry and end.is_lost and state in _LOST and entry.retries < MAX_RETRIES:
                 entry.retries += 1
                 entry.state = JobState.WAITING
-                self._say(f"{name}: its worker was lost; it goes on from its last checkpoint")
+                self._log(f"{name}: its worker was lost; it goes on from its last checkpoint")
             else:
                 outcome = _OUTCOMES.get(state, JobState.FAILED)
                 self._over(entry, outcome, entry.status.error)
@@ -234,7 +235,7 @@ class BatchRun:
         """Take note of a job's end."""
         entry.state = state
         entry.error = error
-        self._say(f"{entry.job.name}: {state}" + (f": {error}" if error else ""))
+        self._log(f"{entry.job.name}: {state}" + (f": {error}" if error else ""))
 
     def _look(self, now: bool = False) -> None:
         """Read the status of running jobs, and show the batch, at most every SHOW_INTERVAL_S."""

@@ -37,7 +37,7 @@ class LiveTable:
         self._stream.flush()
         self._drawn = len(lines)
 
-    def say(self, line: str) -> None:
+    def log(self, line: str) -> None:
         """Print a line above the table."""
         self._erase()
         self._stream.write(one_line(line) + "\n")

@@ -32,11 +32,13 @@ MIN_TRANSMITTANCE = np.float32(1e-4)
 LOG2E = np.float32(1.4426950408889634)
 
 SIDE = 4
-"""Of a block, pixels."""
+"""Side of a block in pixels."""
 BLOCK_PIXELS = SIDE * SIDE
+"""Pixels of a block, which are stored one after the other, row by row."""
 BLOCKS_ALONG = TILE // SIDE
+"""Blocks along the side of a tile."""
 BLOCKS = BLOCKS_ALONG * BLOCKS_ALONG
-"""Of a tile, column by column; the pixels of each are stored one after the other, row by row."""
+"""Blocks of a tile, stored column by column."""
 
 # Where a pixel's values lie in the tile's flat array. Unsigned, because a signed index that may be
 # negative wraps around in Python, and the test for it keeps LLVM from vectorizing (12 times
@@ -46,11 +48,12 @@ SUM_RED, SUM_GREEN, SUM_BLUE, LAST, X, Y, BEHIND = (np.uint64(n * PIXELS) for n 
 V_RED = SUM_RED
 V_GREEN = SUM_GREEN
 V_BLUE = SUM_BLUE
+
 PAIRS_PER_GROUP = 8
-"""Splats whose blocks are listed together; after each group, the forward pass looks again which
-blocks are not yet behind something opaque."""
+"""Splats whose blocks are listed together; after each group, the forward pass drops the blocks that
+are behind something opaque."""
 LISTED = PAIRS_PER_GROUP * BLOCKS
-"""Blocks that a list holds at most."""
+"""Largest number of blocks in a list."""
 # Behind the tile's values, those of the listed blocks; the forward pass has only the first.
 (ALPHA, DX, DY, V_POWER, PART_RED, PART_GREEN, PART_BLUE) = (
     np.uint64(8 * PIXELS + n * LISTED * BLOCK_PIXELS) for n in range(7)

@@ -19,14 +19,14 @@ from numba.core.caching import UserProvidedCacheLocator
 from ..kernel_cache import OWN_KERNELS, has_kernels
 
 PACKAGE = "stga_addon"
-"""Under which workers import the package. A compiled kernel refers to its modules by name; inside
-of Blender they have other names, and other kernels."""
+"""Name under which workers import the package. A compiled kernel refers to its modules by name;
+inside of Blender they have other names, and other kernels."""
 BUNDLE = Path(__file__).with_name("compiled")
 """Folder of Numba's cache files; only in an edition that brings them."""
 PROCESSOR = "x86-64-v3"
+"""LLVM's name of the processor for which the bundled kernels are compiled."""
 MACHINES = ("x86_64", "AMD64")
-"""LLVM's name of the processor that they are compiled for, and what `platform.machine` calls its
-kind."""
+"""Names of that kind of processor in `platform.machine`."""
 NEEDED_FEATURES = ("avx2", "bmi", "bmi2", "f16c", "fma", "lzcnt", "movbe")
 FASTER_FEATURE = "avx512f"
 

@@ -14,6 +14,7 @@ from . import inline_jit, part_jit
 from .threads import call_helpers, end_stages, parallel, pieces, stage
 
 WINDOW_RADIUS_PX = 5
+"""Radius of SSIM's Gaussian window."""
 LOSS_REACH_PX = 2 * WINDOW_RADIUS_PX
 """A pixel's gradient depends on image pixels up to this far away."""
 ROW_UNIT_PX = 32

@@ -11,6 +11,7 @@ from .threads import call_helpers, end_stages, parallel, pieces, stage
 
 ZERO = np.float32(0.0)
 ONE = np.float32(1.0)
+
 ROWS_PER_BLOCK = 256
 """Rows that a thread steps at a time."""
 ROWS_PER_SUM = 1024
@@ -44,8 +45,8 @@ class AdamOptions(NamedTuple):
     ahead      by how much of the way from the first moment to the gradient a step goes; 0: Adam;
                1 − beta1: Nesterov's momentum (Dozat 2016); bias correction makes the first step
                as long as Adam's
-    ema_share  least share of a step in the exponential moving average; with 1, the average is the
-               row
+    ema_share  least fraction of a step in the exponential moving average; with 1, the average is
+               the row
     """
 
     beta1: np.float32
@@ -70,10 +71,11 @@ def adam_rows(work, rows, steps, parameters, options):
     """One Adam step on the listed rows (M,) of several parameters, with each row's own step count.
 
     parameters: tuple of AdamTables; steps (N,) int32; options: AdamOptions. The stepped value
-    enters its exponential moving average with the share `ema_share`, or 4 / (steps + 3) where that
-    is more, because the first steps are long. Rows that are not listed are not touched at all. A
-    row whose gradient is not finite, or beyond MAX_GRADIENT, keeps that parameter, its moments and
-    its average. All parameters at once: every further parallel loop waits for its slowest thread.
+    enters its exponential moving average with the fraction `ema_share`, or 4 / (steps + 3) where
+    that is more, because the first steps are long. Rows that are not listed are not touched at all.
+    A row whose gradient is not finite, or beyond MAX_GRADIENT, keeps that parameter, its moments
+    and its average. All parameters at once: every further parallel loop waits for its slowest
+    thread.
     """
     call_helpers(work)
     corrections = np.empty((3, ROWS_PER_BLOCK), np.float32)
@@ -89,23 +91,23 @@ def adam_rows(work, rows, steps, parameters, options):
 @part_jit
 def correct_bias(rows, steps, options, corrections):
     """Write to corrections (3, ≥ M) what each listed row's next step multiplies the moments by, the
-    second one's root, and the share with which the stepped value enters its average."""
+    second one's root, and the fraction with which the stepped value enters its average."""
     log1 = math.log(options.beta1)
     log2 = math.log(options.beta2)
     latest = np.int32(-1)
     first = ZERO
     second = ZERO
-    share = ZERO
+    fraction = ZERO
     for n in range(len(rows)):
         if steps[rows[n]] != latest:  # neighbors are mostly trained equally often
             latest = steps[rows[n]]
             count = np.float64(latest + 1)
             first = np.float32(1.0 / (1.0 - (1.0 - options.ahead) * math.exp(count * log1)))
             second = np.float32(1.0 / math.sqrt(1.0 - math.exp(count * log2)))
-            share = np.float32(max(np.float64(options.ema_share), 4.0 / (count + 3.0)))
+            fraction = np.float32(max(np.float64(options.ema_share), 4.0 / (count + 3.0)))
         corrections[0, n] = first
         corrections[1, n] = second
-        corrections[2, n] = share
+        corrections[2, n] = fraction
 
 
 @part_jit
@@ -125,7 +127,7 @@ def adam_block(rows, places, parameter, gradient, corrections, options):
             continue
         scale1 = corrections[0, n]
         scale2 = corrections[1, n]
-        share = corrections[2, n]
+        fraction = corrections[2, n]
         for c in range(width):
             g = gradient[at, c]
             m = beta1 * first[i, c] + (ONE - beta1) * g
@@ -135,7 +137,7 @@ def adam_block(rows, places, parameter, gradient, corrections, options):
             m += ahead * (g - m)
             value = values[i, c] - rates[c] * m * scale1 / (math.sqrt(v) * scale2 + epsilon)
             values[i, c] = value
-            average[i, c] += share * (value - average[i, c])
+            average[i, c] += fraction * (value - average[i, c])
 
 
 @parallel(lambda rows, *_: len(rows), piece=16_384)
@@ -304,19 +306,19 @@ def _excess_scale(rows, log_scale, face, unbound, limits, scales):
 
 
 @parallel(lambda rows, *_: len(rows), piece=16_384)
-def opacity_weight(work, rows, opacity, share, weight, gradient):
-    """weight · Σ share · sigmoid(opacity) over the listed rows; its gradient is added to gradient
-    (N,).
+def opacity_weight(work, rows, opacity, fraction, weight, gradient):
+    """weight · Σ fraction · sigmoid(opacity) over the listed rows; its gradient is added to
+    gradient (N,).
 
-    share (N,) float32.
+    fraction (N,) float32.
     """
     call_helpers(work)
     for first_row, past_row in pieces(work):
         for n in range(first_row, past_row):
             i = rows[n]
-            if share[i] != ZERO:  # bound splats have none
+            if fraction[i] != ZERO:  # bound splats have none
                 value = ONE / (ONE + math.exp(-opacity[i]))
-                gradient[i] += np.float32(weight) * share[i] * value * (ONE - value)
+                gradient[i] += np.float32(weight) * fraction[i] * value * (ONE - value)
 
 
 @jit

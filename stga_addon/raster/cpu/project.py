@@ -32,10 +32,11 @@ from .splat_block import BLOCK_SPLATS, HALF, ONE, ZERO
 from .threads import call_helpers, parallel, pieces
 
 COLUMN = np.uint64(BLOCK_SPLATS)
+"""Values from one column of a block to the next. Unsigned, as in `blend`."""
 PAIRS_AHEAD = 64
-"""So many pairs ahead, memory is asked for their gradients."""
+"""Pairs ahead of the current one whose gradients are prefetched."""
 SPLATS_PER_PIECE = 4 * BLOCK_SPLATS
-"""That a thread takes over at a time."""
+"""Splats that a thread takes over at a time."""
 
 
 @parallel(lambda origin, *_: len(origin), piece=1024)

@@ -18,9 +18,10 @@ from .optimizer import AdamOptions, AdamTables, ColorStep
 from .project import compose_frames, move_frames, project_backward, project_forward
 
 LINE_BYTES = 64
+"""Bytes of a cache line: buffers in a chunk begin at a multiple of it."""
 CHUNK_BYTES = 1 << 22
-"""Memory is taken so much at a time at least: from there on NumPy asks for huge pages, but not for
-its zeros. Among small pages, what lies in no order is looked for longer than it is read."""
+"""Least size of an allocation. From this size on, NumPy requests huge pages, except for arrays of
+zeros; with small pages, random access costs more time in page lookups than in reading."""
 BLACK_BACKGROUND = np.zeros(3, np.float32)
 
 

@@ -10,34 +10,44 @@ from .threads import call_helpers, parallel, pieces
 ZERO, EIGHTH, HALF, ONE, TWO, PI = (
     np.float32(value) for value in (0.0, 0.125, 0.5, 1.0, 2.0, np.pi)
 )
+# Kinds of lights.
 SUN = 0
 POINT = 1
 SPOT = 2
 AREA = 3
+
+# Columns of a table of lights (L, COLUMNS) float32.
 KIND = 0
+"""SUN, POINT, SPOT or AREA."""
 POSITION = 1
+"""Position, 3 columns."""
 DIRECTION = 4
+"""Direction in which the light shines, 3 columns."""
 COLOR = 7
+"""Color, 3 columns: irradiance of a sun, else intensity in W/sr towards what faces the light."""
 CONE = 10
+"""Cosine of half a spot's cone."""
 FADE = 11
+"""How far above CONE the cosine has risen where a spot no longer fades."""
 MAP = 12
+"""Row of the table of visibility; -1: the light is visible from every point."""
 DIFFUSE = 13
+"""Factor of diffuse light."""
 SPECULAR = 14
+"""Factor of specular light."""
 WIDTH = 15
+"""Tangent of half the angle that a sun takes, else half the light's width in meters."""
 COLUMNS = 16
-"""Columns of a table of lights (L, COLUMNS) float32: kind; position (3); direction in which it
-shines (3); color (3), irradiance of a sun, else intensity in W/sr towards what faces it; cosine of
-half a spot's cone, and how far above the cosine has risen where the spot no longer fades; row of
-the shares that are lit, -1: all; factors of diffuse and specular light; tangent of half the angle
-that a sun takes, else half the width in meters."""
+"""Number of columns."""
 MIN_FACING = np.float32(0.05)
-"""Cosine that a highlight's normal is taken to have at least towards the eye."""
+"""Least cosine between a highlight's normal and the direction to the eye; smaller ones are
+raised."""
 
 
 @part_jit
 def ggx(facing, toward_eye, half, fresnel_cosine, square, reflectance):
-    """Reflected share per steradian and cosine of a GGX lobe with Smith's shadowing and Schlick's
-    Fresnel term.
+    """Reflected fraction per steradian and cosine of a GGX lobe with Smith's shadowing and
+    Schlick's Fresnel term.
 
     facing, toward_eye, half: cosines of the normal to light, eye and the direction half between
     them. square: α².

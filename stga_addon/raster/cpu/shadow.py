@@ -63,8 +63,8 @@ def add_depths(points, faces, depth):
 
 
 @parallel(lambda depth, points, *_: len(points), piece=256)
-def lit_shares(work, depth, points, bias, step, lit):
-    """Write lit (N,) float32: share 0…1 of the depth map's texels around each point that do not
+def lit_fractions(work, depth, points, bias, step, lit):
+    """Write lit (N,) float32: fraction 0…1 of the depth map's texels around each point that do not
     block it.
 
     points (N, 3) as in `add_depths`. bias (N,): depth by which a texel must be nearer to block.
@@ -84,13 +84,13 @@ def lit_shares(work, depth, points, bias, step, lit):
                     y = points[n, 1] - HALF + np.float32(down) * step
                     left = math.floor(x)
                     top = math.floor(y)
-                    right_share = x - np.float32(left)
-                    lower_share = y - np.float32(top)
+                    right_fraction = x - np.float32(left)
+                    lower_fraction = y - np.float32(top)
                     for k in range(4):
                         column = int(left) + (k & 1)
                         row = int(top) + (k >> 1)
                         outside = column < 0 or row < 0 or column >= size or row >= size
                         if outside or z <= depth[row, column]:
-                            weight = right_share if k & 1 else ONE - right_share
-                            found += weight * (lower_share if k >> 1 else ONE - lower_share)
+                            weight = right_fraction if k & 1 else ONE - right_fraction
+                            found += weight * (lower_fraction if k >> 1 else ONE - lower_fraction)
             lit[n] = found / np.float32((2 * reach + 1) ** 2)

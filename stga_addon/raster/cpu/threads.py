@@ -1,8 +1,8 @@
 """Running kernels on several threads, which works because kernels release the GIL.
 
-A team's helpers stay in compiled code: the first kernel of an iteration wakes them, and until the
-last they find the next one, and its next stage, by themselves. Nobody waits for a helper that has
-not begun, so more threads than processors do no harm.
+Helpers stay in compiled code: the first kernel of an iteration wakes them, and until the last they
+find the next one, and its next stage, by themselves. Nobody waits for a helper that has not begun,
+so more threads than processors do no harm.
 
 Numba's parallel loops would compile every kernel four times over (7 s instead of 2 for the image
 loss), hold the lock while they run, so that Blender's window waits for a picture rendered in its
@@ -28,47 +28,55 @@ from . import inline_jit, jit
 from .elementary import acquire, exchange, fetch_add, latest, pause, release, yield_processor
 
 NEXT, UNITS, PIECE, FAILED, STAGES = range(5)
-"""Where a kernel's `work` int64 holds its next unit, their number, those of a piece, whether a
-member has failed, and of each stage its next unit and how many are done: all that a member sees of
-it."""
+"""Indices in a kernel's `work` int64 of its next unit, the number of units, the size of a piece,
+whether a worker has failed; from STAGES on, each stage's next unit and number of finished units.
+Workers see nothing else of it."""
 SEEN = STAGES + 2 * 14
-# The caller sees all of the team's words. Those that many threads write lie apart, because a
+# The caller sees all of the words. Those that many threads write lie apart, because a
 # processor's core takes over 64 or 128 bytes at a time.
 LIMIT, ENTRY = range(SEEN, SEEN + 2)
-"""How many helpers are of use, and the function that calls the kernel with what CALL keeps."""
+"""Words that hold the number of useful helpers, and the function that calls the kernel with the
+arguments in CALL."""
 JOB = 48
+"""Word that counts kernels; OVER after the last."""
 GATE = 64
-"""How many kernels there have been, negative after the last; and how many members are in one, OPEN
-more as long as others may enter."""
+"""Word that counts the workers in a kernel, plus OPEN as long as others may enter."""
 OPEN = 1 << 32
+"""Bit of GATE: others may enter."""
 OVER = -(1 << 62)
+"""Value of JOB after the last kernel."""
 CALL = 80
+"""First word of the kernel's arguments."""
 CALL_WORDS = 512
+"""Words for the kernel's arguments."""
 SLOTS = CALL + CALL_WORDS
+"""First word of the workers' slots. A slot holds whether the worker sleeps, and the lock for which
+it then waits."""
 SLOT_WORDS = 16
-"""Of each member, the caller the first: whether it sleeps, and the lock that it then waits for."""
+"""Words from one slot to the next."""
 CALLER = 0
+"""Slot of the thread that calls the kernel."""
 PATIENCE = 4000
-"""How often a member looks before it sleeps, some 0.1 ms: longer than Python takes from one kernel
-to the next, and shorter than from one iteration to the next."""
+"""Polls before a worker sleeps, some 0.1 ms: longer than Python takes from one kernel to the next,
+shorter than from one iteration to the next."""
 
 PROCESSORS = (
     len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 )
-"""That this process may use."""
-_team: "Team"
+"""Number of processors that this process may use."""
+_pool: "ThreadPool"
 
 
 def threads() -> int:
     """How many threads a kernel runs on: by default, as many as this process may use processors."""
-    return _team.helpers + 1
+    return _pool.helpers + 1
 
 
 def set_threads(count: int) -> None:
     """Run kernels on `count` threads from now on, at least one."""
-    global _team
-    before = _team
-    _team = Team(max(1, count) - 1)
+    global _pool
+    before = _pool
+    _pool = ThreadPool(max(1, count) - 1)
     before.dismiss()
 
 
@@ -91,14 +99,14 @@ def parallel(units: Callable[..., int], piece: int = 1) -> Callable[[Any], Calla
         @wraps(kernel)
         def call(*arguments: Any) -> None:
             if count := units(*arguments):
-                _team.run(kernel, count, piece, arguments)
+                _pool.run(kernel, count, piece, arguments)
 
         return call
 
     return decorate
 
 
-class Team:
+class ThreadPool:
     """A caller's helpers: threads that are started when they are needed, and sleep when not."""
 
     def __init__(self, helpers: int) -> None:
@@ -249,7 +257,7 @@ def _wake(words, slot):
 
 @njit
 def _wake_next(words, slot):
-    """Wake the two that a member wakes: one alone would take longer than they all do."""
+    """Wake the two that a worker wakes: one alone would take longer than they all do."""
     for child in range(2 * slot + 1, min(2 * slot + 2, words[LIMIT]) + 1):
         _wake(words, child)
 
@@ -270,7 +278,7 @@ def _await_change(words, index, value, slot, patience):
 
 @jit
 def serve(words, slot, patience):
-    """Help with every kernel from now on, until the team is dismissed."""
+    """Help with every kernel from now on, until the pool is dismissed."""
     known = 0
     while known >= 0:
         while latest(words, JOB) == known:
@@ -366,11 +374,11 @@ def end_stages(work):
 
 
 def _restart() -> None:
-    global _team
-    _team = Team(_team.helpers)
+    global _pool
+    _pool = ThreadPool(_pool.helpers)
 
 
-_team = Team(PROCESSORS - 1)
-atexit.register(lambda: _team.dismiss())
+_pool = ThreadPool(PROCESSORS - 1)
+atexit.register(lambda: _pool.dismiss())
 if hasattr(os, "register_at_fork"):  # a forked process has none of its parent's threads
     os.register_at_fork(after_in_child=_restart)

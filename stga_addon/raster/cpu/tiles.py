@@ -12,16 +12,17 @@ from .layout import MEAN_X, MEAN_Y, PRECISION_X, PRECISION_Y, SHEAR
 from .threads import call_helpers, end_stages, parallel, stage
 
 RADIX_BITS = 11
+"""Bits of a digit of the radix sort."""
 DIGITS = 1 << RADIX_BITS
+"""Values of a digit."""
 SPLATS_PER_SORT = 4_096
 """Splats that a thread lists or sorts at a time."""
 SORT_PARTS = 16
-"""Parallel parts: the splats, sorted near to far, are cut into as many of equal length."""
+"""Parallel parts of equal length into which the splats, sorted near to far, are cut."""
 SPLATS, PAIRS, LEAST, GREATEST = range(4)
-"""Columns of what is found in a part: splats with a tile, their pairs, and the bounds of their
-keys."""
+"""Columns of a part's row: splats with a tile, their pairs, least and greatest key."""
 RUN_BUCKETS = 512
-"""Kinds of runs of tiles, by how many pairs they have."""
+"""Classes of runs of tiles by their number of pairs."""
 
 
 @inline_jit
@@ -46,8 +47,9 @@ class Sorting(NamedTuple):
 
 
 FOUND, WRITTEN, LEAST_KEY, KEY_SPAN, RENDERED = range(5)
-"""Of all splats: those with a tile; their pairs; what keys are counted from, of lowest digit 0, so
-that a key's lowest digit is its own; the greatest counted from there; tiles to be rendered."""
+"""Entries of `totals`: splats with a tile; their pairs; the key from which others are counted,
+whose lowest digit is 0, so that lowest digits stay as they are; the greatest key counted from
+there; tiles to be rendered."""
 
 
 def parts_of(splats: int) -> int:
@@ -251,7 +253,7 @@ def _move_by_digit(k, row, keys, values, least, shift, moved_keys, moved):
 
 
 SPLATS_AHEAD = 16
-"""So many splats ahead, memory is asked for what lies in no order."""
+"""Splats ahead of the current one whose scattered values are prefetched."""
 
 
 @part_jit

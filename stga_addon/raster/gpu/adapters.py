@@ -12,7 +12,8 @@ NEEDED_LIMITS = {
     "max-storage-buffers-per-shader-stage": 10,
     "max-compute-workgroup-storage-size": 24 << 10,
 }
-"""What the kernels need of an adapter; WebGPU promises 8 and 16 KiB, desktop adapters have more."""
+"""Limits of an adapter that the kernels need; WebGPU promises 8 and 16 KiB, desktop adapters have
+more."""
 BACKENDS = ("Vulkan", "Metal", "DX12")
 """Without OpenGL, which lacks what the kernels need and complains where there is no display."""
 

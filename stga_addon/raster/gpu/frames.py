@@ -14,7 +14,7 @@ from .device import Device, Recording
 from .layout import FRAME_STRIDE, list_words
 
 SIGNALS = "smoothed_strain", "normal"
-"""Of `avatar.offsets.SIGNALS`, those that are computed on the device."""
+"""Those of `avatar.offsets.SIGNALS` that are computed on the device."""
 
 
 class Embedding:

@@ -236,8 +236,8 @@ fn move_scale(thread: Thread) {
   if f >= pose.triangles {
     return;
   }
-  let growth = exp(driven(f).x);
+  let enlargement = exp(driven(f).x);
   for (var c = 0u; c < 9u; c++) {
-    frames[f * FRAME_STRIDE + FRAME_MATRIX + c] *= growth;
+    frames[f * FRAME_STRIDE + FRAME_MATRIX + c] *= enlargement;
   }
 }

@@ -109,7 +109,7 @@ UNIFORMS = {
             ),  # by field, see `field_of`; then harmonics above the first, colors by the pose
             *((name, "f4") for name in ("beta1", "beta2", "log_beta1", "log_beta2", "epsilon")),
             ("ahead", "f4"),  # by how much of the way from the first moment to the gradient it goes
-            ("ema_share", "f4"),  # least share of a step in the exponential moving average
+            ("ema_share", "f4"),  # least fraction of a step in the exponential moving average
             *((name, "f4") for name in ("scale_weight", "distance_weight")),
             ("opacity_weight", "f4"),  # already divided by the number of splats
             ("statistics", "u4"),  # 1: collect what density control asks for

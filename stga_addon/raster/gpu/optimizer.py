@@ -17,9 +17,9 @@ from .layout import SH, WORKGROUP, XYZ
 from .rasterize import DEPTH_BITS, MAX_TILE_BITS, sort_passes
 
 KERNEL_FILES = ("frames", "project", "tiles", "blend", "image_loss", "optimizer", "rows")
-"""Of the kernels of an iteration, and of those between two, beside those of `sort`."""
+"""Files with the kernels of an iteration and of the work between two, beside those of `sort`."""
 STEP_OFFSET = "optimizer.step_offset"
-"""What any iteration may dispatch beside sorting and steps of driven offsets."""
+"""Kernel that any iteration may dispatch beside sorting and steps of driven offsets."""
 RATES = (*Parameters._fields, "sh_rest", "strain_color")
 """Learning rates in the order of the kernels."""
 
@@ -68,7 +68,7 @@ class OptimizerTables(NamedTuple):
 
     first, second, average  shaped as the table of splats
     history  (N, 3) steps uint32, sum of the screen gradients and number of summands float32
-    traits   (N, 2) float32: 1 for unbound splats, else 0; share of the cameras that did not see
+    traits   (N, 2) float32: 1 for unbound splats, else 0; fraction of the cameras that did not see
              them
     limits   (F, 3) float32: largest scale of bound and of unbound splats, largest distance
     """
@@ -171,7 +171,7 @@ def offset_constants(name: str) -> dict[str, float]:
     by_splat = {"TARGET": XYZ, "PER_UNIT": 1.0, "IS_SCALE": float(offset.target == SCALE)}
     if offset.target == COLOR:
         by_splat |= {"TARGET": SH, "PER_UNIT": 1 / SH_C0}
-    return by_splat | {"RATE": RATES.index(offset.rate), "RATE_SHARE": offset.rate_share}
+    return by_splat | {"RATE": RATES.index(offset.rate), "RATE_FRACTION": offset.rate_fraction}
 
 
 def compile_kernels(device: Device) -> None:

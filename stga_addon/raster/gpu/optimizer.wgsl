@@ -25,7 +25,7 @@ override TARGET: u32 = 0u;
 override IS_SCALE: bool = false; // then it is that of the logarithm of the triangle's scale
 override PER_UNIT: f32 = 1.0;
 override RATE: u32 = 0u;
-override RATE_SHARE: f32 = 1.0;
+override RATE_FRACTION: f32 = 1.0;
 
 const REST_RATE: u32 = 5u; // of the harmonics above the constant one
 
@@ -251,7 +251,7 @@ fn step_offset(thread: Thread) {
     return;
   }
   let correct = corrections_at(steps[f]);
-  let rate = RATE_SHARE * step.rates[RATE / 4u][RATE % 4u];
+  let rate = RATE_FRACTION * step.rates[RATE / 4u][RATE % 4u];
   for (var c = 0u; c < 9u; c++) {
     let n = 9u * f + c;
     let gradient = driving[3u * f + c / 3u] * total[c % 3u];

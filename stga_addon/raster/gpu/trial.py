@@ -18,20 +18,20 @@ from .rasterize import Rasterizer, ViewOptions, upload_frames, upload_splats
 SIZE = 20_000, 400
 """Splats, and pixels of a side of the image."""
 SOFTWARE_SIZE = 1_000, 80
-"""For adapters that compute on the CPU, whose speed is no question."""
+"""The same for adapters that compute on the CPU, whose speed is known to be low."""
 DEGREE = 1
 
 MAX_ERROR = 1e-3
 """Error of a wrong device's gradient, as a fraction of the gradient's length; rounding makes 1e-5
 of it, a lost pair 1e-2."""
 SECONDS = 0.3
-"""For each of the two, after the first image, which is not timed."""
+"""Time for each of the two, after the first image, which is not timed."""
 
 
 @dataclass(frozen=True)
 class Trial:
-    """error: largest difference of a parameter's gradient from the CPU's, as a share of its length;
-    times in s."""
+    """error: largest difference of a parameter's gradient from the CPU's, as a fraction of its
+    length; times in s."""
 
     error: float
     device_s: float

@@ -16,18 +16,19 @@ LIGHTS = {
     RECORDED: "Native splats shine in the colors of the capture",
     SCENE_LIGHT: "Native splats are lit by the scene's lights and world, and shadowed",
 }
-"""What native splats can show in EEVEE and Cycles -> its description."""
+"""Light of native splats in EEVEE and Cycles -> its description."""
 ALBEDO = "albedo"
 """Attribute of native splats; roughness is its fourth channel."""
 NORMAL = "surface_normal"
 
 SHRINKAGE_M = 0.006
-"""How far the mesh that throws shadows lies below the head's: splats would lie in its shadow."""
+"""Depth of the shadow-casting mesh below the head's mesh: splats would lie in the shadow of the
+latter."""
 FOLD_M = 0.03
 """Skin that sees other skin within this, as in mouth, nostrils and between lids, throws none: below
 its surface is the other one."""
 LIFT_M = 1e-4
-TRANSLUCENT_SHARE = 1e-3
+TRANSLUCENT_FRACTION = 1e-3
 
 
 def _surface(nodes: Nodes, splats: Any, head: Any) -> bpy.types.NodeSocket:
@@ -75,7 +76,7 @@ def _lit_shader(nodes: Nodes) -> Any:
     skin = nodes.out("ShaderNodeBsdfPrincipled", surface)
     # Else Cycles' light tree leaves out lamps behind an ellipsoid, if not behind the mesh.
     shaders = [skin, nodes.out("ShaderNodeBsdfTranslucent")]
-    lit = nodes.out("ShaderNodeMixShader", {"Fac": TRANSLUCENT_SHARE, "Shader": shaders})
+    lit = nodes.out("ShaderNodeMixShader", {"Fac": TRANSLUCENT_FRACTION, "Shader": shaders})
     return _by_shadow(nodes, lit, None)
 
 

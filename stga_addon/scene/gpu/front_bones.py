@@ -10,10 +10,10 @@ NO_BONES = np.zeros((0, 2, 4), np.float32)
 
 MAX_SHAPES = 256
 """Bones looked for in each pixel; splats cover those of a larger rig."""
-WIDTH_SHARE = 0.15
+WIDTH_FRACTION = 0.15
 """Half the width of a bone as a fraction of its length."""
 MARGIN_PX = 6.0
-"""What is added to a bone's half width for outlines."""
+"""Margin around a bone's half width for outlines."""
 
 
 def front_bones(space: Any, region: Any, width: int, height: int) -> np.ndarray:
@@ -32,7 +32,7 @@ def front_bones(space: Any, region: Any, width: int, height: int) -> np.ndarray:
         size = rig.matrix_world.median_scale
         shape = bone.custom_shape if rig.data.show_bone_custom_shapes else None
         if shape is None:
-            radius = size * bone.length * WIDTH_SHARE
+            radius = size * bone.length * WIDTH_FRACTION
             found.append((matrix @ bone.head, matrix @ bone.tail, radius))
             continue
         owner = bone.custom_shape_transform or bone  # a sphere around the shape

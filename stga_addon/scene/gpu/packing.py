@@ -31,7 +31,7 @@ MAX_SHORT_KEY = (1 << 16) - 1
 MAX_LONG_KEY = (1 << 24) - (1 << 8)
 """Largest sort key of 24 bits, as many as float32 has, less what rounding may add."""
 MAX_RELATIVE_STEP = 1e-5
-"""Largest step of depth between short keys as a share of the nearest depth: 5 µm at 0.5 m."""
+"""Largest step of depth between short keys as a fraction of the nearest depth: 5 µm at 0.5 m."""
 
 
 @dataclass(frozen=True)
@@ -216,9 +216,9 @@ LIGHT_TEXELS = 4
 MAP_TEXELS = 4
 """Texels of a shadow map."""
 RELIT_TEXELS = 14
-"""Of a layer: share and factor of color; roughness, specular, first light and number of lights;
-eye, damping; typical albedo; nine harmonics of the world as highlights show them; gain and share of
-what is kept of recorded colors (`light.relight`)."""
+"""Texels of a relit layer: weight and factor of color; roughness, specular, first light and number
+of lights; eye, damping; typical albedo; nine harmonics of the world as highlights show them; gain
+and weight of the part of recorded colors that is kept (`light.relight`)."""
 MAX_MAPS = 16
 
 
@@ -258,8 +258,8 @@ class RelitScene(NamedTuple):
 
 
 def relit_scene(layers: Sequence[SceneLayer]) -> RelitScene:
-    """Pack poses and light of all layers; a share of 0: not relit. Lights beyond MAX_MAPS throw no
-    shadow."""
+    """Pack poses and light of all layers; a fraction of 0: not relit. Lights beyond MAX_MAPS throw
+    no shadow."""
     head = np.zeros((len(layers), RELIT_TEXELS, 4), np.float32)
     vertices = [np.zeros((0, 4), np.float32)]
     maps = list[ShadowView]()
@@ -303,7 +303,7 @@ def relit_scene(layers: Sequence[SceneLayer]) -> RelitScene:
         block[2, 3] = relighter.light.damping
         block[3, :3] = relighter.typical_albedo
         block[4:13, :3] = GLOSSY[:, None] * lighting.world
-        block[13] = *kept.gain, kept.share
+        block[13] = *kept.gain, kept.fraction
     head[:, 3, 3] = head.size // 4 + LIGHT_TEXELS * sum(map(len, points))
     rows = [head, *points, *map_rows]
     lights = np.concatenate([each.reshape(-1, 4) for each in rows])

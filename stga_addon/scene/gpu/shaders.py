@@ -70,7 +70,7 @@ RELIT_DEFINES = f"""
 #define WORLD(first, k) TEXEL(lights, first + k).rgb
 {SHADING_DEFINES}"""
 RELIT_FUNCTIONS = """
-float lit_share_of(int map_index, int first, vec3 point, float cosine)
+float lit_fraction_of(int map_index, int first, vec3 point, float cosine)
 {
   int row = first + MAP_TEXELS * map_index;
   vec4 p = vec4(point, 1.0), lens = TEXEL(lights, row + 3);
@@ -85,7 +85,7 @@ float lit_share_of(int map_index, int first, vec3 point, float cosine)
   }
   place = place * lens.x + 0.5 * float(MAP_SIZE);
   ivec2 corner = MAP_SIZE * ivec2(map_index % MAP_COLUMNS, map_index / MAP_COLUMNS);
-  return lit_share(corner, place, local.z - shadow_bias(cosine, lens.z));
+  return lit_fraction(corner, place, local.z - shadow_bias(cosine, lens.z));
 }
 
 vec3 relit(int splat, int layer, vec3 recorded, vec3 face_color)
@@ -135,7 +135,7 @@ vec3 relit(int splat, int layer, vec3 recorded, vec3 face_color)
       continue;
     }
     if (d.x > -0.5) {
-      strength *= lit_share_of(int(d.x + 0.5), int(typical.w + 0.5), point, facing);
+      strength *= lit_fraction_of(int(d.x + 0.5), int(typical.w + 0.5), point, facing);
     }
     vec3 light = light_color * strength * facing;
     float wide = min(alpha * alpha + 0.125 * width * width, 1.0);
@@ -349,8 +349,8 @@ bool is_near_bone(vec2 pixel)
   for (int bone = 0; bone < int(part.y); bone++) {
     vec4 ends = texelFetch(bones, ivec2(0, bone), 0);
     vec2 along = ends.zw - ends.xy, to = pixel - ends.xy;
-    float share = clamp(dot(to, along) / max(dot(along, along), 1e-6), 0.0, 1.0);
-    if (distance(to, share * along) < texelFetch(bones, ivec2(1, bone), 0).r) {
+    float fraction = clamp(dot(to, along) / max(dot(along, along), 1e-6), 0.0, 1.0);
+    if (distance(to, fraction * along) < texelFetch(bones, ivec2(1, bone), 0).r) {
       return true;
     }
   }

@@ -25,7 +25,8 @@ HIDDEN_DEPTH_M = 2.0
 """Depth of invisible splats behind the first of the three, so that the second instance of the
 shader draws the others."""
 MAX_ERROR = 0.03
-"""Of color and alpha, and of depth in meters; up to 1/255 for each splat is cut off on purpose."""
+"""Largest error of color and alpha, and of depth in meters; up to 1/255 for each splat is cut off
+on purpose."""
 
 
 class WrongPicture(Exception):

@@ -146,7 +146,7 @@ class SplatsEngine(bpy.types.RenderEngine):  # type: ignore[misc]
         renderers = list[SplatRenderer]()  # freed here, in the thread of its GPU context
         frame = scene.frame_current + scene.frame_subframe
         offset = 0.0
-        color = share = distance = np.zeros(1)
+        color = fraction = distance = np.zeros(1)
         samples = lens.samples(scene, view_camera(scene, view_name))
         try:
             for taken, sample in enumerate(samples):
@@ -159,7 +159,7 @@ class SplatsEngine(bpy.types.RenderEngine):  # type: ignore[misc]
                 image, hidden = self._layers_image(layers, view, renderers)
                 color = color + combined(image.rgb, image.alpha, background, inverse, hidden)
                 seen = image.alpha - hidden
-                share = share + seen
+                fraction = fraction + seen
                 distance = distance + np.where(seen > 0, seen * image.depth, 0)
                 self.update_stats("", f"{sum(len(layer.splats) for layer in layers)} splats")
                 self.update_progress((taken + 1) / len(samples))
@@ -170,8 +170,8 @@ class SplatsEngine(bpy.types.RenderEngine):  # type: ignore[misc]
                 self._go_to(frame)
         count = taken + 1
         chosen = 0.0 if with_set else depsgraph.view_layer.pass_alpha_threshold
-        covered = share / count >= max(chosen, MIN_ALPHA)
-        depth = np.where(covered, distance / np.maximum(share, MIN_ALPHA), BACKGROUND_DEPTH)
+        covered = fraction / count >= max(chosen, MIN_ALPHA)
+        depth = np.where(covered, distance / np.maximum(fraction, MIN_ALPHA), BACKGROUND_DEPTH)
         return {"Combined": color / count, "Depth": depth[..., None]}
 
     def _go_to(self, frame: float) -> None:

@@ -136,7 +136,7 @@ def _depth_combine() -> Any:
         new_socket(tree, f"{side} Depth", "INPUT", "Float")
     new_socket(tree, "Image", "OUTPUT", "Color")
     new_socket(tree, "Depth", "OUTPUT", "Float")
-    new_socket(tree, "Mask", "OUTPUT", "Float").description = "Share of splats in each pixel"
+    new_socket(tree, "Mask", "OUTPUT", "Float").description = "Fraction of splats in each pixel"
     nodes = Nodes(tree)
     splats, splat_depth, others, other_depth, *_ = nodes.add("NodeGroupInput").outputs
     is_behind = compat.compositor_math(nodes, "GREATER_THAN", splat_depth, other_depth)

@@ -13,9 +13,9 @@ SHUTTER_START = {"START": 0.0, "CENTER": -0.5, "END": -1.0}
 """When the shutter opens, in exposure times from the frame."""
 
 TIME_STEP = 0.7548776662
-"""Of a sample's moment to the next one's, in exposure times: 1 over the plastic number."""
+"""Time from a sample to the next one, in exposure times: 1 over the plastic number."""
 GOLDEN_STEP = 0.6180339887
-"""Of a sample's angle in the aperture to the next one's, in turns."""
+"""Angle in the aperture from a sample to the next one, in turns."""
 
 
 class Sample(NamedTuple):
@@ -108,13 +108,13 @@ def _even(count: int) -> np.ndarray:
 def _aperture_points(turn: np.ndarray, area: np.ndarray, blades: int, rotation: float) -> Any:
     """(N, 2) points of a disk of radius 1, or of the regular polygon in it that three blades or
     more form, turned by radians. turn, area (N,): in 0…1, of a full turn and of the area."""
-    share = np.sqrt(area)[:, None]
+    fraction = np.sqrt(area)[:, None]
     if blades < 3:
         angle = 2 * np.pi * turn
-        return share * np.stack([np.cos(angle), np.sin(angle)], -1)
+        return fraction * np.stack([np.cos(angle), np.sin(angle)], -1)
     corner = np.floor(turn * blades)
     along = (turn * blades - corner)[:, None]
     # Blender's rotation is that of the first side's middle, counterclockwise as the camera sees it
     angles = rotation + 2 * np.pi * np.stack([corner - 0.5, corner + 0.5]) / blades
     first, second = np.stack([np.cos(angles), -np.sin(angles)], -1)
-    return share * (first * (1 - along) + second * along)
+    return fraction * (first * (1 - along) + second * along)

@@ -216,7 +216,7 @@ def _shown(scene: Any, linear: np.ndarray) -> np.ndarray:
 
 
 MIN_SEEN = 1e-6
-"""Share of a pixel below which its color does not matter."""
+"""Fraction of a pixel below which its color does not matter."""
 
 
 def combined(
@@ -235,17 +235,17 @@ def combined(
     image = np.zeros((*alpha.shape, 4), np.float32)
     covered = alpha > 0
     color = rgb[:, covered].T
-    share = alpha[covered][:, None]
+    fraction = alpha[covered][:, None]
     held_out = np.broadcast_to(hidden, alpha.shape)
     seen = 1 - held_out[covered][:, None]
     if background is None:
-        seen = share - held_out[covered][:, None]
+        seen = fraction - held_out[covered][:, None]
         image[..., 3] = alpha - held_out
     else:
         linear = np.array(background, np.float32)
         behind = linear_to_srgb(np.clip(linear, 0, 1)) if view is None else view.show(linear)
         image[...] = *background, 1
-        color = np.clip(color + (1 - share) * behind, 0, 1)
+        color = np.clip(color + (1 - fraction) * behind, 0, 1)
         image[..., 3] = 1 - held_out
     image[covered, :3] = to_linear(color / np.maximum(seen, MIN_SEEN)) * seen
     return image

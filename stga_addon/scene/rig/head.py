@@ -103,7 +103,7 @@ TIMESTEP_KEY = re.compile(r"t\d{5,}")
 FLAME_KEY = re.compile(r"(expr_|identity_|offset_t)\d+|pose_\w+_\d\d")
 """Name of a shape key that the import of a FLAME capture makes."""
 KEY_FIELDS = ("slider_min", "slider_max", "value", "mute", "vertex_group")
-"""What is kept of a shape key beside its shape, in an order in which it can be set."""
+"""Fields of a shape key that are kept beside its shape, in an order in which they can be set."""
 OtherKey = tuple[np.ndarray, dict[str, Any]]
 
 

@@ -30,7 +30,7 @@ EXPECTED = (
     "transforms.json, a COLMAP model (sparse/0), Metashape's cameras.xml, "
     "RealityCapture's CSV or XMP files, NeRSemble's camera_params.json"
 )
-"""What messages say is read."""
+"""Files that are read, for messages."""
 LEVELS_ABOVE = 4
 """Folders around one of images, in which NeRSemble's calibration is looked for."""
 HEAD_BYTES = 4096
@@ -55,7 +55,7 @@ UNREAD_MARKS: dict[str, tuple[str, ...]] = {
 
 
 class Program(NamedTuple):
-    """Whose calibrations are read.
+    """A program whose calibrations are read.
 
     find      those in a folder, files or folders that stand for several, the best first
     read      shots of one of them, and sentences about what it lists and is left out
@@ -158,7 +158,7 @@ PROGRAMS = (
     ),
     Program(_xmp_folder, _read_xmp, (".xmp",), True),
 )
-"""In the order in which the calibration of a folder is looked for."""
+"""Readers, in the order in which the calibration of a folder is looked for."""
 
 
 def find_calibration(root: Path) -> tuple[Path | None, tuple[str, ...]]:

@@ -1,5 +1,5 @@
-"""What recordings state beside their pixels: focal lengths in photos' EXIF and in metadata of
-QuickTime's and MP4's tracks, whose clean aperture too."""
+"""Metadata of recordings: focal lengths from photos' EXIF and from tracks of QuickTime and MP4, and
+their clean aperture."""
 
 import mmap
 import re
@@ -14,7 +14,8 @@ from PIL import Image
 from ...capture.images import FORMATS
 
 FULL_FRAME_DIAGONAL_MM = 43.27
-"""Of 36 x 24 mm; equivalent lengths have one angle of view over the diagonal (CIPA DCG-001)."""
+"""Diagonal of 36 x 24 mm; equivalent lengths have one angle of view over the diagonal (CIPA
+DCG-001)."""
 MIN_EQUIVALENT_MM = 5.0
 """Least focal length for 35 mm film that is plausible."""
 MAX_EQUIVALENT_MM = 2000.0

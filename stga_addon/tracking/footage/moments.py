@@ -165,8 +165,8 @@ def _assigned(
 
 
 def _likeliness(found: dict[str, dict[str, str]]) -> tuple[int, bool, int]:
-    """Order of folders of images and masks that have the same names: most cameras first, then
-    those that are not called masks, then the most images."""
+    """Sort key of folders of images and masks with the same names: most cameras first, then folders
+    that are not called masks, then the most images."""
     moments = [moment.lower() for own in found.values() for moment in own]
     is_other = any(word in moments[0] for word in OTHER_WORDS)
     return len(found), not is_other, len(moments)

@@ -46,7 +46,7 @@ ALL_FRAMES = FrameRange()
 
 MAX_MEASURED_MASKS = 6
 """Masks, evenly spread over cameras and timesteps, that tell what 255 means."""
-USUAL_VIEW_DEG = 65.0
+TYPICAL_VIEW_DEG = 65.0
 """Angle of view of an unknown camera over the image's diagonal: that of a phone."""
 
 
@@ -62,7 +62,7 @@ def open_footage(
     path     folder with an image, a folder of images or a video for each camera; or one video
     cameras  calibration file or folder; None: the one in `path` (`find_calibration`)
     focal    focal length in pixels of a single camera without a calibration; None: what its file
-             says, else `usual_focal`
+             says, else `typical_focal`
     mattes   folder of masks that stand in for the footage's own, named as its images; those of a
              video's frames by camera and number, counted from 0, as in left/00012.png
     Cameras with a folder or video show sequences; where all have one image, it shows one timestep.
@@ -100,8 +100,8 @@ def open_footage(
     plated = tuple(replace(own, plate=sources.plates.get(own.name)) for own in footage.cameras)
     footage = replace(footage, cameras=plated)
     if mattes is None:
-        strays = _stray_masks(sources, plated)
-        return _masks_as_meant(replace(footage, warnings=(*footage.warnings, *strays)))
+        unused = _unused_masks(sources, plated)
+        return _masks_as_meant(replace(footage, warnings=(*footage.warnings, *unused)))
     if not is_folder(mattes):
         raise StgaError(f"{mattes}: is not a folder; expected one of mattes")
     given = find_sources(Path(realpath(mattes)))
@@ -144,7 +144,7 @@ def _mask_views(frames: Frames) -> Mapping[int, View]:
 
 
 def sized(footage: Footage, size: float) -> Footage:
-    """The footage with images of a share of the recorded size."""
+    """The footage with images of a fraction of the recorded size."""
     cameras = []
     for own in footage.cameras:
         ideal = own.camera.scaled(size)
@@ -154,7 +154,7 @@ def sized(footage: Footage, size: float) -> Footage:
 
 
 def _no_footage(path: Path) -> str:
-    """What a path is that is neither a folder nor a video."""
+    """Description of a path that is neither a folder nor a video."""
     if not exists(path):
         return "does not exist"
     if path.suffix.lower() in IMAGE_SUFFIXES:
@@ -250,7 +250,7 @@ def _unused(sources: Sources, calibration: Path, used: Iterable[Path]) -> tuple[
     return (f"{sources.root}: {counted}: {listed(sorted(names))}",)
 
 
-def _stray_masks(sources: Sources, cameras: Iterable[FootageCamera]) -> tuple[str, ...]:
+def _unused_masks(sources: Sources, cameras: Iterable[FootageCamera]) -> tuple[str, ...]:
     """Sentences about masks of no image and plates of no camera."""
     frames = [camera.frames for camera in cameras]
     views = (view for own in frames if isinstance(own, ImageFrames) for view in own.views.values())
@@ -398,7 +398,7 @@ def _single_camera(sources: Sources, frames: FrameRange, focal: float | None) ->
             focal = photo_focal(sequence[0], width, height)
             known = "file"
     if focal is None:
-        focal = usual_focal(width, height)
+        focal = typical_focal(width, height)
         known = "usual"
     if focal < 1:
         raise StgaError(f"Focal length: expected at least 1 pixel, not {focal:g}")
@@ -408,9 +408,9 @@ def _single_camera(sources: Sources, frames: FrameRange, focal: float | None) ->
     return replace(_rig(sources, {name: shot}, {name: sequence}, frames), focal=known)
 
 
-def usual_focal(width: int, height: int) -> float:
+def typical_focal(width: int, height: int) -> float:
     """Focal length in pixels of a phone's images of that size."""
-    return math.hypot(width, height) / 2 / math.tan(math.radians(USUAL_VIEW_DEG / 2))
+    return math.hypot(width, height) / 2 / math.tan(math.radians(TYPICAL_VIEW_DEG / 2))
 
 
 # Images that the calibration lists

@@ -13,7 +13,7 @@ from ...flame.forward import axis_angle_matrices
 from .shots import Calibrated, ImageSize, Shot, listed, numbers, pinhole, read_xml
 
 FILM_WIDTH_MM = 36.0
-"""Of the 35 mm film that focal lengths are given for; it stands for the image's longer side."""
+"""Width of the 35 mm film to which focal lengths refer; it stands for the image's longer side."""
 REQUIRED_COLUMNS = ("name", "x", "y", "alt", "heading", "pitch", "roll", "f")
 LENS_COLUMNS = ("k1", "k2", "k3", "k4", "t1", "t2")
 
@@ -63,8 +63,8 @@ def is_xmp(path: Path) -> bool:
 
 def read_realitycapture_csv(path: Path, image_size: ImageSize) -> Calibrated:
     """One shot a line, labelled with the image's name. Columns: name, x, y, alt, heading, pitch,
-    roll (degrees), f (35 mm film), and, where they are there, px, py (shares of the longer side),
-    k1 to k4, t1, t2; or `OTHER_SPELLINGS`. Raises StgaError that names file and line."""
+    roll (degrees), f (35 mm film), and, where they are there, px, py (fractions of the longer
+    side), k1 to k4, t1, t2; or `OTHER_SPELLINGS`. Raises StgaError that names file and line."""
     rows = read_table(path)
     first = _row_of_names(rows)
     columns = _columns(rows[first][1]) if rows else []
@@ -162,9 +162,9 @@ def _xmp_shot(path: Path, label: str, fields: dict[str, str], size: tuple[int, i
     if "FocalLength35mm" not in fields:
         raise StgaError(f"{path}: xcr:FocalLength35mm is missing")
     scale = max(size)
-    share = values("FocalLength35mm", "")[0] / FILM_WIDTH_MM
-    lens = _lens(coefficients, values("Skew", "0")[0] / share if share else 0.0)
-    focal = share * scale, share * scale * values("AspectRatio", "1")[0]
+    fraction = values("FocalLength35mm", "")[0] / FILM_WIDTH_MM
+    lens = _lens(coefficients, values("Skew", "0")[0] / fraction if fraction else 0.0)
+    focal = fraction * scale, fraction * scale * values("AspectRatio", "1")[0]
     cx, cy = (values(f"PrincipalPoint{axis}", "0")[0] * scale for axis in "UV")
     rotation = np.array(values("Rotation", "", 9)).reshape(3, 3)  # world to camera, OpenCV axes
     position = np.array(values("Position", "", 3))

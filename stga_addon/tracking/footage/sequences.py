@@ -1,5 +1,5 @@
-"""Frames of cameras that recorded a sequence each, in step: by offsets that are given, or found in
-sound or motion."""
+"""Frames of cameras that recorded a sequence each, synchronized by given offsets, or by offsets
+found in sound or motion."""
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
@@ -33,7 +33,7 @@ NEIGHBORHOOD_S = 0.2
 
 @dataclass(frozen=True)
 class FrameRange:
-    """Which frames are used: `start`, `start` + `step`, … before `stop` (None: to the end), counted
+    """Frames that are used: `start`, `start` + `step`, … before `stop` (None: to the end), counted
     from 0.
 
     offsets  camera -> how many frames later its recording shows the same moment; 0 for those not
@@ -228,8 +228,8 @@ def clock_offsets(
 
 
 def best_lag(reference: np.ndarray, signal: np.ndarray, rate: float) -> tuple[int, float, float]:
-    """The lag at which signal[t + lag] follows reference[t] most certainly, their correlation there
-    (−1 to 1), and how many times its score exceeds all that are farther than NEIGHBORHOOD_S away.
+    """The lag with the highest score of signal[t + lag] against reference[t], their correlation
+    there (−1 to 1), and the ratio of its score to the best one farther away than NEIGHBORHOOD_S.
 
     Signals (N,) and (M,) of `rate` values a second. The score is the correlation over the values
     that both have, MIN_OVERLAP_S at least, times the root of their number: of few values, chance
@@ -239,7 +239,7 @@ def best_lag(reference: np.ndarray, signal: np.ndarray, rate: float) -> tuple[in
     least = min(len(reference), len(signal), round(MIN_OVERLAP_S * rate))
 
     def sums(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-        """Σ a[t] b[t + lag] for each lag, from −(N − 1) on."""
+        """Σ a[t] b[t + lag] for each lag, starting at −(N − 1)."""
         return np.fft.irfft(np.fft.rfft(a[::-1], size) * np.fft.rfft(b, size), size)
 
     one = np.ones(len(reference))

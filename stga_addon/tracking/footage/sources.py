@@ -22,8 +22,8 @@ the same names in several, the first are used."""
 ORIGINALS = "input"  # Container of the images before undistortion, by 3DGS's convert.py
 
 MASK_FOLDERS = ("masks", "fg_masks", "alpha_map", "alpha_maps")
-"""At the top of the footage, or beside the folders of images, as NeRSemble has one in each moment's
-folder; a frame rate may follow (alpha_map-73fps)."""
+"""Folders of masks at the top of the footage, or beside the folders of images, as NeRSemble has one
+in each timestep's folder; a frame rate may follow (alpha_map-73fps)."""
 
 PLATE_FOLDER = "plates"  # Holds an image without the person for each camera, of its name
 MAX_DEPTH = 4

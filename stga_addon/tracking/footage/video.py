@@ -1,4 +1,4 @@
-"""Frames of one camera that are in a video, decoded with PyAV."""
+"""Frames of one camera from a video, decoded with PyAV."""
 
 import itertools
 from collections.abc import Iterator, Mapping, Sequence
@@ -19,21 +19,22 @@ from ...files import file_address
 from .focal_tags import clean_aperture
 
 MIN_HD_LINES = 720
-"""From this height on, videos without a stated color matrix use that of HD (BT.709)."""
+"""Height from which on videos without a stated color matrix use that of HD (BT.709)."""
 TIMED_CONTAINERS = ("mov", "matroska")
 """FFmpeg's names of containers that store when each packet is shown."""
 SEEKABLE_CONTAINERS = (*TIMED_CONTAINERS, "mpegts")
 """Containers in which a frame has the same presentation time after a seek as in order."""
 CODECS_WITH_HIDDEN_PACKETS = ("vp8",)
-"""Whose reference frames that are not shown are packets of their own."""
+"""Codecs whose reference frames that are not shown are packets of their own."""
 DISPLAY_MATRIX_ONE = 1 << 16
-"""In the fixed-point numbers of a display matrix (ISO/IEC 14496-12, track header)."""
+"""The number 1 in the fixed-point numbers of a display matrix (ISO/IEC 14496-12, track header)."""
 CHECKED_FRAMES = 8
 """Frames at the beginning of a video that are decoded to check the times of its packets."""
 MAX_FRAMES_AHEAD = 100
 """Frames that are decoded to reach a later one; further ahead, a key frame is sought."""
 SEEK_BACK_FRAMES = (0, 16, 64, 256)
-"""How far before a frame a seek is tried, in turn, before all is decoded from the beginning."""
+"""Distances before a frame to which a seek is tried, in turn, before all is decoded from the
+beginning."""
 RATE_TOLERANCE = 0.01
 """Relative difference up to which a stated frame rate is that of the frames' times."""
 TURN_TOLERANCE = 0.02
@@ -276,7 +277,7 @@ def _square_width(frame: Any, aspect: Fraction) -> int:
 
 
 def _unheard(path: Path, frame: Any) -> list[str]:
-    """What a video asks for and does not get."""
+    """Requests of a video that are not followed."""
     sentences = []
     matrix = _display_matrix(frame)
     if matrix is not None:
@@ -313,8 +314,8 @@ def opened_video(path: Path) -> Iterator[Any]:
 
 
 def _packet_times(path: Path) -> tuple[list[int], bool]:
-    """When packets are shown, ascending, without those that an edit list hides; none where they do
-    not say it, so that all frames must be decoded. And whether the file was found to end within a
+    """Presentation times of packets, ascending, without those that an edit list hides; none where
+    packets have no times, so that all frames must be decoded. And whether the file ends within a
     packet, which is left out."""
     with opened_video(path) as container:
         stream = container.streams.video[0]

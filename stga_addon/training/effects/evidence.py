@@ -26,7 +26,7 @@ EXPOSURE_RIDGE = 50.0
 """Weight in samples of an even exposure of each view: where light and exposure both explain the
 images, the one light does."""
 TYPICAL_LEVEL = 100.0
-"""Of a color, in levels of 255; scales the prior of a gain."""
+"""Typical color in levels of 255; scales the prior of a gain."""
 MIN_EXPOSURE_LEVELS = 1.5
 """Gain in levels of 255 from which differences between cameras, or in time, are corrected."""
 OFFSET_PENALTY = 0.05
@@ -37,7 +37,8 @@ RELATIVE_CHANGE_BIAS_LEVELS = 32.0
 ROUNDING_LEVELS = 12**-0.5
 """Root mean square error of colors in whole levels; none is known better."""
 RIDGE_WEIGHT = 1.0
-"""Of a triangle's coefficients, in units of a feature's variance over all triangles."""
+"""Weight of the ridge on a triangle's coefficients, in units of a feature's variance over all
+triangles."""
 
 
 @dataclass(frozen=True)
@@ -53,8 +54,8 @@ class Evidence:
         return math.sqrt(max(0.0, self.before**2 - self.after**2))
 
     @property
-    def share(self) -> float:
-        """Explained share of the error's variance."""
+    def fraction(self) -> float:
+        """Explained fraction of the error's variance."""
         return (self.gain / max(self.before, 1e-9)) ** 2
 
     @property

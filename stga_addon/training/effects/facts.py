@@ -23,7 +23,7 @@ from .samples import Samples, take_samples
 
 MAX_TIMESTEPS = 64
 """Timesteps that are posed to measure motion, evenly spread."""
-MIN_WHITE_SHARE = 0.1
+MIN_WHITE_FRACTION = 0.1
 """Of the pixels beside the mesh: with a white background, more of them than this are white."""
 
 
@@ -110,7 +110,9 @@ class CaptureFacts:
     @cached_property
     def shows_backdrop(self) -> bool:
         """Whether sampled views without a mask show something else than white behind the head."""
-        return bool((self.samples.white[np.isnan(self.samples.foreground)] < MIN_WHITE_SHARE).any())
+        return bool(
+            (self.samples.white[np.isnan(self.samples.foreground)] < MIN_WHITE_FRACTION).any()
+        )
 
     @cached_property
     def backdrop_spread(self) -> float | None:
@@ -136,8 +138,8 @@ class CaptureFacts:
         return replace(self.capture, timesteps=self.sampled_timesteps, expression_mesh=pose)
 
     @cached_property
-    def selected_share(self) -> float:
-        """Mean share of the triangles that the settings' rule selects in a sampled timestep."""
+    def selected_fraction(self) -> float:
+        """Mean fraction of the triangles that the settings' rule selects in a sampled timestep."""
         chosen = select_capture(self.sampled, self.settings.selection)
         return float(np.mean([faces.mean() for faces in chosen.values()]))
 

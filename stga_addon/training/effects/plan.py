@@ -30,16 +30,17 @@ MIN_STRAIN_GAIN_DB = 0.35
 """Mean gain of sampled colors, in frames and in cameras that are left out, from which splats follow
 deformation: with less, trainings with and without differ by no more than their noise."""
 MIN_TRACKED_STRAIN_GAIN_DB = -0.35
-"""The same of a capture by `stga track`, whose mesh lies beside what is seen by so much that colors
-sampled there show nothing of what trainings gain."""
+"""The same for a capture by `stga track`, whose mesh is so far from the true surface that colors
+sampled there do not show what trainings gain."""
 MIN_TIMESTEPS_FOR_STRAIN = 4
 """With fewer, leaving out one and its neighbors leaves no two to fit a dependence to."""
 MIN_SIGNAL_CHANGE = 1e-5
-"""Of strain or a unit normal; less is rounding."""
+"""Least change of strain or a unit normal; smaller ones are rounding errors."""
 MIN_TURN_DEG = 2.0
 """Root mean square over frames and triangles, from which colors follow where skin faces."""
 MAX_PIXEL_WIDTH_RATIO = 1.25
-"""Of pixels at the head; above it, splats narrower than a pixel look different to each camera."""
+"""Largest ratio of pixel widths at the head; above it, splats narrower than a pixel look different
+to each camera."""
 FINE_SPLAT_PIXELS = 4.0
 """Median pixels per splat below which the screen-space low-pass filter changes how splats look."""
 MAX_BACKGROUND_SPREAD_LEVELS = 6.0
@@ -50,17 +51,17 @@ MESH_AS_MASK = (
     "what the head's mesh does not cover, hair included, is left out (`stga track --mattes auto` "
     "makes masks)"
 )
-"""What becomes of images without a mask."""
-MIN_UNCOVERED_SHARE = 0.003
-"""Share of the foreground that the mesh does not cover, from which splats are added for it."""
+"""Treatment of images without a mask."""
+MIN_UNCOVERED_FRACTION = 0.003
+"""Fraction of the foreground that the mesh does not cover, from which splats are added for it."""
 MIN_PIXELS_PER_SPLAT = 0.5
 """90th percentile over triangles, below which further splats have no detail to show."""
 MIN_LIP_GAP_MM = 1.5
 """Gap between the lips above which the inside of the mouth is visible."""
 MIN_JAW_ANGLE_DEG = 3.0
 """Rotation of the jaw above which it is visible."""
-MAX_OUTSIDE_SHARE = 0.001
-"""Share of the mesh outside of the masks above which the tracking is inaccurate."""
+MAX_OUTSIDE_FRACTION = 0.001
+"""Fraction of the mesh outside of the masks above which the tracking is inaccurate."""
 
 
 @dataclass(frozen=True)
@@ -88,7 +89,7 @@ def view_color(facts: CaptureFacts) -> Verdict:
     direction = facts.samples.direction
     folds = scattered_folds(np.arange(len(direction)))
     found = linear_evidence(facts.matched_colors, direction, folds, MAX_VIEW_ERROR_RATIO)
-    variance = f"({found.share:.1%} of the variance)"
+    variance = f"({found.fraction:.1%} of the variance)"
     reason = f"colors depend on the view by {found.gain:.1f} of 255 levels {variance}"
     return Verdict(found.gain >= MIN_VIEW_DEPENDENCE_LEVELS, reason)
 
@@ -162,7 +163,7 @@ def hull_points(facts: CaptureFacts) -> Verdict:
     reason = f"{uncovered:.1%} of the foreground lies beside the mesh"
     if facts.has_one_camera:
         reason += "; a single camera does not show how far away, so that it becomes a flat layer"
-    return Verdict(uncovered > MIN_UNCOVERED_SHARE, reason)
+    return Verdict(uncovered > MIN_UNCOVERED_FRACTION, reason)
 
 
 def depth_limits(facts: CaptureFacts) -> Verdict:
@@ -180,14 +181,14 @@ def density(facts: CaptureFacts) -> Verdict:
 
 def selection(facts: CaptureFacts) -> Verdict:
     threshold = 1000 * facts.settings.selection.threshold
-    if facts.selected_share == 0:
+    if facts.selected_fraction == 0:
         count = len(facts.sampled_timesteps)
         total = len(facts.capture.timesteps)
         reason = f"no triangle moves by more than {threshold:g} mm in any of {count} frames"
         return Verdict(False, reason, fixed=count == total)
-    share = f"{facts.selected_share:.0%}"
+    fraction = f"{facts.selected_fraction:.0%}"
     asked = facts.settings.strategy == "selective"
-    reason = f"a frame moves {share} of the triangles by more than {threshold:g} mm"
+    reason = f"a frame moves {fraction} of the triangles by more than {threshold:g} mm"
     return Verdict(asked, reason + ("" if asked else ", but training all of them measured best"))
 
 
@@ -302,7 +303,7 @@ def tracking(facts: CaptureFacts) -> Verdict | None:
     if np.isnan(outside):
         return Verdict(False, "without masks, the mesh cannot be compared with the images")
     reason = f"{outside:.2%} of the mesh sticks out of the masks"
-    return Verdict(outside > MAX_OUTSIDE_SHARE, reason)
+    return Verdict(outside > MAX_OUTSIDE_FRACTION, reason)
 
 
 RULES: dict[str, Rule] = {

@@ -27,13 +27,15 @@ SAMPLED_HEIGHT_PIXELS = 400
 """Height to which images half as high again are shrunk: triangles are then two or three pixels
 wide."""
 MIN_FACING_COSINE = 0.35
-"""Between normal and line of sight; below it, a triangle is too oblique to have a color."""
+"""Least cosine between normal and line of sight; below it, a triangle is too oblique to have a
+color."""
 MASK_EDGE_PIXELS = 3
 """Along the mask's edge, colors are mixed with the background."""
-TRACKING_ERROR_SHARE = 0.01
-"""Foreground up to this share of the image's height beside the mesh counts as tracking error."""
-DEPTH_TOLERANCE_SHARE = 0.003
-"""How far a visible triangle's center may lie behind the nearest one, as a share of its depth."""
+TRACKING_ERROR_FRACTION = 0.01
+"""Foreground up to this fraction of the image's height beside the mesh counts as tracking error."""
+DEPTH_TOLERANCE_FRACTION = 0.003
+"""How far a visible triangle's center may lie behind the nearest one, as a fraction of its
+depth."""
 
 
 @dataclass(frozen=True)
@@ -52,7 +54,7 @@ class Samples:
     mesh, outside  (S,) pixels of the mesh, and those of them that lie outside the mask
     background, background_spread  (S, 3) mean color outside the mask, and (S,) root mean square
                deviation from it in levels of 255
-    white      (S,) share of the pixels beside the mesh that are white, with or without a mask
+    white      (S,) fraction of the pixels beside the mesh that are white, with or without a mask
     """
 
     faces: np.ndarray
@@ -143,7 +145,7 @@ def _sample_view(capture: Capture, view: View, faces: np.ndarray) -> dict[str, n
     y = np.where(inside, y, 0)
     in_front = np.where(nearest[y, x] >= 0, depths[nearest[y, x]], np.inf)
     seen = inside & (towards[faces] > MIN_FACING_COSINE)
-    seen &= depths[faces] < in_front * (1 + DEPTH_TOLERANCE_SHARE)
+    seen &= depths[faces] < in_front * (1 + DEPTH_TOLERANCE_FRACTION)
     if mask is not None:
         seen &= binary_erosion(mask > 127, iterations=MASK_EDGE_PIXELS)[y, x]
     smooth = uniform_filter(image.astype(np.float32), (3, 3, 0))
@@ -170,7 +172,7 @@ def _coverage(
 ) -> dict[str, np.ndarray]:
     """What `Samples` holds of an image's mask and of its mesh, which covers pixels (H, W) bool;
     area: pixels of the image at its own size in one of these."""
-    near = binary_dilation(covered, iterations=max(1, round(TRACKING_ERROR_SHARE * len(image))))
+    near = binary_dilation(covered, iterations=max(1, round(TRACKING_ERROR_FRACTION * len(image))))
     white = (image >= WHITE_LEVEL).all(axis=2)[~near].mean() if not near.all() else 1.0
     row = {"white": np.array(white), "background": np.full(3, np.nan)}
     if mask is None:

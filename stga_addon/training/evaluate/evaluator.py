@@ -19,21 +19,22 @@ from .forecast import (
 from .metrics import EvaluationView, Quality, evaluate
 
 EVALUATIONS = 10
-"""Evaluations over a budget in iterations, at fixed shares of it, so that runs are reproducible."""
-EVALUATION_SHARE = 0.04
-"""Largest share that evaluations, without the last one, add to a budget in seconds."""
+"""Evaluations over a budget in iterations, at fixed fractions of it, so that runs are
+reproducible."""
+EVALUATION_FRACTION = 0.04
+"""Largest fraction that evaluations, without the last one, add to a budget in seconds."""
 MAX_EVALUATIONS = 40
 """Evaluations over a budget in seconds, even where they cost little."""
 RENDERING_COST = 0.5
-"""Time to render a view, as a share of the time to train it; estimates the first evaluation."""
+"""Time to render a view, as a fraction of the time to train it; estimates the first evaluation."""
 
 
 @dataclass(frozen=True)
 class Spent:
-    """Trained so far: share of the budget (may exceed 1), seconds without evaluations, steps; the
-    seconds of training that are left, at the speed so far, NaN before the first step."""
+    """Trained so far: fraction of the budget (may exceed 1), seconds without evaluations, steps;
+    the seconds of training that are left, at the speed so far, NaN before the first step."""
 
-    share: float
+    fraction: float
     seconds: float
     iterations: int
     left_s: float
@@ -62,20 +63,20 @@ class Evaluator:
     def is_due(self, spent: Spent) -> bool:
         """Whether to evaluate now; at the end of the budget there is an evaluation anyway."""
         budget_s = self.settings.seconds
-        if spent.share >= 1 or budget_s is None:
-            return 1 > spent.share >= (self.count + 1) / EVALUATIONS
+        if spent.fraction >= 1 or budget_s is None:
+            return 1 > spent.fraction >= (self.count + 1) / EVALUATIONS
         cost = RENDERING_COST * len(self.views) * spent.seconds / spent.iterations
         last = 0.0
         if self.lines:
             cost = float(self.lines[-1]["evaluation_s"])
             last = float(self.lines[-1]["seconds"])
-        return spent.seconds - last >= max(budget_s / MAX_EVALUATIONS, cost / EVALUATION_SHARE)
+        return spent.seconds - last >= max(budget_s / MAX_EVALUATIONS, cost / EVALUATION_FRACTION)
 
     def is_finished(self, spent: Spent) -> bool:
         """Whether the budget is spent, the target reached, or a stop at a flat curve due."""
         target = self.settings.target_psnr
         reached = target is not None and any(psnr >= target for _, psnr in curve_of(self.lines))
-        if spent.share >= 1 or reached:
+        if spent.fraction >= 1 or reached:
             return True
         return self.settings.stop_when_flat and flat_since(self.lines) is not None
 
@@ -97,7 +98,7 @@ class Evaluator:
 
     def record(self, line: Mapping[str, Any], spent: Spent) -> dict[str, Any]:
         """Remember an evaluation; returns its metrics line with a forecast, to be checked later."""
-        self.count = max(self.count, int(min(1.0, spent.share) * EVALUATIONS))
+        self.count = max(self.count, int(min(1.0, spent.fraction) * EVALUATIONS))
         self.lines.append(dict(line))
         lines = self.lines
         elapsed = spent.seconds

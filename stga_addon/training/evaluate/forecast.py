@@ -24,21 +24,21 @@ UNMATCHED = "psnr_unmatched"
 """Key of PSNR without fitted exposure, in the lines whose "psnr" is with it."""
 MIN_EVALUATIONS = 4
 """Evaluations that a forecast needs."""
-FITTED_SINCE_SHARE = 2 / 3
-"""The fit uses evaluations since this share of the time: before, the phase is a steeper one."""
+FITTED_SINCE_FRACTION = 2 / 3
+"""The fit uses evaluations since this fraction of the time: before, the phase is a steeper one."""
 FORECAST_CONFIDENCE = 0.8
-"""Share of forecasts that should hold within their error."""
+"""Fraction of forecasts that should hold within their error."""
 PRIOR_RELATIVE_ERROR = 0.8
-"""Error of a forecast without earlier ones to check, as a share of the gain that it promises."""
+"""Error of a forecast without earlier ones to check, as a fraction of the gain that it promises."""
 EVALUATION_NOISE_DB = 0.05
 """Typical scatter between evaluations."""
 HORIZONS_S = (5, 10, 20, 30, 60, 120, 300, 600, 1200, 1800, 3600)
 """Time spans that a forecast may look ahead."""
 MIN_GAIN_DB = 0.02
 """Smaller gains count as none."""
-MIN_REMAINING_SHARE = 0.2
-"""A target is called reachable if at least this share of the total predicted gain lies beyond it;
-with less, reaching it would take more than 25 times the time trained."""
+MIN_REMAINING_FRACTION = 0.2
+"""A target is called reachable if at least this fraction of the total predicted gain lies beyond
+it; with less, reaching it would take more than 25 times the time trained."""
 MIN_TIME_FACTOR = 1.1
 """Lower bound of the predicted time to a target, as a multiple of the time trained; applies where
 the fit already lies above the target but no evaluation does."""
@@ -93,7 +93,7 @@ def plateau_start(curve: Curve) -> float | None:
     """Time of the best evaluation if PSNR has stopped rising, else None: at least MIN_EVALUATIONS
     in the last third of the time gained less than MIN_GAIN_DB."""
     t, psnr = np.array(curve, np.float64).reshape(-1, 2).T
-    late = np.flatnonzero(t > FITTED_SINCE_SHARE * t[-1:])
+    late = np.flatnonzero(t > FITTED_SINCE_FRACTION * t[-1:])
     if len(late) < MIN_EVALUATIONS or len(late) == len(t):
         return None
     before = psnr[: late[0]]
@@ -211,8 +211,8 @@ def explain_missed_target(curve: Curve, target: float) -> str:
     now, gain, _ = _fit(t, psnr, np.inf)
     if gain <= 0:
         return f"{missed}: the curve does not rise steadily"
-    remaining = 1 - (target - now) / gain  # share of the total gain that lies beyond the target
-    if remaining < MIN_REMAINING_SHARE:
+    remaining = 1 - (target - now) / gain  # fraction of the total gain that lies beyond the target
+    if remaining < MIN_REMAINING_FRACTION:
         advice = "only a much longer budget might reach it"
         if target > now + (1 + PRIOR_RELATIVE_ERROR) * gain:
             advice = "more time alone would not reach it"
@@ -232,7 +232,7 @@ def _can_fit(curve: Curve) -> bool:
 def _fit(t: np.ndarray, psnr: np.ndarray, factor: float) -> tuple[float, float, float]:
     """The model's PSNR at t[-1], its gain from there to factor·t[-1], and the scatter of the
     evaluations around it; the slope is the Theil–Sen estimator, robust to outliers."""
-    first_late = np.searchsorted(t, FITTED_SINCE_SHARE * t[-1])
+    first_late = np.searchsorted(t, FITTED_SINCE_FRACTION * t[-1])
     late = slice(min(int(first_late), len(t) - MIN_EVALUATIONS), None)
     x = -np.sqrt(t[-1] / t[late])
     y = psnr[late]

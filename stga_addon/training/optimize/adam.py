@@ -22,7 +22,8 @@ PLAIN = AdamOptions(*map(np.float32, (0.9, 0.999, 1e-15, 0.0, 1.0)))
 
 
 def adam_options(settings: TrainingSettings, camera: Camera) -> AdamOptions:
-    """For gradients of a mean over an image's values: ε is a share of the weight of one of them."""
+    """Adam's options for gradients of a mean over an image's values: ε is a fraction of the weight
+    of one value."""
     return PLAIN._replace(
         beta2=np.float32(settings.adam_beta2),
         epsilon=np.float32(settings.adam_epsilon / (3 * camera.width * camera.height)),
@@ -37,8 +38,8 @@ def color_step(
     options: AdamOptions = PLAIN,
     sh_degree: int = MAX_SH_DEGREE,
 ) -> ColorStep:
-    """How `render_backward` steps `sh`: at the rate "sh", its view-dependent part at "sh_rest";
-    coefficients of higher degrees than the one in use are left alone."""
+    """How `render_backward` steps `sh`: its constant part at the rate "sh", its view-dependent part
+    at "sh_rest". Coefficients of higher degrees than the one in use do not change."""
     tables = state.tables["sh"]
     tables.rates[:3] = rates["sh"]
     tables.rates[3:] = rates["sh_rest"]
@@ -87,7 +88,7 @@ def step_offsets(
         is_color = offset.target == COLOR
         arrays = (own.value, own.value, own.first, own.second, own.average)
         tables = [array.reshape(len(own.steps), 9) for array in arrays]
-        rate = np.full(9, offset.rate_share * rates[offset.rate], np.float32)
+        rate = np.full(9, offset.rate_fraction * rates[offset.rate], np.float32)
         step_offset(
             state.rows_by_triangle,
             stepped,

@@ -1,5 +1,5 @@
-"""Tracking by a finished avatar: pose and expression such that the avatar, its splats fixed, looks
-like the images.
+"""Tracking by a finished avatar: finds the pose and expression at which the avatar, with its splats
+fixed, looks like the images.
 
 Landmarks and dense tracking know a face in general; an avatar knows its person, with hair and
 teeth. The gradient is that of the training's own loss, passed from the splats to the head's
@@ -43,7 +43,7 @@ from ...light.harmonics import basis
 from ...progress import Cancelled
 from ...render.render import render_avatar, to_uint8
 from ...tracking import appearance, solve
-from ...tracking.appearance import NOISE_LEVELS, POINT_SHARE
+from ...tracking.appearance import NOISE_LEVELS, POINT_FRACTION
 from ...tracking.head_model import HeadModel
 from ...tracking.posed_points import PosedPoints
 from ...tracking.seen_surface import in_sight, surface_points
@@ -53,7 +53,7 @@ from .backend import RenderOptions
 from .cpu_backend import CpuBackend
 from .frames import FrameStore
 from .image_preparation import MAX_GAIN, image_preparation
-from .outlines import TOLERANCE_SHARE
+from .outlines import TOLERANCE_FRACTION
 from .state import state_of_avatar
 
 RENDERINGS = 7
@@ -69,7 +69,7 @@ PYRAMID_PX = (50, 100, 200)
 pattern on clothes misleads by more than its width."""
 PYRAMID_RENDERINGS = 20
 """Renderings at each height of the pyramid."""
-TRACKED_SHARE = 0.2
+TRACKED_FRACTION = 0.2
 """Images that the avatar tracks its head in while it trains, as a fraction of the run's iterations:
 a long take must not track for longer than it trains."""
 MIN_TRACKED_TIMESTEPS = 12
@@ -93,10 +93,10 @@ TRANSLATION_SIGMA_M = 0.02
 SCALE_SIGMA = 0.02
 """Standard deviation of the head's relative size from its start."""
 LEAST_GAIN = 1e-3
-"""Share of the loss by which a step has to lower it; one that does not is the last, but not where
-the first timestep of another recording is sought: it leads all others."""
+"""Fraction of the loss by which a step has to lower it; one that does not is the last, but not
+where the first timestep of another recording is sought: it leads all others."""
 FIRST_STEP = 0.01
-"""Length of the first step, as a share of the one down a loss as steep as the points say."""
+"""Length of the first step, as a fraction of the one down a loss as steep as the points say."""
 MAX_MOVE_M = 0.05
 """Mean distance of the mesh's vertices by which an avatar may move a tracked head at one timestep:
 2.5 standard deviations of its place. Farther, the image does not show the head that was trained."""
@@ -106,12 +106,11 @@ MISS_LEVELS = 24
 
 @dataclass(frozen=True)
 class AvatarTracking:
-    """Parameters (T, E + 18) of timesteps; (T,) the share of the head's pixels whose colors the
-    avatar misses by more than MISS_LEVELS, NaN where it tracks for the first time; (T, 3) by how
-    much the torso is shifted, of `torso_shapes`; (T,) the head's scale, where it was sought; and
-    (T, P, P) inverse covariances of what was sought: expressions, the torso's shift, scale, pose;
-    (T, 0, 0) of the recording that the avatar was trained on.
-    """
+    """Parameters (T, E + 18) of timesteps; (T,) the fraction of the head's pixels whose colors the
+    avatar misses by more than MISS_LEVELS, NaN where it tracks for the first time; (T, 3) the
+    torso's shift, see `torso_shapes`; (T,) the head's scale, where it was solved for; and (T, P, P)
+    inverse covariances of the solved parameters: expressions, the torso's shift, scale, pose; (T,
+    0, 0) for the recording that the avatar was trained on."""
 
     timesteps: tuple[int, ...]
     parameters: np.ndarray
@@ -189,7 +188,8 @@ class RefinedTracking:
         return with_sequence(capture, replace(self.sequence, frame=self.frame))
 
     def take(self, found: AvatarTracking, timesteps: Sequence[int]) -> list[int]:
-        """Give timesteps what was found: those left out in between change as their neighbors.
+        """Apply tracked parameters at some timesteps; the timesteps between them change as their
+        neighbors do.
 
         Returns the timesteps that stay as they were, because their head went farther than tracking
         can be wrong.
@@ -249,19 +249,19 @@ class TrainedAvatar(NamedTuple):
 def tracked_timesteps(
     settings: TrainingSettings, capture: Capture, timesteps: Sequence[int]
 ) -> list[int]:
-    """Those that an avatar tracks while it is trained for a number of iterations, evenly spread: as
-    many as TRACKED_SHARE allows. With a budget in seconds, all: time decides."""
+    """Timesteps, evenly spread, that an avatar tracks while it is trained for a number of
+    iterations: as many as TRACKED_FRACTION allows. With a budget in seconds, all: time decides."""
     if settings.iterations is None:
         return list(timesteps)
     wanted = set(timesteps)
     shown = sum(view.timestep in wanted for view in capture.all_views)
     views = min(MAX_VIEWS, max(1.0, shown / max(1, len(timesteps))))
-    most = int(TRACKED_SHARE * settings.iterations / views)
+    most = int(TRACKED_FRACTION * settings.iterations / views)
     return evenly_spread(timesteps, max(MIN_TRACKED_TIMESTEPS, most))
 
 
 def not_moved(timesteps: Sequence[int]) -> str:
-    """The sentence about timesteps that `RefinedTracking.take` has left as they were."""
+    """The sentence about timesteps that `RefinedTracking.take` did not move."""
     listed = ", ".join(map(str, timesteps))
     return (
         f"the head would move by more than {100 * MAX_MOVE_M:.0f} cm at timesteps {listed}, "
@@ -316,13 +316,13 @@ def track_by_avatar(
 
 
 def normal_images(mesh: np.ndarray, faces: np.ndarray, shown: ArrayPair) -> ArrayPair:
-    """Where a camera sees a mesh, (H, W) bool, and the surface's unit normals there (H, W, 3);
-    shown: `rasterize` of the mesh."""
-    triangles, share = shown
+    """Pixels (H, W) bool that show a mesh, and the surface's unit normals there (H, W, 3); shown:
+    `rasterize` of the mesh."""
+    triangles, fraction = shown
     seen = triangles >= 0
     found = np.zeros((*triangles.shape, 3))
     corners = vertex_normals(mesh, faces)[faces[triangles[seen]]]
-    own = np.einsum("nk,nkc->nc", share[seen], corners)
+    own = np.einsum("nk,nkc->nc", fraction[seen], corners)
     found[seen] = unit(own)
     return seen, found
 
@@ -342,7 +342,8 @@ Shots = Sequence[tuple[View, np.ndarray]]
 
 
 class _Effort(NamedTuple):
-    """Renderings of each view at most; share of the loss by which a step has to lower it."""
+    """Largest number of renderings of each view; fraction of the loss by which a step has to lower
+    it."""
 
     renderings: int
     least_gain: float
@@ -435,7 +436,8 @@ class _Tracker:
         effort: _Effort,
         first: tuple[float, np.ndarray] | None = None,
     ) -> tuple[np.ndarray, np.ndarray]:
-        """From `start` on, and their inverse covariance; first: the start's `_loss`, if known."""
+        """Parameters after minimization from `start`, and their inverse covariance; first: the
+        start's `_loss`, if known."""
         precision = self._precision()  # of the change from those that were tracked
         known = self._gauss_newton(start, shots) + np.diag(precision)
         root = np.linalg.cholesky(known)
@@ -494,12 +496,13 @@ class _Tracker:
         return shots
 
     def _cut(self, view: View, image: np.ndarray) -> np.ndarray:
-        """The image (H, W, 3) uint8 and, where no mask tells what lies behind the head, the avatar
-        itself beyond the mesh that is being tried: what is not known pulls nowhere. Cut by the mesh
-        that was tracked, the image would say that the head has not moved."""
+        """The image (H, W, 3) uint8. Where no mask shows the background, pixels beyond the mesh
+        that is being tried are replaced by the avatar's, so that the unknown background has no
+        gradient. If the tracked mesh cut the image, the image would show that the head has not
+        moved."""
         if not self._cuts or view.mask is not None:
             return image
-        margin = max(1, round(TOLERANCE_SHARE * len(image)))
+        margin = max(1, round(TOLERANCE_FRACTION * len(image)))
         inside = silhouette(self._mesh(view.timestep), self._capture.faces, view.camera)
         inside = binary_erosion(inside, iterations=margin)
         drawn = to_uint8(self._backend.render(view, self._options))
@@ -537,7 +540,7 @@ class _Tracker:
         self._values = values
         self._frames.clear()
         shots = [(view, self._cut(view, image)) for view, image in shots]
-        weights = [POINT_SHARE * image.size / 3 / (NOISE_LEVELS / 255) for _, image in shots]
+        weights = [POINT_FRACTION * image.size / 3 / (NOISE_LEVELS / 255) for _, image in shots]
         total, by_vertex = self._backend.mesh_gradient(shots, weights, self._options)
         offset = self._sequence.frame(shots[0][0].timestep).dynamic_offset
         return total, parameters_gradient(self._head.model, frame_of(values, offset), by_vertex)
@@ -560,7 +563,7 @@ class _Tracker:
             # (N, 3 channels, 2)
             slopes = np.stack(appearance.sampled(list(level.gradient), pixels), -1)
             moved = slopes @ appearance.projection_derivative(level.camera, at) / NOISE_LEVELS
-            weight = POINT_SHARE * (cosine * seen)[:, None] * appearance.CHANNEL_WEIGHTS
+            weight = POINT_FRACTION * (cosine * seen)[:, None] * appearance.CHANNEL_WEIGHTS
             curvature += np.einsum("nc,ncx,ncy->nxy", weight, moved, moved)
         _, jacobian = self._posed_points.linearized(values[:-RIGID_SIZE], values[-RIGID_SIZE:])
         flat = jacobian.reshape(-1, jacobian.shape[2])

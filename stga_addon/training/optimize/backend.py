@@ -1,4 +1,5 @@
-"""The seam between what decides about splats, on the host, and what holds and trains them."""
+"""The interface between decisions about splats, made on the host, and the backend that holds and
+trains them."""
 
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass

@@ -72,9 +72,9 @@ class CpuBackend:
             )
         if settings.unseen_opacity_weight and state.has_unseen:
             weight = settings.unseen_opacity_weight / len(state)
-            share = state.unseen_share
+            fraction = state.unseen_share
             optimizer.opacity_weight(
-                rows, state.parameters.opacity, share, weight, gradients.opacity
+                rows, state.parameters.opacity, fraction, weight, gradients.opacity
             )
         if settings.distance_weight:
             limit = np.float32(settings.distance_limit) * self._frames.units
@@ -199,10 +199,10 @@ class CpuBackend:
                 more = offset_of(offset.value, store.signals(timestep)(signal))
                 change[target] = change[target] + more
         # around the mesh's own origins, in the unit of the scaled frames
-        growth = np.exp(change[SCALE][:, :1].astype(np.float64))
-        shift = (change[POSITION] / growth).astype(np.float32)
+        factor = np.exp(change[SCALE][:, :1].astype(np.float64))
+        shift = (change[POSITION] / factor).astype(np.float32)
         splats = splats._replace(xyz=splats.xyz + shift[face])
-        scaled = replace(frames, scale=frames.scale * growth[:, 0])
+        scaled = replace(frames, scale=frames.scale * factor[:, 0])
         moved = self._moved_frames(timestep)
         total = 0.0
         by_frame = np.zeros((len(frames.scale), 7))

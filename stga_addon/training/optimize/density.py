@@ -31,19 +31,20 @@ class DensityControl:
 
     interval       iterations between turns, 0: never; default 100, as in 3D Gaussian Splatting
                    (Kerbl et al. 2023), 200 with the paper's settings
-    span           shares of the budget from and before which it works; default (0.1, 0.6)
-    split_share    largest share of the splats that is split at a time; default 0.2, ours
-    growth         most splats that are added, as a share of the whole lattice and the hull points;
-                   default 0.25, ours
+    span           fractions of the budget from and before which it works; default (0.1, 0.6)
+    split_share    largest fraction of the splats that is split at a time; default 0.2, ours
+    growth         most splats that are added, as a fraction of the whole lattice and the
+                   visual-hull points; default 0.25, ours
     seed           of the halves' distances
-    region_share   `split_share` where a region is trained, as in a refinement, which has few turns
+    region_fraction   `split_share` where a region is trained, as in a refinement, which has few
+                      turns
     min_opacity    0…1, below which splats are pruned; ours, 0.005 in 3D Gaussian
                    Splatting. A half has twice as much at least
     narrowing      by which halves are narrower than their parent along its longest axis; 1.6 in 3D
                    Gaussian Splatting, along all
     distance       of a half's center from its parent's, in the parent's standard deviation along
                    that axis; ours
-    jitter         standard deviation of that distance, as a share of it; ours
+    jitter         standard deviation of that distance, as a fraction of it; ours
     """
 
     interval: int
@@ -51,7 +52,7 @@ class DensityControl:
     split_share: float
     growth: float
     seed: int
-    region_share: float = 0.1
+    region_fraction: float = 0.1
     min_opacity: float = 0.02
     narrowing: float = 1.6
     distance: float = 0.5
@@ -88,7 +89,7 @@ class DensityControl:
         backend.assign(every, {"screen_gradient": 0.0, "gradient_count": 0.0})
 
     def score(self, columns: Mapping[str, np.ndarray]) -> np.ndarray:
-        """(N,) how much detail is missing at each splat: its mean screen gradient."""
+        """(N,) mean screen gradient of each splat: how much detail is missing there."""
         gradient = columns["screen_gradient"] / np.maximum(columns["gradient_count"], 1)
         return np.asarray(gradient)
 
@@ -97,9 +98,9 @@ class DensityControl:
     ) -> np.ndarray:
         """Rows of the highest scores among those within (N,) bool, the highest first."""
         score = np.where(within, self.score(columns), 0)
-        share = self.split_share if schedule.region is None else self.region_share
+        fraction = self.split_share if schedule.region is None else self.region_fraction
         room = round(schedule.initial_count * (1 + self.growth)) - len(score)
-        count = max(0, min(room, int(share * within.sum())))
+        count = max(0, min(room, int(fraction * within.sum())))
         rows = np.argsort(-score, kind="stable")[:count]
         return np.asarray(rows[score[rows] > 0])
 

@@ -12,14 +12,14 @@ from .step_hook import Schedule
 MIN_WEIGHT_PX = 0.5
 """An unbound splat that fills less than this in every view serves the rays of a few pixels, and
 floats in the air for all other cameras."""
-MIN_WEIGHT_SHARE = 0.4
+MIN_WEIGHT_FRACTION = 0.4
 """The same limit as a fraction of the median of unbound splats, which fill much after a short
 training."""
 PRUNING_TIMES = (0.6, 0.8)
 """Fractions of the budget at which splats are measured; what is trained afterwards fills in."""
 MAX_WEIGHED_VIEWS = 40
 """Training views, spread over all, in which splats are measured, at most."""
-WEIGHED_SHARE = 0.03
+WEIGHED_FRACTION = 0.03
 """Views that are measured, as a fraction of all iterations, which take longer."""
 
 
@@ -44,10 +44,10 @@ class FloaterPruning:
         if not weighed.any():
             return
         iterations = schedule.iteration / schedule.progress
-        count = min(MAX_WEIGHED_VIEWS, max(1, round(WEIGHED_SHARE * iterations)))
+        count = min(MAX_WEIGHED_VIEWS, max(1, round(WEIGHED_FRACTION * iterations)))
         views = evenly_spread(self.capture.views["train"], count)
         weight = np.max([backend.blend_weights(view) for view in views], axis=0)
         median = np.median(weight[columns["unbound"]])
-        floaters = weighed & (weight < max(MIN_WEIGHT_PX, MIN_WEIGHT_SHARE * median))
+        floaters = weighed & (weight < max(MIN_WEIGHT_PX, MIN_WEIGHT_FRACTION * median))
         if floaters.any():
             backend.keep(~floaters)

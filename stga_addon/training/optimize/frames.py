@@ -24,22 +24,23 @@ CACHE_BYTES = 256e6
 BYTES_PER_TRIANGLE = 170
 """Memory of a triangle's frame, deformation, signals and corners in a timestep."""
 
-UNSEEN_LIMIT_SHARE = 0.35
+UNSEEN_LIMIT_FRACTION = 0.35
 """Fraction of the scale limit that remains on triangles that face away from all cameras: a large
 splat that serves an outline floats in the air for other cameras."""
-BORDER_LIMIT_SHARE = 0.2
+BORDER_LIMIT_FRACTION = 0.2
 """Fraction of the scale limit that remains where the mesh ends."""
-BORDER_DISTANCE_SHARE = 0.6
+BORDER_DISTANCE_FRACTION = 0.6
 """Fraction of the distance limit that remains where the mesh ends."""
-LAYER_HEIGHT_SHARE = 0.8
+LAYER_HEIGHT_FRACTION = 0.8
 """Height of the middle of hair's outer layer as a fraction of the height of hair, before half of
 its thickness is taken off."""
 LAYER_VOXELS = 0.5
-"""What is taken off that height, half of the layer's thickness."""
+"""Subtracted from that height: half of the layer's thickness."""
 SKIN_DEPTH = 0.1
 """Depth of the layer on skin, in the triangles' units, so that it does not stand out."""
 HEAD_RADIUS_VOXELS = 22.5
-"""By which hair's outer layer is wider than the scalp."""
+"""Radius of the head, by which hair's height is divided: hair's outer layer is wider than the scalp
+by that ratio."""
 
 
 @dataclass
@@ -56,7 +57,7 @@ class FrameStore:
     neutral   face frames of the neutral mesh
     units     (F,) float32: the length that a triangle's limits are multiples of, in local units
     unit_lengths  (F,) meters of the neutral mesh that are a triangle's local unit
-    voxel     meters between hull points
+    voxel     meters between visual-hull points
     surface   what training views tell of the triangles
     """
 
@@ -92,17 +93,19 @@ class FrameStore:
         """Largest scale (2, F) float32 of bound and of unbound splats, in local units."""
         unbound = settings.unbound_scale_limit * self.voxel / self.unit_lengths
         limits = np.stack([settings.scale_limit * self.units, unbound])
-        limits *= 1 - (1 - UNSEEN_LIMIT_SHARE) * self.surface.turned_away
-        limits[0, self.surface.border] *= BORDER_LIMIT_SHARE  # a torso's unbound splats follow it
+        limits *= 1 - (1 - UNSEEN_LIMIT_FRACTION) * self.surface.turned_away
+        limits[0, self.surface.border] *= (
+            BORDER_LIMIT_FRACTION  # a torso's unbound splats follow it
+        )
         limits[0] = np.maximum(limits[0], self.hair_layer_scale)
         return np.asarray(limits, np.float32)
 
-    def stray_limits(self, settings: TrainingSettings) -> np.ndarray:
+    def outlier_limits(self, settings: TrainingSettings) -> np.ndarray:
         """How far (F,) float32 bound splats may lie from the middle of their triangle, in local
         units: on the scalp as far as hair reaches."""
-        share = np.where(self.surface.border, BORDER_DISTANCE_SHARE, 1.0)
+        fraction = np.where(self.surface.border, BORDER_DISTANCE_FRACTION, 1.0)
         hair = self.surface.hair_height / self.unit_lengths
-        return np.asarray(settings.stray_limit * self.units * share + hair, np.float32)
+        return np.asarray(settings.stray_limit * self.units * fraction + hair, np.float32)
 
     @cached_property
     def sides(self) -> UnseenSides:
@@ -116,20 +119,20 @@ class FrameStore:
     def layer_height(self) -> np.ndarray:
         """(F,) of the middle of hair's outer layer over each triangle, just below the surface on
         skin, in local units."""
-        inner = LAYER_HEIGHT_SHARE * self.surface.hair_height - LAYER_VOXELS * self.voxel
+        inner = LAYER_HEIGHT_FRACTION * self.surface.hair_height - LAYER_VOXELS * self.voxel
         skin = -SKIN_DEPTH * self.units
         return np.asarray(np.where(inner > 0, inner / self.unit_lengths, skin), np.float32)
 
     @cached_property
     def hair_layer_scale(self) -> np.ndarray:
-        """(F,) of hair's outer layer where it faces away from all cameras, in local units: smaller,
-        it has gaps, through which the head's inside shows. 0 elsewhere."""
+        """(F,) scale of hair's outer layer where it faces away from all cameras, in local units; 0
+        elsewhere. A smaller one would leave gaps that show the head's inside."""
         is_hair = self.surface.hidden & (self.surface.hair_height > 0)
         return np.asarray(np.where(is_hair, SCALE * self.units * self.hair_widening, 0))
 
     @cached_property
     def hair_widening(self) -> np.ndarray:
-        """(F,) how much wider hair's outer layer is than the scalp; 1 elsewhere."""
+        """(F,) ratio of the width of hair's outer layer to the scalp's; 1 elsewhere."""
         return np.asarray(1 + self.surface.hair_height / (HEAD_RADIUS_VOXELS * self.voxel))
 
     def of(self, timestep: int) -> FaceFrames:

@@ -1,5 +1,5 @@
-"""Opaque layers that training begins with where views show nothing: hidden skin and hair, what lies
-behind lids and in the mouth, and the occlusion layer."""
+"""Opaque layers that training adds where views show nothing: on hidden skin and hair, behind lids
+and in the mouth, and the occlusion layer."""
 
 from dataclasses import replace
 
@@ -26,7 +26,7 @@ OCCLUSION_OPACITY = 5.0
 """Logit of the opacity of the occlusion layer."""
 CELL_WIDTH = 0.6
 """Least standard deviation of the occlusion layer's splats, in cells."""
-BESIDE_LID_SHARE = 0.6
+BESIDE_LID_FRACTION = 0.6
 """Fraction of the scale of the layer under lids that it has at their edges and in the mouth, where
 it would stand out beside the eye and the lips."""
 BORDER_INSET = 0.6
@@ -35,8 +35,8 @@ a lattice of order 1; a finer one reaches less beyond."""
 
 
 def above_unseen_hair(frames: FrameStore, splats: Splats) -> np.ndarray:
-    """(N,) bool: unbound splats that stand higher than hair which faces no camera. Masks from
-    in front do not end the hull behind a head: what stands there hangs in the air off-axis."""
+    """(N,) bool: unbound splats above hair that no camera faces. Masks from the front do not limit
+    the hull behind a head, so these splats would hang in the air in off-axis views."""
     surface = frames.surface
     top = (surface.hair_height + frames.voxel) / frames.unit_lengths
     height = splats.xyz[:, NORMAL_AXIS[frames.convention]]
@@ -45,8 +45,9 @@ def above_unseen_hair(frames: FrameStore, splats: Splats) -> np.ndarray:
 
 
 def hidden_splats(frames: FrameStore, settings: TrainingSettings) -> Splats:
-    """A dense opaque layer on the `closed` triangles, in which no view splits splats: on skin and
-    clothes, or where the outer layer of hair is, of strands where no outline shows it."""
+    """A dense opaque layer on the `closed` triangles, where no view splits splats: on skin and
+    clothes, or at the outer layer of hair, where it consists of strands unless an outline shows
+    them."""
     surface = frames.surface
     hair = UnseenHair(frames)
     order = hidden_order(frames)
@@ -85,30 +86,30 @@ def layer_on(
 
 
 def hidden_order(frames: FrameStore) -> np.ndarray:
-    """(F,) order of the hidden layer's lattice, the higher the larger the triangles: colors and
-    ends of the mesh would be as coarse as these."""
+    """(F,) order of the hidden layer's lattice, which rises with the triangle's size: on large
+    triangles, colors and the mesh's end would be coarse otherwise."""
     spacing = HIDDEN_SPACING_VOXELS * frames.voxel
     order = np.ceil(frames.units * frames.unit_lengths / spacing)
     return np.clip(order, 1, MAX_HIDDEN_ORDER).astype(int)
 
 
 def border_inset(surface: Surface, order: np.ndarray) -> np.ndarray:
-    """(F,) share of the size that the hidden layer, lattices of these orders (F,), has on each
-    triangle."""
+    """(F,) fraction of each triangle's size that the hidden layer, lattices of these orders (F,),
+    covers."""
     inset = 1 - (1 - BORDER_INSET) / np.maximum(order, 1) ** 2
     return np.where(surface.border, inset, 1.0)
 
 
 def splats_behind(frames: FrameStore, sh_degree: int) -> Splats:
-    """The opaque layer under lids, whose own splats, trained on open eyes, would leave gaps when
-    they close, and the `occlusion_layer`."""
+    """The opaque layer under lids, and the `occlusion_layer`. The lids' splats are trained on open
+    eyes and would leave gaps when the eyes close."""
     surface = frames.surface
-    inner = inner_layer(frames, sh_degree)
+    inner = occluding_splats(frames, sh_degree)
     has_inner = (surface.lids & ~surface.closed) | frames.occlusion_layer.triangles
     return inner.rows(has_inner[inner.face])
 
 
-def inner_layer(frames: FrameStore, sh_degree: int = 0) -> Splats:
+def occluding_splats(frames: FrameStore, sh_degree: int = 0) -> Splats:
     """One splat in its plausible color, sorted by triangle, for each triangle of lids, under its
     middle and so large that closed lids have no gaps, of the mouth's unseen inside, and of the
     `occlusion_layer`."""
@@ -121,9 +122,9 @@ def inner_layer(frames: FrameStore, sh_degree: int = 0) -> Splats:
     )
     around = np.ones(len(capture.neutral), bool)
     around[capture.faces[~lids]] = False
-    share = np.where(around[capture.faces].all(1), 1.0, BESIDE_LID_SHARE)
+    fraction = np.where(around[capture.faces].all(1), 1.0, BESIDE_LID_FRACTION)
     layer.xyz[:, axis] = frames.layer_height
-    layer.log_scale[:] += np.log(share)[:, None]
+    layer.log_scale[:] += np.log(fraction)[:, None]
     layer.log_scale[:, axis] += np.log(HIDDEN_FLATNESS)
     behind = lattice_splats(
         occlusion.places, capture.faces, 0, sh_degree, OCCLUSION_OPACITY, frames.convention

@@ -37,9 +37,9 @@ def whole_image(height: int, width: int, bands: int | None = None) -> np.ndarray
 
 def tile_rectangles(tiles: np.ndarray, height: int, width: int) -> np.ndarray:
     """Rectangles (R, 4) of pixels around each connected group of marked tiles (rows, columns) bool,
-    the largest first; those of more rows than a thread's share, or BAND_TILES, are cut."""
-    share = -(-int(tiles.any(1).sum()) // min(threads(), PROCESSORS))
-    boxes = box_groups(tiles, max(BAND_TILES, share))
+    the largest first; those of more rows than a thread's part, or BAND_TILES, are cut."""
+    fraction = -(-int(tiles.any(1).sum()) // min(threads(), PROCESSORS))
+    boxes = box_groups(tiles, max(BAND_TILES, fraction))
     largest_first = np.argsort((boxes[:, 0] - boxes[:, 2]) * (boxes[:, 3] - boxes[:, 1]))
     return np.minimum(boxes[largest_first] * TILE, [width, height, width, height])
 
@@ -58,11 +58,11 @@ def image_gradient(
     """
     sums = np.zeros((2, 3, sum(y1 - y0 for _, y0, _, y1 in rectangles.tolist())))
     totals = np.zeros(2)
-    share = 1.0 / image.size
-    factors = np.float32(ssim_weight), np.float32(share)
+    fraction = 1.0 / image.size
+    factors = np.float32(ssim_weight), np.float32(fraction)
     image_loss(image, target, rectangles, *factors, out, sums, totals)
     l1, ssim = totals.tolist()
-    return l1 * share, ssim * share
+    return l1 * fraction, ssim * fraction
 
 
 def mean_ssim(image: np.ndarray, target: np.ndarray) -> float:

@@ -15,9 +15,9 @@ from ..settings import TrainingSettings
 
 Correction = Callable[[View, np.ndarray, np.ndarray | None], np.ndarray]
 """(view, image (H, W, 3) uint8, mask (H, W) uint8 or None) -> corrected image (H, W, 3) uint8."""
-BLUR_SHARES = (0.01, 0.05)
-"""Standard deviations of the neighborhoods that a pixel's backdrop is the mean of, as shares of the
-image's height: the larger one counts where the smaller one holds no backdrop."""
+BLUR_FRACTIONS = (0.01, 0.05)
+"""Standard deviations of the neighborhoods that a pixel's backdrop is the mean of, as fractions of
+the image's height: the larger one counts where the smaller one holds no backdrop."""
 NO_CORRECTION = np.array([[1.0, 1.0, 1.0], [0.0, 0.0, 0.0]])
 """Gain and offset by channel."""
 MAX_GAIN = 4.0
@@ -90,7 +90,7 @@ def over_color(image: np.ndarray, mask: np.ndarray, color: Sequence[float]) -> n
         cover = mask[places][:, None].astype(np.float32) / 255
         shown = cover * image[places]
         if not mask.all():
-            deviations = [max(1.0, share * len(image)) for share in BLUR_SHARES]
+            deviations = [max(1.0, fraction * len(image)) for fraction in BLUR_FRACTIONS]
             clear = (mask == 0).astype(np.uint8)
             behind = mean_around(image, clear, deviations, np.stack(places, axis=1))
             shown = np.clip(image[places] - (1 - cover) * behind, 0, 255 * cover)
@@ -110,7 +110,7 @@ def fit_exposure(
     drawn: np.ndarray,
     seen: np.ndarray,
     expected: np.ndarray | None = None,
-    share: float = EXPOSURE_PRIOR,
+    fraction: float = EXPOSURE_PRIOR,
 ) -> np.ndarray:
     """(2, 3) gain and offset of each channel with which colors (3, N) become those of a camera.
 
@@ -122,7 +122,7 @@ def fit_exposure(
     for _ in range(EXPOSURE_ITERATIONS if drawn.size else 0):
         gain, offset = found[..., None]
         weight = (1 + ((seen - gain * drawn - offset) / EXPOSURE_SCALE) ** 2) ** -2.0
-        prior = share * weight.sum(1) * np.stack([drawn.var(1) + 1e-4, np.ones(3)])
+        prior = fraction * weight.sum(1) * np.stack([drawn.var(1) + 1e-4, np.ones(3)])
         found = fit_lines(drawn, seen, prior, expected, weight)
         found[0] = np.clip(found[0], 1 / MAX_GAIN, MAX_GAIN)
     return found

@@ -1,6 +1,6 @@
 """The splats that training starts with: a lattice on the mesh, colored as the images show it, and
-hull points for what the mesh does not cover (hair, shoulders, clothes); a flat layer for a single
-camera."""
+visual-hull points for what the mesh does not cover (hair, shoulders, clothes); a flat layer for a
+single camera."""
 
 from collections.abc import Sequence
 
@@ -39,31 +39,32 @@ MAX_LATER_VIEWS = 2
 """Views of each of these timesteps."""
 MIDDLE_GRAY = 0.5
 """Brightness, 0…1, of splats that no view shows."""
-MIN_ONE_SIDED_SHARE = 0.05
+MIN_ONE_SIDED_FRACTION = 0.05
 """Area of the triangles that no view shows, but whose mirror images are visible, as a fraction of
 the mesh; below it, the cameras stand on both sides of the head."""
-MAX_ASYMMETRY_SHARE = 0.015
+MAX_ASYMMETRY_FRACTION = 0.015
 """Largest median distance of a symmetric mesh from its mirror image, of its diagonal."""
 VOXEL_SIZE_M = 0.004
-"""Distance between hull points, on a mesh of a head's size."""
-MIN_VOXEL_SIZE_SHARE = 1 / 200
+"""Distance between visual-hull points, on a mesh of a head's size."""
+MIN_VOXEL_SIZE_FRACTION = 1 / 200
 """Of the mesh's diagonal, so that the grid of a mesh in millimeters fits into memory."""
 MIN_MESH_DISTANCE_M = 0.006
 """Points nearer to the mesh are covered by the mesh's own splats."""
-GRID_MARGIN_SHARE = 0.25
-"""Margin of the grid around the mesh's bounding box, as a share of its diagonal."""
+GRID_MARGIN_FRACTION = 0.25
+"""Margin of the grid around the mesh's bounding box, as a fraction of its diagonal."""
 BLOCK_VOXELS = 5
 """Edge of the blocks that are carved before single voxels are, in voxels."""
-MIN_VISIBLE_SHARE = 0.25
-"""Share of the views in whose image a voxel must lie; it must be foreground in all of these."""
-MIN_EXPOSED_SHARE = 0.125
-"""Share of the views in which a voxel must be visible beside the mesh. Otherwise, volumes behind
+MIN_VISIBLE_FRACTION = 0.25
+"""Fraction of the views in whose image a voxel must lie; it must be foreground in all of these."""
+MIN_EXPOSED_FRACTION = 0.125
+"""Fraction of the views in which a voxel must be visible beside the mesh. Otherwise, volumes behind
 the head that no view contradicts would become floaters in other views."""
-SILHOUETTE_TOLERANCE_SHARE = 0.01
-"""Error of the tracked silhouette, as a share of the image height."""
+SILHOUETTE_TOLERANCE_FRACTION = 0.01
+"""Error of the tracked silhouette, as a fraction of the image height."""
 FEW_CAMERAS = 4
-"""Up to which a torso's visual hull bulges by centimeters: `TorsoPoints` are better."""
-CONTINUED_SHARE = 0.4
+"""Largest number of cameras with which a torso's visual hull bulges by centimeters: `TorsoPoints`
+are better."""
+CONTINUED_FRACTION = 0.4
 """How far a torso is continued beyond the image of a single camera, as a fraction of the image's
 width."""
 CONTINUED_OPACITY = 3.0
@@ -75,7 +76,7 @@ SEEN_SPREAD = 0.5
 
 
 def initial_splats(capture: Capture, settings: TrainingSettings) -> Splats:
-    """The lattice on the neutral mesh and, if the settings say so, hull points of the first
+    """The lattice on the neutral mesh and, if the settings say so, visual-hull points of the first
     training timestep (`flat_points` where a single camera shows it)."""
     convention = settings.convention
     degree = settings.sh_degree
@@ -92,27 +93,27 @@ def initial_splats(capture: Capture, settings: TrainingSettings) -> Splats:
     if settings.hull_points and len(first) == 1:
         parts.append(flat_points(capture, first[0], convention, degree, settings.torso))
     elif settings.hull_points:
-        parts.append(hull_points(capture, first, convention, degree, settings.torso))
+        parts.append(visual_hull_points(capture, first, convention, degree, settings.torso))
     return joined(parts)
 
 
 def unseen_share(capture: Capture, convention: str, splats: Splats) -> np.ndarray:
-    """Share (N,) of the cameras of the first training timestep in whose image an unbound splat does
+    """Fraction (N,) of the first training timestep's cameras in whose image an unbound splat does
     not lie.
 
-    0 for bound splats. A hull point outside of most images is held by few masks only, and often in
-    the air.
+    0 for bound splats. A visual-hull point outside of most images is held by few masks only, and
+    often in the air.
     """
-    share = np.zeros(len(splats), np.float32)
+    fraction = np.zeros(len(splats), np.float32)
     unbound = np.flatnonzero(splats.unbound)
     if not len(unbound):
-        return share
+        return fraction
     first = capture.views["train"][0].timestep
     views = [view for view in capture.views["train"] if view.timestep == first]
     frames = face_frames(capture.mesh(first), capture.faces, capture.neutral, convention)
     points = to_world(splats.rows(unbound), frames).xyz.astype(np.float64)
-    share[unbound] = 1 - np.mean([pixels_of(points, view.camera)[2] for view in views], axis=0)
-    return share
+    fraction[unbound] = 1 - np.mean([pixels_of(points, view.camera)[2] for view in views], axis=0)
+    return fraction
 
 
 def triangle_colors(capture: Capture, views: Sequence[View]) -> np.ndarray:
@@ -141,7 +142,7 @@ def triangle_colors(capture: Capture, views: Sequence[View]) -> np.ndarray:
         return np.full(color.shape, MIDDLE_GRAY)
     hidden, mirrored = mirror_images(capture, ~shown, shown)
     area = np.linalg.norm(triangle_normals(capture.neutral[capture.faces]), axis=1)
-    if area[hidden].sum() >= MIN_ONE_SIDED_SHARE * area.sum():
+    if area[hidden].sum() >= MIN_ONE_SIDED_FRACTION * area.sum():
         color[hidden] = color[mirrored]
         shown[hidden] = True
     centers = capture.neutral[capture.faces].mean(1)
@@ -186,12 +187,14 @@ def mirror_images(
     centers = capture.neutral[capture.faces].mean(1)
     distance, partner = cKDTree(centers).query(mirrored(centers))
     rows = np.flatnonzero(hidden & shown[partner])
-    if np.median(distance) > MAX_ASYMMETRY_SHARE * np.linalg.norm(np.ptp(capture.neutral, axis=0)):
+    if np.median(distance) > MAX_ASYMMETRY_FRACTION * np.linalg.norm(
+        np.ptp(capture.neutral, axis=0)
+    ):
         rows = rows[:0]
     return rows, partner[rows]
 
 
-def hull_points(
+def visual_hull_points(
     capture: Capture, views: Sequence[View], convention: str, sh_degree: int, torso: bool = False
 ) -> Splats:
     """Unbound splats on the surface of the visual hull of one timestep, outside the mesh.
@@ -248,7 +251,7 @@ def flat_points(
     pixels, depth = camera.project(samples)
     step = max(1.0, voxel * (camera.fl_x + camera.fl_y) / 2 / float(np.median(depth)))
     neck = capture.flame if torso else None
-    beyond = 0.0 if neck is None else round(CONTINUED_SHARE * camera.width / step) * step
+    beyond = 0.0 if neck is None else round(CONTINUED_FRACTION * camera.width / step) * step
     rows, columns = np.meshgrid(
         np.arange(step / 2, camera.height + beyond, step),
         np.arange(step / 2 - beyond, camera.width + beyond, step),
@@ -279,16 +282,16 @@ def flat_points(
 
 
 def _without_face(capture: Capture) -> np.ndarray:
-    """(F,) bool: triangles that are not the face's; all of a mesh that has no others, or of which
-    that is not known."""
+    """(F,) bool: triangles outside the face; all of a mesh that consists of a face or whose face is
+    not known."""
     at = head_coordinates(capture)
     others = np.ones(len(capture.faces), bool) if at is None else ~face_of(at)
     return others if others.any() else ~others
 
 
 def voxel_size(mesh: np.ndarray) -> float:
-    """Distance in meters between hull points around a mesh (V, 3)."""
-    return max(VOXEL_SIZE_M, MIN_VOXEL_SIZE_SHARE * float(np.linalg.norm(np.ptp(mesh, axis=0))))
+    """Distance in meters between visual-hull points around a mesh (V, 3)."""
+    return max(VOXEL_SIZE_M, MIN_VOXEL_SIZE_FRACTION * float(np.linalg.norm(np.ptp(mesh, axis=0))))
 
 
 def _nearest_triangle(
@@ -303,8 +306,8 @@ def _nearest_triangle(
 def _followed(
     capture: Capture, timestep: int, points: np.ndarray, torso: bool
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Distance (N,) to the mesh, and triangle (N,) of each point: the nearest, of those below the
-    base of the neck with `torso` the nearest of the torso."""
+    """Distance (N,) to the mesh, and the nearest triangle (N,) of each point. With `torso`, points
+    below the base of the neck take the torso's nearest triangle."""
     mesh = capture.mesh(timestep)
     distance, face = _nearest_triangle(points, mesh, capture.faces)
     if torso and capture.flame is not None:
@@ -327,10 +330,10 @@ def _hull_surface(
     """Grid points (N, 3) on the surface of the visual hull that are visible beside the mesh."""
     low = mesh.min(0)
     high = mesh.max(0)
-    margin = GRID_MARGIN_SHARE * np.linalg.norm(high - low)
+    margin = GRID_MARGIN_FRACTION * np.linalg.norm(high - low)
     axes = [np.arange(a - margin, b + margin, voxel) for a, b in zip(low, high, strict=True)]
     foreground = [_foreground(view) for view in views]
-    min_visible = max(2, MIN_VISIBLE_SHARE * len(views))
+    min_visible = max(2, MIN_VISIBLE_FRACTION * len(views))
     # first blocks are carved, whose bounding sphere lies in the background of an image, or outside
     # of too many images
     centers = [axis[::BLOCK_VOXELS] + (BLOCK_VOXELS - 1) / 2 * voxel for axis in axes]
@@ -376,12 +379,14 @@ def _hull_surface(
     solid = within.copy()
     solid[within] = inside & (visible >= min_visible)
     surface = (solid & ~binary_erosion(solid))[within]
-    return np.asarray(points[surface & (exposed >= np.maximum(1, MIN_EXPOSED_SHARE * len(views)))])
+    return np.asarray(
+        points[surface & (exposed >= np.maximum(1, MIN_EXPOSED_FRACTION * len(views)))]
+    )
 
 
 def _silhouette(mesh: np.ndarray, faces: np.ndarray, camera: Camera) -> np.ndarray:
     """(H, W) bool: pixels that the mesh covers, dilated by the tolerance."""
-    tolerance = max(1, round(SILHOUETTE_TOLERANCE_SHARE * camera.height))
+    tolerance = max(1, round(SILHOUETTE_TOLERANCE_FRACTION * camera.height))
     return np.asarray(binary_dilation(silhouette(mesh, faces, camera), iterations=tolerance))
 
 

@@ -1,5 +1,5 @@
-"""An opaque layer behind the surface, which off-axis views would look through: images make a head's
-sides transparent where it is tracked too wide, and a torso may have a front only."""
+"""An opaque layer behind the surface, which blocks off-axis views: images make a head's sides
+transparent where the tracked mesh is too wide, and a torso may have a front only."""
 
 from dataclasses import dataclass
 
@@ -40,16 +40,16 @@ DEPTH_VOXELS = 0.5
 """Step between the depths at which the layer may lie."""
 MAX_DEPTHS = 10
 """Depths that are tried; the first that lies within the masks is taken."""
-MARGIN_SHARE = 0.015
+MARGIN_FRACTION = 0.015
 """How far the layer must lie within the masks, as a fraction of their height."""
-BACK_MARGIN_SHARE = 0.03
+BACK_MARGIN_FRACTION = 0.03
 """The same of a torso's back, whose triangles are large."""
 SPLAT_REACH = 1.8
 """Three standard deviations of a splat, in sides of a square of two triangles, or in cells where
 these are larger."""
 BEHIND_DEG = (-30.0, 0.0, 30.0)
 """Directions from behind from which the inner side of a torso's front may show."""
-BACK_SHARE = 0.5
+BACK_FRACTION = 0.5
 """Depth of a back, an ellipse, as a fraction of half of the torso's width."""
 BACK_LEVELS = 0.5
 """Height over which a torso's width and color are measured, in distances of the eyes from the
@@ -106,10 +106,10 @@ def occlusion_layer(surface: Surface, sides: UnseenSides) -> OcclusionLayer:
 def _behind_sides(
     surface: Surface, at: HeadCoordinates, allowed: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """One triangle in each cell, of those `allowed` (F,) bool that an off-axis view may look
-    through, as (F,) bool: what is `_grazed`; neck and clothes, as what a collar or a fold hides
-    from the cameras need not be opaque for them. The neutral vertices (V, 3), moved inside the head
-    until masks cover them."""
+    """One triangle in each cell of those `allowed` (F,) bool that an off-axis view may look
+    through, as (F,) bool: the triangles of `_grazed`, and of neck and clothes, because images need
+    not make opaque what a collar or a fold hides from the cameras. And the neutral vertices (V, 3),
+    moved inside the head until masks cover them."""
     faces = surface.capture.faces
     neutral = np.asarray(surface.capture.neutral, np.float64)
     voxel = voxel_size(neutral)
@@ -120,7 +120,7 @@ def _behind_sides(
     depths = voxel * DEPTH_VOXELS * np.arange(1, MAX_DEPTHS + 1)
     offsets = np.zeros((len(rows), len(depths), 3))
     offsets[:, :, NORMAL_AXIS["stga"]] = -depths
-    fits = ~surface.beside_masks(rows, offsets, -MARGIN_SHARE)
+    fits = ~surface.beside_masks(rows, offsets, -MARGIN_FRACTION)
     large = clothes[rows]
     fits[large] &= ~_reaches_beside(surface, rows[large], offsets[large])
     deepest = np.zeros(len(neutral))
@@ -146,8 +146,8 @@ def _reaches_beside(surface: Surface, rows: np.ndarray, offsets: np.ndarray) -> 
 
 
 def _grazed(surface: Surface, at: HeadCoordinates) -> np.ndarray:
-    """(F,) bool: what no camera sees well, of head and neck but for the face, up to an angle from
-    straight ahead."""
+    """(F,) bool: triangles of head and neck, without the face and up to an angle from straight
+    ahead, that no camera sees well."""
     limit = GRAZED_COSINE
     angle_deg = FACE_ANGLE_DEG
     if surface.filmed_along is not None:
@@ -169,8 +169,8 @@ def _is_off_border(surface: Surface) -> np.ndarray:
 
 
 def _open_front(surface: Surface, at: HeadCoordinates) -> np.ndarray:
-    """(F,) bool: triangles of a torso whose inner side shows from behind, but for what sticks out
-    of masks. A bust, which ends soon, has none."""
+    """(F,) bool: triangles of a torso whose inner side is visible from behind, except those that
+    stick out of masks. A bust, which is short, has none."""
     across, _, ahead = at.axes
     front = np.zeros(len(surface.outside), bool)
     for angle in np.radians(BEHIND_DEG):
@@ -203,7 +203,7 @@ def _back(
     points = np.concatenate([center, center + reach], axis=1)
     away = points - neutral[faces[rows]].mean(1, keepdims=True)
     offsets = np.einsum("nji,nkj->nki", turned, away)
-    fits = ~surface.beside_masks(rows, offsets[:, :1], -BACK_MARGIN_SHARE)[:, 0]
+    fits = ~surface.beside_masks(rows, offsets[:, :1], -BACK_MARGIN_FRACTION)[:, 0]
     fits &= ~surface.beside_masks(rows, offsets[:, 1:]).any(1)
     front[rows] = fits
     return front, places, median_color[fits]
@@ -233,7 +233,7 @@ def _round_back(
     for row, (x, y) in enumerate((places[vertices] - at.eyes) @ np.stack([across, up], 1)):
         _, middle, half = around(y)
         beside = min(abs(x - middle) / half, 1)
-        behind[row] = BACK_SHARE * half * np.sqrt(1 - beside**2)
+        behind[row] = BACK_FRACTION * half * np.sqrt(1 - beside**2)
     behind += BACK_GAP_VOXELS * voxel_size(places)
     places[vertices] -= behind[:, None] * ahead
     median_color = np.empty((len(level), 3))

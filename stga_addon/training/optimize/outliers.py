@@ -12,19 +12,19 @@ from .step_hook import Schedule
 class OutlierReset:
     """Moves bound splats farther than a limit from their triangle's origin to a fraction of it.
 
-    The paper moves them onto the origin: share = 0. Adam's first moment of the position is reset.
-    The second moment is kept: with it at zero and the step count of the row, which all its
+    The paper moves them onto the origin: fraction = 0. Adam's first moment of the position is
+    reset. The second moment is kept: with it at zero and the step count of the row, which all its
     parameters share, in the thousands, the bias correction would make the next step 3.2 times as
     long as the learning rate (0.1 / √0.001).
 
     interval  iterations between calls; 0: never
     limit     (F,) float32 in local units
-    share     0…1
+    fraction  0…1
     """
 
     interval: int
     limit: np.ndarray
-    share: float
+    fraction: float
 
     def prepare(self) -> None:
         """Nothing is found out once."""
@@ -39,6 +39,6 @@ class OutlierReset:
         allowed = limit[columns["face"]]
         outliers = np.flatnonzero(~columns["unbound"] & (distance > allowed))
         # Rounding must not leave them just beyond the limit, or they would be outliers again.
-        factor = (self.share * (1 - 1e-6) * allowed[outliers] / distance[outliers])[:, None]
+        factor = (self.fraction * (1 - 1e-6) * allowed[outliers] / distance[outliers])[:, None]
         near = np.where(factor > 0, factor * xyz[outliers], 0)
         backend.assign(outliers, {"parameters/xyz": near, "average/xyz": near, "first/xyz": 0.0})

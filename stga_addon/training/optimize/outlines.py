@@ -1,5 +1,5 @@
-"""Pruning of splats outside of the masks: a needle beside the hair, which a few images call for and
-many others push back, would survive the training."""
+"""Pruning of splats outside of the masks: without it, a needle beside the hair that a few images
+call for, and many others reject, would survive the training."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -22,17 +22,17 @@ MAX_OUTLINES = 16
 """Views whose masks are read."""
 MAX_OUTLINE_HEIGHT_PX = 400
 """Height to which higher masks are shrunk."""
-TOLERANCE_SHARE = 0.01
-"""Error of masks and tracking, as a share of the image height."""
-MAX_OUTSIDE_SHARE = 0.5
-"""Share of the outlines in whose image a point lies, that it may lie outside of."""
+TOLERANCE_FRACTION = 0.01
+"""Error of masks and tracking, as a fraction of the image height."""
+MAX_OUTSIDE_FRACTION = 0.5
+"""Fraction of the outlines in whose image a point lies, that it may lie outside of."""
 Coefficients = dict[str, np.ndarray]
 """Driven offset -> (F, 3, 3) float32."""
 
 
 @dataclass(frozen=True)
 class Outline:
-    """What a mask leaves clear, with a margin, (H, W) bool; camera: of that size."""
+    """Pixels (H, W) bool that a mask with a margin does not cover; camera: of that size."""
 
     timestep: int
     camera: Camera
@@ -54,11 +54,11 @@ def read_outlines(capture: Capture, seed: int) -> list[Outline]:
     return outlines
 
 
-def clear_of(covered: np.ndarray, margin_share: float = TOLERANCE_SHARE) -> np.ndarray:
-    """(H, W) bool: pixels that a mask, which covers these (H, W) bool, leaves clear, but for a
-    margin beside it; with a negative one, also a margin within it. margin_share: of the height."""
-    margin = max(1, round(abs(margin_share) * len(covered)))
-    moved = binary_dilation if margin_share > 0 else binary_erosion
+def clear_of(covered: np.ndarray, margin_fraction: float = TOLERANCE_FRACTION) -> np.ndarray:
+    """(H, W) bool: pixels that a mask (H, W) bool does not cover, without a margin beside it; a
+    negative margin includes pixels within it. margin_fraction: fraction of the height."""
+    margin = max(1, round(abs(margin_fraction) * len(covered)))
+    moved = binary_dilation if margin_fraction > 0 else binary_erosion
     return np.asarray(~moved(covered, iterations=margin))
 
 
@@ -114,7 +114,7 @@ def is_outside(
     rows = np.arange(len(face), dtype=np.int32)
     for n, outline in enumerate(outlines):
         left = len(outlines) - n  # without those that all of these could not take for outside
-        rows = rows[outside[rows] + left > MAX_OUTSIDE_SHARE * (seen[rows] + left)]
+        rows = rows[outside[rows] + left > MAX_OUTSIDE_FRACTION * (seen[rows] + left)]
         in_camera = frames_in_camera(frames(outline.timestep), outline.camera)
         count_marked(rows, xyz, face, in_camera, outline.clear, seen, outside)
-    return np.asarray(outside > MAX_OUTSIDE_SHARE * seen)
+    return np.asarray(outside > MAX_OUTSIDE_FRACTION * seen)

@@ -19,7 +19,7 @@ from ...raster.cpu.rasterize import (
     render_backward,
     render_forward,
 )
-from ...raster.cpu.threads import Team
+from ...raster.cpu.threads import ThreadPool
 from ...render.device import adapter_name
 from ...worker.launch import is_preparing
 from . import adam
@@ -75,9 +75,9 @@ def _render() -> None:
 
 def _step() -> None:
     """Limits, replacement of the background, loss and Adam; and what helpers run."""
-    team = Team(1)
-    team.start()
-    team.dismiss()
+    pool = ThreadPool(1)
+    pool.start()
+    pool.dismiss()
     image = np.zeros((3, 16, 16), np.float32)
     target = np.zeros((16, 16, 3), np.uint8)
     mask = np.zeros((16, 16), np.uint8)

@@ -1,4 +1,4 @@
-"""Which seen triangles of a head unseen ones look like: hair has hair, a neck a neck."""
+"""Which visible triangles of a head unseen ones look like: hair like hair, a neck like a neck."""
 
 from collections.abc import Collection
 from dataclasses import dataclass
@@ -17,10 +17,10 @@ SCALP_ELEVATION_DEG = 38.0
 NECK_ANGLE_DEG = 60.0
 """Angle from straight ahead behind which the neck begins."""
 EYES_TO_MIDDLE = 1.35
-"""How far the head's middle lies behind the eyes, in distances of the eyes from the mouth, the unit
-of all levels here."""
+"""Distance of the head's middle behind the eyes, in distances of the eyes from the mouth, the unit
+of all lengths here."""
 BROWS_OVER_EYES = 0.15
-"""How far the head's middle lies above the eyes."""
+"""Height of the head's middle above the eyes: that of the brows."""
 BROWS_LEVEL = 0.45
 """Height of the brows over the eyes."""
 JAW_LEVEL = -0.5
@@ -74,13 +74,13 @@ TONGUE_REACH = 0.5
 DEPTHS = (0.0, 0.25, 0.45, 0.75)
 """Distances from the visible lips at which the colors of a mouth's inside are given: it gets darker
 inward."""
-LIP_SHARE = 0.75
+LIP_FRACTION = 0.75
 """Brightness of the lining at the lips, as a fraction of theirs."""
-GUM_SHARES = np.array([[0.43, 0.24, 0.22], [0.22, 0.1, 0.09], [0.12, 0.04, 0.03]])
+GUM_FRACTIONS = np.array([[0.43, 0.24, 0.22], [0.22, 0.1, 0.09], [0.12, 0.04, 0.03]])
 """Color of gums and tongue at the later DEPTHS, as fractions of the eyes' white."""
 TOOTH_DEPTHS = (0.05, 0.15, 0.5)
 """Distances from the visible lips at which the brightness of teeth is given."""
-TOOTH_SHARES = (0.92, 0.74, 0.23)
+TOOTH_FRACTIONS = (0.92, 0.74, 0.23)
 """Brightness of teeth at TOOTH_DEPTHS, as fractions of the eyes' white."""
 WHITE_QUANTILE = 0.8
 """Quantile of the eyeballs' brightness above which triangles are white."""
@@ -150,8 +150,8 @@ def face_of(at: HeadCoordinates) -> np.ndarray:
 def kinds_of(
     at: HeadCoordinates, is_outside: np.ndarray, has_long_hair: bool = False
 ) -> dict[str, np.ndarray]:
-    """Kind -> (F,) bool: scalp, which includes the back of a neck that long hair hides, and body,
-    which is neck and shoulders; unseen parts of each look as seen ones."""
+    """Kind -> (F,) bool: "scalp", which includes the back of a neck that long hair hides, and
+    "body", neck and shoulders. Unseen parts of each kind look like visible ones of it."""
     angle = np.degrees(np.abs(at.azimuth))
     elevation = np.degrees(at.elevation)
     ear = ears_of(at)
@@ -164,8 +164,8 @@ def kinds_of(
     return {"scalp": scalp, "body": body}
 
 
-def hanging_share(at: HeadCoordinates) -> np.ndarray:
-    """(F,) share of its full distance from the neck that long hair has: 0 at the hairline and
+def hanging_fraction(at: HeadCoordinates) -> np.ndarray:
+    """(F,) fraction of its full distance from the neck that long hair has: 0 at the hairline and
     beside the neck, 1 behind it and further down."""
     angle = np.degrees(np.abs(at.azimuth))
     below = np.interp(angle, HAIRLINE_DEG, HAIRLINE) - at.level
@@ -183,8 +183,8 @@ def nearest_rows(known: np.ndarray, places: np.ndarray, count: int) -> np.ndarra
 def hairy_triangles(
     sources: np.ndarray, centers: np.ndarray, color: np.ndarray, skin: np.ndarray
 ) -> np.ndarray:
-    """Those of a scalp's triangles whose color differs from skin in another way than skin's own
-    shades (K, 3) do; all where no skin is known."""
+    """Triangles of a scalp whose color differs from skin by more than skin's shades (K, 3) do among
+    each other; all of them where no skin is known."""
     if not len(sources) or not len(skin):
         return sources
     median = np.median(skin, axis=0)
@@ -199,10 +199,10 @@ def hairy_triangles(
 def inside_colors(
     capture: Capture, color: np.ndarray, shown: np.ndarray, inside: np.ndarray
 ) -> np.ndarray:
-    """Colors (M, 3) of triangles `inside` (F,) bool, which show where mouth or lids move as in no
-    view: teeth, gums and lining near the mouth, in the light on the person's lips and eyes; what
-    lids hide of eyeballs, as white as the rest; elsewhere as the skin around. color, shown: of
-    `mean_colors`."""
+    """Colors (M, 3) of triangles `inside` (F,) bool that no view shows and that motion of mouth or
+    lids exposes: teeth, gums and lining near the mouth, in the light on the person's lips and eyes;
+    the hidden part of eyeballs, as white as the visible part; elsewhere the color of the skin
+    around. color, shown: of `mean_colors`."""
     faces = capture.faces
     centers = np.asarray(capture.neutral)[faces].mean(1)
     skin = skin_of(capture)
@@ -226,10 +226,10 @@ def inside_colors(
     in_mouth = np.isin(part, part[~skin & (away < TONGUE_REACH)])
     within = inside & (in_mouth | lining_of(capture))
     depth = cKDTree(centers[lips]).query(centers[within])[0] / at.unit
-    colors = np.vstack([LIP_SHARE * np.median(color[lips], axis=0), GUM_SHARES * white])
+    colors = np.vstack([LIP_FRACTION * np.median(color[lips], axis=0), GUM_FRACTIONS * white])
     inner = np.stack([np.interp(depth, DEPTHS, channel) for channel in colors.T], axis=1)
     teeth = teeth_of(capture)[within]
-    inner[teeth] = np.interp(depth[teeth], TOOTH_DEPTHS, TOOTH_SHARES)[:, None] * white
+    inner[teeth] = np.interp(depth[teeth], TOOTH_DEPTHS, TOOTH_FRACTIONS)[:, None] * white
     found[within[inside]] = inner
     return np.asarray(found)
 
@@ -249,8 +249,8 @@ def skin_of(capture: Capture) -> np.ndarray:
 
 
 def lining_of(capture: Capture) -> np.ndarray:
-    """(F,) bool: skin so near to the middle of the mouth that it may line it; none where it is not
-    known where that is."""
+    """(F,) bool: skin so near to the middle of the mouth that it may line it; none where the mouth
+    is not known."""
     at = head_coordinates(capture)
     if at is None:
         return np.zeros(len(capture.faces), bool)

@@ -45,7 +45,7 @@ class TrainState:
              made
     steps    (N,) int32 Adam steps per row
     face, unbound    (N,) int32 and (N,) bool, as in `Splats`
-    unseen_share     (N,) float32 share of the cameras that did not see an unbound splat where
+    unseen_share     (N,) float32 fraction of the cameras that did not see an unbound splat where
                      training put it or its parent; 0 for bound splats
     screen_gradient  (N,) float32 sum of screen-space gradient lengths since the latest density
                      control
@@ -87,7 +87,7 @@ class TrainState:
 
     @cached_property
     def has_unseen(self) -> bool:
-        """Whether a splat has a share of cameras that did not see it."""
+        """Whether a splat has a fraction of cameras that did not see it."""
         return bool(self.unseen_share.any())
 
     def splats(self, averaged: bool = False) -> Splats:
@@ -105,9 +105,9 @@ def new_state(splats: Splats, unseen_share: np.ndarray | None = None) -> TrainSt
     """A copy of the splats with zero moments; unseen_share (N,), zeros if None."""
     values = [getattr(splats, name).astype(np.float32, order="C") for name in Parameters._fields]
     gradients, first, second = (Parameters(*map(np.zeros_like, values)) for _ in range(3))
-    share, screen, count = np.zeros((3, len(splats)), np.float32)
+    fraction, screen, count = np.zeros((3, len(splats)), np.float32)
     if unseen_share is not None:
-        share = unseen_share.astype(np.float32)
+        fraction = unseen_share.astype(np.float32)
     average = Parameters(*(v.copy() for v in values))
     steps = np.zeros(len(splats), np.int32)
     return TrainState(
@@ -119,7 +119,7 @@ def new_state(splats: Splats, unseen_share: np.ndarray | None = None) -> TrainSt
         steps,
         splats.face.astype(np.int32),
         splats.unbound.astype(bool),
-        share,
+        fraction,
         screen,
         count,
     )

@@ -14,7 +14,7 @@ class Schedule:
 
     iteration      steps made so far
     progress       fraction of the budget spent, 0…1
-    initial_count  splats of the whole lattice and hull points
+    initial_count  splats of the whole lattice and visual-hull points
     region         (F,) bool: the triangles whose splats may change; None for all
     before         progress at the step before
     """

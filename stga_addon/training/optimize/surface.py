@@ -1,4 +1,4 @@
-"""What training views tell of a head's surface: which triangles face a camera, where something
+"""What training views show of a head's surface: which triangles face a camera, where something
 stands above them, where the mesh ends."""
 
 from functools import cached_property
@@ -22,14 +22,14 @@ from ...capture.mesh_geometry import (
 from ...capture.model import Capture, View, evenly_spread, views_by_timestep
 from ...flame.model import torso_faces
 from ...flame.quaternions import unit
-from ...tracking.solve import lid_shares
+from ...tracking.solve import lid_fractions
 from .initial_splats import FEW_CAMERAS, SAMPLED_HEIGHT_PIXELS, mirrored, voxel_size
-from .outlines import TOLERANCE_SHARE, clear_of
+from .outlines import TOLERANCE_FRACTION, clear_of
 from .semantic_regions import (
     JAW_LEVEL,
     TORSO_HEIGHT,
     HeadCoordinates,
-    hanging_share,
+    hanging_fraction,
     head_coordinates,
     kinds_of,
     nearest_rows,
@@ -45,9 +45,9 @@ UNSEEN_COSINE = -0.1
 """Cosine between a triangle and the camera that it faces most below which not even hair stands in
 an outline."""
 HIDDEN_COSINE = 0.0
-"""Below it, the triangle is hidden."""
+"""Cosine below which a triangle is hidden."""
 GRAZING_COSINE = 0.2
-"""Below it, the triangle fills little of any image; many outlines tell its shape."""
+"""Cosine below which a triangle fills little of any image; many outlines show its shape."""
 OUTLINE_VIEWS = 16
 """Views, spread over all, whose outlines are measured."""
 OUTLINE_COSINE = 0.2
@@ -58,7 +58,7 @@ OUTSIDE_DISTANCE = 4.0
 """Their distance from the head's center, in its radius."""
 OUTSIDE_WIDTH = 2.2
 """Width of their images, in the head's radius."""
-OUTSIDE_PIXEL_SHARE = 0.7
+OUTSIDE_PIXEL_FRACTION = 0.7
 """Side of their pixels, in sides of a square as large as the median triangle."""
 OUTSIDE_SIDES_PX = (240, 2000)
 """Least and largest side of their images, however far a torso reaches."""
@@ -76,7 +76,7 @@ BLINKS = ("eyeBlinkLeft", "eyeBlinkRight")
 """Expressions that pull lids out of their folds."""
 LID_STRETCH = 1.8
 """Factor by which these lengthen a lid's triangle at least."""
-CLOSED_SHARE = 0.6
+CLOSED_FRACTION = 0.6
 """Weight of these expressions at which tracked eyes count as closed."""
 MIN_SQUARED_AREA = 1e-28
 """Squared area in m⁴ below which a triangle has none."""
@@ -89,13 +89,13 @@ NECK_SIDE_DEG = 95.0
 NECK_HALF_WIDTH_DEG = 45.0
 """Half the angle over which they are measured."""
 HANGING_HEIGHT = 0.4
-"""How far long hair stands out from there, in distances of the eyes from the mouth."""
+"""Height of long hair above the scalp, in distances of the eyes from the mouth."""
 MAX_APART_DEG = 8.0
-"""Between the directions in which one camera sees a triangle, and their mean."""
-MAX_BESIDE_SHARE = 0.1
-"""Share of the masks in whose image a point lies, that it may lie outside of."""
-MAX_STICKING_SHARE = 0.05
-"""Of the triangles of a torso that is where images show a body."""
+"""Largest angle between the directions in which one camera sees a triangle, and their mean."""
+MAX_BESIDE_FRACTION = 0.1
+"""Fraction of the masks in whose image a point lies, that it may lie outside of."""
+MAX_STICKING_FRACTION = 0.05
+"""Largest fraction of a torso's triangles that lie outside masks where images show a body."""
 STANDING_VOXELS = 1.5
 """Height from which hair or a collar stands out."""
 STANDING_REACH_VOXELS = 4
@@ -147,7 +147,7 @@ class Surface:
         corners = neutral[self.capture.faces]
         normal = triangle_normals(corners)
         square = np.sqrt(np.median(np.linalg.norm(normal, axis=1)) / 2)
-        wanted = OUTSIDE_WIDTH * radius / max(OUTSIDE_PIXEL_SHARE * square, 1e-9)
+        wanted = OUTSIDE_WIDTH * radius / max(OUTSIDE_PIXEL_FRACTION * square, 1e-9)
         side = int(np.clip(wanted, *OUTSIDE_SIDES_PX))
         eye = center + OUTSIDE_DISTANCE * radius * direction
         focal_length = side * OUTSIDE_DISTANCE / OUTSIDE_WIDTH
@@ -178,14 +178,13 @@ class Surface:
 
     @cached_property
     def turned_away(self) -> np.ndarray:
-        """(F,) share in 0…1 of what views do not tell of a triangle's shape, by how it faces them:
-        1 where it faces away, 0 where it does not graze."""
+        """(F,) in 0…1, by how training views face a triangle: 1 where it faces away and its shape
+        is unknown, 0 where no view grazes it."""
         return self.turned_from(GRAZING_COSINE)
 
     def turned_from(self, cosine: float, away: float = UNSEEN_COSINE) -> np.ndarray:
-        """(F,) 1 where a triangle faces all cameras by less than the cosine `away`, less the better
-        it faces one, 0 from the other cosine on; with many cameras, which outlines tell enough, 1
-        or 0."""
+        """(F,) 1 where a triangle faces all cameras by less than the cosine `away`; it falls to 0
+        at the other cosine. With many cameras, whose outlines show the shape, only 1 or 0."""
         if not self.has_few_cameras:
             return np.asarray(self.facing <= UNSEEN_COSINE, float)
         return np.asarray(np.interp(self.facing, (away, cosine), (1, 0)))
@@ -198,14 +197,14 @@ class Surface:
 
     @cached_property
     def closed(self) -> np.ndarray:
-        """(F,) bool: hidden triangles that an opaque layer closes, so that no view shines through:
-        all but those that stick out."""
+        """(F,) bool: hidden triangles that an opaque layer closes, so that no view shows the
+        inside: all except those that stick out."""
         return np.asarray(self.hidden & ~self.sticks_out)
 
     @cached_property
     def sticks_out(self) -> np.ndarray:
-        """(F,) bool: triangles that lie outside of some masks, or touch one that does, as an ear of
-        a head whose turn is tracked too far: they have to be as transparent as images say."""
+        """(F,) bool: triangles outside of some masks, or next to such a triangle, as an ear of a
+        head that was tracked with too much turn: they must be as transparent as images show."""
         every = np.arange(len(self.outside))
         touched = np.zeros(len(self.capture.neutral), bool)
         touched[self.capture.faces[self.beside_masks(every, np.zeros((1, 3)))[:, 0]]] = True
@@ -215,14 +214,14 @@ class Surface:
         self,
         rows: np.ndarray,
         offsets: np.ndarray,
-        margin_share: float = TOLERANCE_SHARE,
+        margin_fraction: float = TOLERANCE_FRACTION,
     ) -> np.ndarray:
         """(N, K) bool: whether K points at each of the triangles `rows` (N,) lie outside of more
-        than MAX_BESIDE_SHARE of the masks in whose image they lie.
+        than MAX_BESIDE_FRACTION of the masks in whose image they lie.
 
         offsets       (N, K, 3) or (K, 3) of the points from the triangles' origins, meters along
                       the axes of their frames
-        margin_share  of the masks' height, which still counts as inside; negative: as outside
+        margin_fraction  of the masks' height, which still counts as inside; negative: as outside
         """
         offsets = np.broadcast_to(offsets, (len(rows), *offsets.shape[-2:]))
         seen, beside = np.zeros((2, *offsets.shape[:2]), int)
@@ -231,8 +230,10 @@ class Surface:
             points += frames.origin[rows, None]
             column, row, within = pixels_of(points.reshape(-1, 3), view.camera)
             seen += within.reshape(seen.shape)
-            beside += (within & clear_of(mask > 127, margin_share)[row, column]).reshape(seen.shape)
-        return np.asarray(beside > MAX_BESIDE_SHARE * np.maximum(seen, 1))
+            beside += (within & clear_of(mask > 127, margin_fraction)[row, column]).reshape(
+                seen.shape
+            )
+        return np.asarray(beside > MAX_BESIDE_FRACTION * np.maximum(seen, 1))
 
     @cached_property
     def masks(self) -> list[tuple[View, np.ndarray]]:
@@ -270,8 +271,8 @@ class Surface:
         timesteps = views_by_timestep(self.capture.views["train"])
         weights = np.array([flame.frame(timestep).expr for timestep in timesteps])
         for blink, own in self._lids.items():
-            columns, shares = lid_shares(flame.model, blink.removeprefix("eyeBlink"))
-            if (weights[:, columns] @ shares).max() < CLOSED_SHARE:
+            columns, fractions = lid_fractions(flame.model, blink.removeprefix("eyeBlink"))
+            if (weights[:, columns] @ fractions).max() < CLOSED_FRACTION:
                 found |= own
         return found
 
@@ -298,8 +299,8 @@ class Surface:
 
     @cached_property
     def border(self) -> np.ndarray:
-        """(F,) bool: triangles at the longest edge of the mesh, where a bust ends; none of a torso,
-        which ends where images do."""
+        """(F,) bool: triangles at the longest edge of the mesh, where a bust ends. None for a
+        torso, whose end is outside the images."""
         faces = self.capture.faces
         count = len(self.capture.neutral)
         edges = np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
@@ -322,9 +323,9 @@ class Surface:
 
     @cached_property
     def hair_height(self) -> np.ndarray:
-        """(F,) meters that hair stands above the scalp's triangles: as measured, else as where it
-        is measured around there, on both sides of the head alike, but within masks; of long hair
-        behind the neck as beside it at least. 0 elsewhere."""
+        """(F,) meters of hair above the scalp's triangles, 0 elsewhere: as measured, else as
+        measured in the neighborhood, equal on both sides of the head, but within masks. Long hair
+        is at least as high behind the neck as beside it."""
         height = np.zeros(len(self.outside))
         scalp = np.flatnonzero(self._scalp)
         measured = scalp[self._is_measured[scalp]] if len(scalp) else scalp
@@ -335,11 +336,11 @@ class Surface:
         near = measured[nearest_rows(sources, center[scalp], AROUND) % len(measured)]
         height[scalp] = np.median(self._measured_height[near], axis=1)
         if self.at is not None and self._has_long_hair:
-            share = hanging_share(self.at)
-            hanging = self._scalp & (share > 0)
+            fraction = hanging_fraction(self.at)
+            hanging = self._scalp & (fraction > 0)
             growing = self._scalp & ~hanging
             median = np.median(height[growing]) if growing.any() else 0.0
-            height[hanging] = median + share[hanging] * (HANGING_HEIGHT * self.at.unit - median)
+            height[hanging] = median + fraction[hanging] * (HANGING_HEIGHT * self.at.unit - median)
         # one side's hair may be higher than the other's, which it is mirrored from
         offsets = np.zeros((len(scalp), HEIGHTS + 1, 3))
         offsets[:, :, NORMAL_AXIS["stga"]] = height[scalp, None] * np.linspace(1, 0, HEIGHTS + 1)
@@ -350,9 +351,9 @@ class Surface:
 
     @cached_property
     def is_flat(self) -> np.ndarray:
-        """(F,) bool: hidden triangles and, where few cameras do not tell how thick it is, skin and
-        clothes, above which no outline shows anything to stand. Not the torso where parts of it
-        stick out of masks: what images show there, as arms and hands, is elsewhere."""
+        """(F,) bool: hidden triangles and, with few cameras, skin and clothes above which no
+        outline shows anything. The torso is left out where parts of it stick out of masks: hands
+        and arms that images show there are elsewhere."""
         if self.at is None or not self.has_few_cameras:
             return self.hidden
         voxel = voxel_size(np.asarray(self.capture.neutral))
@@ -365,7 +366,7 @@ class Surface:
         if self.capture.flame is not None:
             torso = torso_faces(self.capture.flame.model)
             sticking = np.count_nonzero(self.sticks_out & torso)
-            bare &= ~(torso & (sticking > MAX_STICKING_SHARE * np.count_nonzero(torso)))
+            bare &= ~(torso & (sticking > MAX_STICKING_FRACTION * np.count_nonzero(torso)))
         return np.asarray(bare | self.hidden)
 
     @cached_property

@@ -1,5 +1,5 @@
-"""Priors of what training views tell little of: what shines through the front, and a pixel of an
-outline, would give such splats any color, size and place."""
+"""Priors for splats that training views show little of. Without them, light through the front, or a
+pixel of an outline, would give such splats any color, size and place."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -13,7 +13,7 @@ from ...avatar.splats import SH_C0, Splats
 from ...flame.quaternions import from_matrices, to_matrices
 from .backend import Backend
 from .frames import FrameStore
-from .hidden_layers import HIDDEN_OPACITY, hidden_order, inner_layer, layer_on
+from .hidden_layers import HIDDEN_OPACITY, hidden_order, layer_on, occluding_splats
 from .semantic_regions import eyeballs_of, lining_of
 from .state import parameters_and_average
 from .step_hook import Schedule
@@ -29,10 +29,10 @@ DOUBT = 0.3
 halfway to what is plausible."""
 MIN_PULL = 0.02
 """Least fraction of that way that is worth a change."""
-LEAST_WIDTH_SHARE = 0.9
+LEAST_WIDTH_FRACTION = 0.9
 """Width below which splats of the hidden layer may not shrink, as a fraction of what the lattice
 begins with."""
-LINING_SHARE = 0.5
+LINING_FRACTION = 0.5
 """Largest scale behind closed lips, as a fraction of that of a triangle's only splat."""
 EYE_DEPTH_M = 0.0005
 """Least depth of splats below the eyeballs that they are on."""
@@ -56,28 +56,28 @@ PULLED_COLUMNS = (
     "parameters/log_scale",
     *MOMENTS,
 )
-"""What is read of the splats that may be pulled."""
+"""Columns that are read of the splats that may be pulled."""
 PINNED_KINDS = ("parameters", "average", "first", "second")
 """Arrays of the splats whose color is pinned."""
 INNER_PARAMETERS = ("xyz", "rotation", "log_scale", "opacity")
-"""Parameters of the inner layer, and of the occlusion layer's end, that do not change."""
+"""Parameters of occluding splats, and of the layer where the mesh ends, that do not change."""
 
 
 @dataclass(frozen=True)
 class BoundSplats:
     """The bound splats that priors may change, as they were before the first prior.
 
-    rows       (N,) their rows in the backend
-    columns    PULLED_COLUMNS, (N, …) each
-    reference  MOMENTS of well observed splats, (M, …) each
-    is_inner   (N,) bool: splats of the `inner_layer`
+    rows          (N,) their rows in the backend
+    columns       PULLED_COLUMNS, (N, …) each
+    reference     MOMENTS of well observed splats, (M, …) each
+    is_occluding  (N,) bool: those of `occluding_splats`
     """
 
     backend: Backend
     rows: np.ndarray
     columns: Mapping[str, np.ndarray]
     reference: Mapping[str, np.ndarray]
-    is_inner: np.ndarray
+    is_occluding: np.ndarray
 
     @property
     def face(self) -> np.ndarray:
@@ -97,7 +97,7 @@ class Prior(Protocol):
 
 
 class SurfacePrior:
-    """Pulls bound splats towards what is plausible, the more the less the views tell of them.
+    """Pulls bound splats toward a prior; the pull is stronger where views determine less.
 
     How much views tell is read from Adam's second moments, root mean squares of gradients. Without
     this, its steps, which are of one length for strong and weak gradients, would let splats that
@@ -112,7 +112,7 @@ class SurfacePrior:
 
     @cached_property
     def may_be_pulled(self) -> np.ndarray:
-        """(F,) bool: triangles some of whose splats may be; of many cameras, few."""
+        """(F,) bool: triangles with splats that priors may pull; few with many cameras."""
         surface = self._surface
         sides = self._frames.sides
         may_be = sides.triangles | ~sides.shown | surface.lids | surface.is_flat
@@ -132,7 +132,7 @@ class SurfacePrior:
         reference = np.flatnonzero(well_seen if well_seen.any() else is_bound)
         moments = backend.columns(MOMENTS, reference)
         columns = backend.columns(PULLED_COLUMNS, rows)
-        splats = BoundSplats(backend, rows, columns, moments, self._is_inner(columns))
+        splats = BoundSplats(backend, rows, columns, moments, self._is_occluding(columns))
         for prior in self._priors:
             prior.apply(splats)
 
@@ -144,7 +144,7 @@ class SurfacePrior:
     def _priors(self) -> list[Prior]:
         return [prior(self._known) for prior in PRIORS]
 
-    def _is_inner(self, columns: Mapping[str, np.ndarray]) -> np.ndarray:
+    def _is_occluding(self, columns: Mapping[str, np.ndarray]) -> np.ndarray:
         """(N,) bool: the splats of the layer behind lids and sides, each the nearest to its place.
         By depth, lids' own splats would join it, as training moves them by more than the tenth of a
         millimeter that it is deep, and never leave it."""
@@ -156,9 +156,9 @@ class SurfacePrior:
         distance = np.linalg.norm(columns["parameters/xyz"][rows] - place, axis=1)
         order = np.lexsort((distance, face))
         _, first = np.unique(face[order], return_index=True)
-        is_inner = np.zeros(len(columns["face"]), bool)
-        is_inner[rows[order[first]]] = True
-        return is_inner
+        is_occluding = np.zeros(len(columns["face"]), bool)
+        is_occluding[rows[order[first]]] = True
+        return is_occluding
 
 
 class _Known:
@@ -176,12 +176,12 @@ class _Known:
 
     @cached_property
     def inner(self) -> Splats:
-        return inner_layer(self.frames)
+        return occluding_splats(self.frames)
 
 
 class PlausibleColor:
-    """What views do not show has the color of `UnseenSides`, and keeps it where no view can tell:
-    of a folded lid, views show only the edge, in the fold's shade."""
+    """Splats that views do not show take the color of `UnseenSides`, and keep it where no view
+    determines it: training views see only the shaded edge of a folded lid."""
 
     def __init__(self, known: _Known) -> None:
         self._known = known
@@ -191,23 +191,23 @@ class PlausibleColor:
         sides = known.sides
         face = splats.face
         moments = splats.columns["second/color"]
-        is_inner = splats.is_inner
-        share = doubt(moments, splats.reference["second/color"]) * ~sides.shown[face]
+        is_occluding = splats.is_occluding
+        fraction = doubt(moments, splats.reference["second/color"]) * ~sides.shown[face]
         # the avatar is made of averages, which only steps move
         is_untouched = ~sides.shown[face] & ~moments.any(1)
         is_folded = known.surface.folded_lids[face] & ~sides.shown[face]
-        is_pinned = sides.triangles[face] | is_inner | is_untouched | is_folded
+        is_pinned = sides.triangles[face] | is_occluding | is_untouched | is_folded
         colors = sides.color[face]
         hair = np.flatnonzero(sides.is_hair[face])
         if len(hair):
             shades = known.hair.shades(face[hair], splats.columns["parameters/xyz"][hair])
             colors[hair] *= shades[:, None]
         plausible = ((colors - 0.5) / SH_C0).astype(np.float32)
-        inner = np.searchsorted(known.inner.face, face[is_inner])
-        plausible[is_inner] = known.inner.sh[inner, 0]
-        rows = np.flatnonzero((share > MIN_PULL) & ~is_pinned)
+        inner = np.searchsorted(known.inner.face, face[is_occluding])
+        plausible[is_occluding] = known.inner.sh[inner, 0]
+        rows = np.flatnonzero((fraction > MIN_PULL) & ~is_pinned)
         color = splats.columns["parameters/color"][rows]
-        color += share[rows, None] * (plausible[rows] - color)
+        color += fraction[rows, None] * (plausible[rows] - color)
         splats.assign(rows, {"parameters/color": color})
         rows = np.flatnonzero(is_pinned)
         zeros = dict.fromkeys((f"{kind}/sh" for kind in PINNED_KINDS), 0.0)
@@ -216,8 +216,8 @@ class PlausibleColor:
 
 
 class OpaqueSurface:
-    """What turns away from the views is opaque and lies on the surface, or in the outer layer of
-    hair."""
+    """Splats that face away from the views are opaque and lie on the surface, or in the outer layer
+    of hair."""
 
     def __init__(self, known: _Known) -> None:
         self._known = known
@@ -227,26 +227,27 @@ class OpaqueSurface:
         surface = known.surface
         face = splats.face
         moments = splats.columns["second/opacity"]
-        share = doubt(moments[:, None], splats.reference["second/opacity"][:, None])
+        fraction = doubt(moments[:, None], splats.reference["second/opacity"][:, None])
         turned_away = np.where(surface.sticks_out, 0, surface.turned_away)
-        share = (share * turned_away[face]) ** 2  # little of what outlines show
+        fraction = (fraction * turned_away[face]) ** 2  # little of what outlines show
         # no view has stepped these: beyond images' edges also lies what faces cameras
         beyond = surface.outside & ~surface.sticks_out & ~known.sides.shown
-        share[beyond[face] & ~moments.astype(bool)] = 1
-        rows = np.flatnonzero(share > MIN_PULL)
-        share = share[rows]
+        fraction[beyond[face] & ~moments.astype(bool)] = 1
+        rows = np.flatnonzero(fraction > MIN_PULL)
+        fraction = fraction[rows]
         opacity = splats.columns["parameters/opacity"][rows]
-        opacity += share * (HIDDEN_OPACITY - opacity)
+        opacity += fraction * (HIDDEN_OPACITY - opacity)
         xyz = splats.columns["parameters/xyz"][rows]
         axis = known.normal_axis
         height = known.hair.height(face[rows], xyz)
-        xyz[:, axis] += share * (height - xyz[:, axis])
+        xyz[:, axis] += fraction * (height - xyz[:, axis])
         splats.assign(rows, parameters_and_average({"opacity": opacity, "xyz": xyz}))
 
 
 class ShortSteps:
-    """Where gradients are below DOUBT times those of well observed splats, Adam moves and shapes
-    splats by steps that are as much shorter: a layer that hardly shows would get holes."""
+    """Where gradients are below DOUBT times those of well observed splats, Adam's steps in position
+    and shape are shortened by that ratio. Otherwise a layer that is hardly visible would get
+    holes."""
 
     def __init__(self, known: _Known) -> None:
         pass
@@ -259,7 +260,8 @@ class ShortSteps:
 
 
 class FlatSkin:
-    """Splats on skin and clothes stay thin, those of the hidden layer as wide as closes it."""
+    """Splats on skin and clothes stay thin, and those of the hidden layer stay wide enough to close
+    it."""
 
     def __init__(self, known: _Known) -> None:
         self._known = known
@@ -291,20 +293,20 @@ class FlatSkin:
         frames = self._known.frames
         is_layer = surface.closed & (surface.facing < BEHIND_COSINE)
         hair = self._known.hair.least_width
-        skin = LEAST_WIDTH_SHARE * SCALE * frames.units / hidden_order(frames)
+        skin = LEAST_WIDTH_FRACTION * SCALE * frames.units / hidden_order(frames)
         return np.where(is_layer, np.where(hair > 0, hair, skin), 0.0)
 
 
-class FixedInnerLayer:
-    """Splats of the mouth's unseen inside, and those behind lids and sides, stay as `inner_layer`
-    has them: views would make them any size."""
+class FixedOcclusion:
+    """Splats of the mouth's unseen inside, and behind lids and sides, stay as `occluding_splats`
+    placed them: views would make them any size."""
 
     def __init__(self, known: _Known) -> None:
         self._inner = known.inner
         self._is_inside = known.sides.triangles & ~known.surface.outside
 
     def apply(self, splats: BoundSplats) -> None:
-        rows = np.flatnonzero(self._is_inside[splats.face] | splats.is_inner)
+        rows = np.flatnonzero(self._is_inside[splats.face] | splats.is_occluding)
         inner = self._inner.rows(np.searchsorted(self._inner.face, splats.face[rows]))
         kept = {name: getattr(inner, name) for name in INNER_PARAMETERS}
         splats.assign(rows, parameters_and_average(kept))
@@ -323,10 +325,10 @@ class FixedEnd:
 
     def apply(self, splats: BoundSplats) -> None:
         size = self._size
-        is_inner = splats.is_inner
-        count = np.bincount(splats.face[~is_inner], minlength=len(size))
+        is_occluding = splats.is_occluding
+        count = np.bincount(splats.face[~is_occluding], minlength=len(size))
         is_whole = (size > 0) & (count >= size)  # not where another lattice was chosen
-        rows = np.flatnonzero(is_whole[splats.face] & ~is_inner)
+        rows = np.flatnonzero(is_whole[splats.face] & ~is_occluding)
         rows = rows[np.argsort(splats.face[rows], kind="stable")]
         face = splats.face[rows]
         number = np.arange(len(rows)) - np.searchsorted(face, face)
@@ -337,8 +339,8 @@ class FixedEnd:
 
 
 class SmallLining:
-    """Splats on the lips' inner side, which few cameras do not show well, stay small: they would
-    hang before the teeth when the lips part."""
+    """Splats on the lips' inner side that few cameras show well stay small: large ones would hang
+    in front of the teeth when the lips part."""
 
     def __init__(self, known: _Known) -> None:
         capture = known.frames.capture
@@ -348,7 +350,7 @@ class SmallLining:
         single = lattice_splats(
             capture.neutral, capture.faces, 0, 0, convention=known.frames.convention
         )
-        largest = single.log_scale.max(1) + np.log(LINING_SHARE)
+        largest = single.log_scale.max(1) + np.log(LINING_FRACTION)
         self._limits = np.where(lining, largest, np.inf).astype(np.float32)
 
     def apply(self, splats: BoundSplats) -> None:
@@ -381,17 +383,17 @@ PRIORS = (
     OpaqueSurface,
     ShortSteps,
     FlatSkin,
-    FixedInnerLayer,
+    FixedOcclusion,
     FixedEnd,
     SmallLining,
     SunkenEyes,
 )
-"""In the order in which they apply: a later one may change what an earlier one did."""
+"""Priors in the order in which they apply: a later one may change the result of an earlier one."""
 
 
 def doubt(second: np.ndarray, reference: np.ndarray) -> np.ndarray:
-    """Share (N,) in 0…1 of what is plausible: 1 where views tell nothing, a half where gradients
-    are DOUBT times those of well observed splats. second (N, C): Adam's moments; reference (M, C):
+    """Weight (N,) of the prior in 0…1: 1 where views determine nothing, 0.5 where gradients are
+    DOUBT times those of well observed splats. second (N, C): Adam's moments; reference (M, C):
     those of well observed splats."""
     little = DOUBT * np.median(np.sqrt(reference.mean(1))) + np.finfo(np.float32).tiny
     return np.asarray(little / (little + np.sqrt(second.mean(1))), np.float32)
@@ -412,9 +414,9 @@ def width(rotation: np.ndarray, log_scale: np.ndarray, axis: int) -> np.ndarray:
 def flattened(
     rotation: np.ndarray, log_scale: np.ndarray, axis: int, limit: np.ndarray, least: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Splats compressed along a local axis to the standard deviation `limit` (N,), at most, and
-    widened across it to a `width` of `least` (N,): rotation (N, 4) wxyz and log_scale (N, 3),
-    float32. What is seen along that axis of those wide enough stays as it is."""
+    """Splats compressed along a local axis to a standard deviation of at most `limit` (N,), and
+    widened across it to a `width` of at least `least` (N,): rotation (N, 4) wxyz and log_scale (N,
+    3), float32. Splats that are wide enough look the same along that axis as before."""
     wide = np.maximum(width(rotation, log_scale, axis), np.sqrt(MIN_VARIANCE))
     wider = np.maximum(least / wide, 1)
     sides = to_matrices(rotation) * np.exp(log_scale)[:, None] * wider[:, None, None]

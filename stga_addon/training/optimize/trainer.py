@@ -65,7 +65,7 @@ class Strategy:
 
         iteration, visit  count iterations and visits of frames (consecutive views of one timestep)
                           from 0
-        progress          share of the budget spent
+        progress          fraction of the budget spent
         """
         settings = self._settings
         if self.region is not None:
@@ -84,7 +84,8 @@ class Trainer:
     iteration      steps made so far
     visit          visits of frames so far, minus one: consecutive views of one timestep are one
                    visit
-    initial_count  splats of the whole lattice and hull points, which density control counts from
+    initial_count  splats of the whole lattice and visual-hull points, which density control counts
+                   from
     hooks          by name, what may edit the splats after a step, in this order
     """
 
@@ -118,7 +119,7 @@ class Trainer:
             state = start.state
             self.initial_count = len(state)
         self._backend = make_backend(device, settings, self.frames, state)
-        limits = self.frames.stray_limits(settings)
+        limits = self.frames.outlier_limits(settings)
         interval = settings.stray_reset_interval
         self.hooks: dict[str, StepHook] = {
             "outliers": OutlierReset(interval, limits, settings.stray_reset_share),
@@ -136,7 +137,7 @@ class Trainer:
 
     @property
     def state(self) -> TrainState:
-        """A GPU backend copies it, so do not read it in every iteration."""
+        """The training state. A GPU backend copies it, so do not read it in every iteration."""
         return self._backend.state
 
     @state.setter
@@ -154,7 +155,7 @@ class Trainer:
         """Train one view.
 
         target    (H, W, 3) uint8 over the settings' background
-        progress  share of the budget spent
+        progress  fraction of the budget spent
         mask      (H, W) uint8 coverage, with which the background may be randomized
         mesh      (V, 3) the capture's mesh of the view's timestep, if it has been read already
 
@@ -222,7 +223,7 @@ class Trainer:
     def _post_step(self, progress: float) -> None:
         """Call the hooks that are due after an optimizer step."""
         before = self._progress
-        if before is None:  # begun or resumed: as of steps that all take the same share
+        if before is None:  # begun or resumed: as of steps that all take the same fraction
             before = progress * (1 - 1 / max(1, self.iteration - 1))
         self._progress = progress
         region = self.strategy.region
@@ -243,8 +244,7 @@ def density_control(settings: TrainingSettings) -> DensityControl:
 
 
 def _placed_splats(frames: FrameStore, settings: TrainingSettings) -> tuple[TrainState, int]:
-    """The splats that a training begins with; how many there would be, had the lattice begun with
-    all of its points."""
+    """The splats that a training begins with, and how many there would be on the whole lattice."""
     capture = frames.capture
     triangles = len(capture.faces)
     splats = initial_splats(capture, settings)

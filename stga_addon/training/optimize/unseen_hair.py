@@ -1,4 +1,4 @@
-"""Strands and locks of hair where no view shows any: without them, it looks like a helmet."""
+"""Strands and locks of hair where no view shows the hair: without them, it looks like a helmet."""
 
 from dataclasses import replace
 from functools import cache, cached_property
@@ -14,11 +14,11 @@ from .frames import SKIN_DEPTH, FrameStore
 from .semantic_regions import HeadCoordinates
 
 STRAND_COSINE = -0.3
-"""Of the angle between a triangle and the camera that it faces most, below which strands grow:
-longer than the layer's splats, they would stand in outlines."""
+"""Largest cosine of the angle between a triangle and the camera that it faces most for which
+strands are added: longer than the layer's splats, they would stand out in outlines."""
 STRANDS = 10000
 """Strands that a whole scalp would have."""
-STRAND_SHARE = 1.35
+STRAND_FRACTION = 1.35
 """Product of a strand's standard deviations along and across its direction, as a fraction of its
 part of the surface: strands hide what is below."""
 STRAND_SHAPE = (2.6, 0.38, 0.13)
@@ -28,17 +28,17 @@ SMOOTHING_STEPS = 10
 MIN_RISE = 0.3
 """Least cosine between hair's surface and a triangle in its slope."""
 CROWN_ELEVATION_DEG = 55.0
-"""Of the place from which hair grows in all directions, behind the middle of the head."""
+"""Elevation of the point behind the middle of the head from which hair grows in all directions."""
 LOCK_CONTRAST = 0.15
 """Standard deviation of the brightness of locks, as a fraction of it."""
 LOCKS = 400
 """Locks around the head."""
 LOCK_LENGTH = 0.7
-"""How far a lock keeps its brightness, in distances of the eyes from the mouth."""
+"""Length over which a lock keeps its brightness, in distances of the eyes from the mouth."""
 
 
 class UnseenHair:
-    """Hair's outer layer where it faces away from all cameras: the same in every run."""
+    """Hair's outer layer where it faces away from all cameras. It is the same in every run."""
 
     def __init__(self, frames: FrameStore) -> None:
         self._frames = frames
@@ -98,7 +98,7 @@ class UnseenHair:
     def _strand_width(self) -> float:
         """Standard deviation in meters, geometric mean of along and across the growth."""
         area = face_areas(self._surface, self._frames.capture.faces[self.has_strands]).sum()
-        return float(np.sqrt(STRAND_SHARE * area / self._count))
+        return float(np.sqrt(STRAND_FRACTION * area / self._count))
 
     @property
     def _count(self) -> float:
@@ -175,8 +175,8 @@ def growth(at: HeadCoordinates, places: np.ndarray, normals: np.ndarray) -> np.n
 
 
 def lock_shades(at: HeadCoordinates, places: np.ndarray) -> np.ndarray:
-    """(N,) brightness of hair at places (N, 3), relative to the typical one: locks, which reach
-    from the crown down, have their own, that changes slowly along them."""
+    """(N,) brightness of hair at places (N, 3), relative to the typical one. It differs from lock
+    to lock and changes slowly along a lock, which reaches down from the crown."""
     crown = _crown(at)
     across = at.axes[0]
     away = places - at.middle

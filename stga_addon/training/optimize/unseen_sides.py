@@ -1,4 +1,5 @@
-"""Colors of what no training view shows, sides of the head and the inside of a closed mouth."""
+"""Colors for parts that no training view shows: sides of the head, and the inside of a closed
+mouth."""
 
 from dataclasses import dataclass
 
@@ -28,19 +29,19 @@ SPREAD_VIEWS = 12
 """Training views, spread over all, whose colors are measured."""
 OPEN_VIEWS = 6
 """Views whose colors are measured of the timesteps in which the mouth is highest."""
-MIN_TEETH_SHARE = 0.04
-"""Of the pixels that show the mouth, that teeth fill at least; a slit between lips is as well one
-of the mesh alone."""
+MIN_TEETH_FRACTION = 0.04
+"""Least fraction of the mouth's pixels that teeth fill; with fewer, in a slit between the lips, all
+teeth count as hidden."""
 SOURCE_COSINE = 0.25
 """Cosine between a triangle and the camera that it faces most above which others take its color:
 hair at the temples and a beard beside the jaw are seen at 60 to 75° at least."""
 WELL_SHOWN_COSINE = 0.5
-"""The same above which a face is shown better than its mirror image could tell."""
+"""The same above which a view shows a face better than its mirror image does."""
 FRINGE_COSINE = 0.2
 """The same for the scalp, which takes the color of a fringe where it is not visible itself."""
-FRINGE_SHARE = 0.2
-"""Of what is shown above the brows, the highest, where hair is if there is any."""
-MIN_SHOWN_SHARE = 0.1
+FRINGE_FRACTION = 0.2
+"""Highest fraction of the visible triangles above the brows; they show hair if there is any."""
+MIN_SHOWN_FRACTION = 0.1
 """Fraction of the median of the pixels that show as much of the surface, below which it is not
 visible: a folded eyelid has less."""
 NEAREST = 24
@@ -51,13 +52,14 @@ over which unseen colors are softened."""
 COLLAR_SLOPE = 0.3
 """Rise of a collar from front to back, by its depth."""
 LEVEL_WEIGHT = 3.0
-"""By how much visible triangles of neck and shoulders above and below the collar's plane through a
-hidden one count as farther than those beside it: a chin's shadow is on a neck's front only."""
+"""Factor by which visible triangles of neck and shoulders count as farther where they are above or
+below a hidden triangle, along the normal of the collar's plane, instead of beside it: only a neck's
+front has a chin's shadow."""
 SAME_COLOR_DEVIATION = 0.12
 """Largest difference in 0…1 of colors that differ by their shade alone: collars and hairlines stay
 sharp."""
 MAX_LIGHT_RATIO = 2.0
-"""Of the light on one side of a face to that on the other."""
+"""Largest ratio of the light on one side of a face to that on the other."""
 SHOWN_COSINE = 0.6
 """Cosine between a triangle and the camera that it faces most above which its color depends on no
 view; up to SOURCE_COSINE, it depends wholly on the view."""
@@ -91,10 +93,11 @@ class UnseenSides:
 
 
 def unseen_sides(surface: Surface) -> UnseenSides:
-    """Triangles that no camera looks at. They look as the nearest that views show, on either side
-    of the head: those on the other side as their mirror images, in the light of this one. Hair has
-    one color where no view shows it, and ears look as ears. What views show looks as there, but for
-    faces of few cameras, which look as their mirror images where these are shown better."""
+    """Colors of triangles that no camera faces. They take the color of the nearest visible
+    triangles on either side of the head; those on the other side are mirrored and relit by this
+    side's light. Unseen hair has one color, and ears take the color of ears. Visible triangles keep
+    their color, except on faces of few cameras, which take their mirror image's color where that is
+    shown better."""
     capture = surface.capture
     cosine = surface.facing
     is_outside = surface.outside
@@ -102,7 +105,7 @@ def unseen_sides(surface: Surface) -> UnseenSides:
     density = pixels / np.maximum(face_areas(capture.neutral, capture.faces), MIN_DIVISOR)
     facing = density[cosine > WELL_SHOWN_COSINE]
     median = np.median(facing[facing > 0]) if facing.any() else 0.0
-    shown = density > MIN_SHOWN_SHARE * median
+    shown = density > MIN_SHOWN_FRACTION * median
     is_source = (pixels > 0) & is_outside & (cosine > SOURCE_COSINE) & ~surface.lids
     if not is_source.any():
         none = np.zeros_like(shown)
@@ -151,23 +154,24 @@ def unseen_sides(surface: Surface) -> UnseenSides:
 
 
 def plausible_off_axis(splats: Splats, along: np.ndarray, sides: UnseenSides) -> Splats:
-    """Splats that views show along one direction only, that of their triangle (F, 3), with what is
-    plausible off-axis: hair, and of the rest what lies on it, not what hangs before it. What looks
-    like hair on skin that turns away is hair behind it: it is skin off-axis."""
+    """Splats that views show along one direction only, that of their triangle (F, 3), with their
+    prior's color off-axis: hair, and elsewhere the splats that lie on the surface, not those that
+    hang in front of it. A hair-colored splat on skin that turns away belongs to hair behind it:
+    off-axis it is skin."""
     face = splats.face
-    share = OFF_AXIS_WEIGHT * sides.view_dependence[face]
-    share[splats.unbound & ~sides.is_hair[face]] = 0
-    share[sides.triangles[face]] = 0  # they have one color from everywhere, and hair its locks
+    fraction = OFF_AXIS_WEIGHT * sides.view_dependence[face]
+    fraction[splats.unbound & ~sides.is_hair[face]] = 0
+    fraction[sides.triangles[face]] = 0  # they have one color from everywhere, and hair its locks
     plausible = sides.off_axis[face]
     steepness = np.ones(len(face))
     if sides.is_hair.any():
         shown = sh_color(splats.sh, along[face])
         hair = np.median(sides.off_axis[sides.is_hair], axis=0)
         from_hair, from_skin = (np.linalg.norm(shown - own, axis=1) for own in (hair, plausible))
-        is_behind = (share > 0) & ~sides.is_hair[face] & (from_hair < from_skin)
-        share[is_behind] = 1
+        is_behind = (fraction > 0) & ~sides.is_hair[face] & (from_hair < from_skin)
+        fraction[is_behind] = 1
         steepness[is_behind] = BEHIND_STEEPNESS
-    return colored_off_axis(splats, along[face], share, plausible, steepness)
+    return colored_off_axis(splats, along[face], fraction, plausible, steepness)
 
 
 def _hair(
@@ -283,7 +287,7 @@ def _lid_colors(
 def _fringe(at: HeadCoordinates, shown: np.ndarray) -> np.ndarray:
     """The highest of the triangles (F,) bool that are shown above the brows."""
     above = np.flatnonzero(shown & (at.level > BROWS_LEVEL))
-    return above[np.argsort(at.level[above])][int(len(above) * (1 - FRINGE_SHARE)) :]
+    return above[np.argsort(at.level[above])][int(len(above) * (1 - FRINGE_FRACTION)) :]
 
 
 def _color_views(capture: Capture) -> list[View]:
@@ -307,9 +311,9 @@ def _color_views(capture: Capture) -> list[View]:
 
 
 def _unseen_inside(capture: Capture, shown: np.ndarray, is_outside: np.ndarray) -> np.ndarray:
-    """(F,) bool: triangles inside of mouth and eyes that no view shows, nor any neighbor of theirs.
-    Not the folds of ears, which other views show. None in a long recording whose meshes are files:
-    not all of its mouths were looked for."""
+    """(F,) bool: triangles inside of mouth and eyes that neither a view nor a view of a neighbor
+    shows. Folds of ears are left out, because other views show them. None in a long recording whose
+    meshes are files, because not all open mouths were looked for."""
     if capture.flame is None and len(capture.timesteps) > SPREAD_VIEWS:
         return np.zeros(len(shown), bool)
     touched = np.zeros(len(capture.neutral), bool)
@@ -322,6 +326,6 @@ def _unseen_teeth(capture: Capture, pixels: np.ndarray, shown: np.ndarray) -> np
     """(F,) bool: teeth that the pixels (F,) do not show well, or all where lips hide them."""
     teeth = teeth_of(capture)
     in_mouth = pixels[capture.regions.get("mouth", teeth)].sum()
-    if pixels[teeth].sum() < MIN_TEETH_SHARE * in_mouth:
+    if pixels[teeth].sum() < MIN_TEETH_FRACTION * in_mouth:
         return teeth
     return np.asarray(teeth & ~shown)

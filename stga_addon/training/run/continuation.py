@@ -20,8 +20,8 @@ from ..settings import TrainingSettings
 from .checkpoint import read_checkpoint
 from .folder import AVATAR, CHECKPOINT, Continuation, Run
 
-START_SHARE = 0.5
-"""Share of the run's schedule of learning rates that has passed when its continuation begins."""
+START_FRACTION = 0.5
+"""Fraction of the run's schedule of learning rates that has passed when its continuation begins."""
 DENSITY_INTERVAL = 40
 """Iterations between density control's steps in a continuation, whose budget is a tenth of a
 training's."""
@@ -30,7 +30,7 @@ DENSITY_SPAN = (0.0, 0.6)
 MIN_GROUP_VIEWS = 4
 """Evaluation views of a group at least, where it has so many."""
 ROUNDING = 1e-5
-"""By which colors differ that went through harmonics of what is plausible off-axis."""
+"""Largest difference between colors that went through the harmonics of the off-axis prior."""
 
 
 def starting_state(
@@ -88,9 +88,9 @@ def continued_settings(
     expressions strain triangles in directions that the old takes never showed.
     """
     first = settings.rates
-    left = 1 - START_SHARE
+    left = 1 - START_FRACTION
     ends = {"position_end": first.position_end**left, "end": first.end**left}
-    rates = replace(first, **learning_rates(first, START_SHARE), **ends)  # from there on
+    rates = replace(first, **learning_rates(first, START_FRACTION), **ends)  # from there on
     if strategy == "extend":
         rates = replace(rates, strain_color=first.strain_color)
     continued = replace(
@@ -150,7 +150,7 @@ def grouped_evaluation_views(
     return chosen
 
 
-REPLAY_SHARE = 1 / 3
+REPLAY_FRACTION = 1 / 3
 """Fraction of a refinement's iterations that train views outside its frames, if any."""
 REPLAY_TIMESTEPS = 12
 """Timesteps that are replayed: those that differ most from each other."""
@@ -158,8 +158,8 @@ REPLAY_VIEWS = 120
 """Replayed at most; cameras take turns from timestep to timestep. Fewer would be overfitted."""
 MAX_CANDIDATES = 200
 """Evenly spread, of which replayed timesteps are chosen: long takes are not read as a whole."""
-MIN_REGION_SHARE = 0.3
-"""A view refines a region if it sees this share of what the view that sees most does."""
+MIN_REGION_FRACTION = 0.3
+"""A view refines a region if it sees this fraction of what the view that sees most does."""
 
 
 def continued_order(
@@ -183,13 +183,13 @@ def continued_order(
         return
     parts = (asked, replayed_views(capture, rest))
     asked, others = (views_of_region(capture, members, region) for members in parts)
-    share = REPLAY_SHARE if others else 0.0
-    replayed = [int(position * share) for position in (start, start + 1)]
+    fraction = REPLAY_FRACTION if others else 0.0
+    replayed = [int(position * fraction) for position in (start, start + 1)]
     new = view_order(asked, 1, seed, start - replayed[0])
     old = view_order(others, 1, seed + 1, replayed[0]) if others else new
     position = start
     while True:
-        yield next(old) if int((position + 1) * share) > int(position * share) else next(new)
+        yield next(old) if int((position + 1) * fraction) > int(position * fraction) else next(new)
         position += 1
 
 
@@ -232,7 +232,7 @@ def _distance(meshes: np.ndarray, mesh: np.ndarray) -> np.ndarray:
 def views_of_region(capture: Capture, views: Sequence[View], region: np.ndarray) -> list[View]:
     """In which the region (F,) bool is seen large: turned to the camera, whatever covers it."""
     seen = np.array([_facing_area(capture, view, region) for view in views])
-    large = [area >= MIN_REGION_SHARE * seen.max() > 0 for area in seen]
+    large = [area >= MIN_REGION_FRACTION * seen.max() > 0 for area in seen]
     return [view for view, is_large in zip(views, large, strict=True) if is_large]
 
 

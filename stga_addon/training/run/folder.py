@@ -43,7 +43,7 @@ TRACKING = "tracking.npz"
 RESIDUALS = "residuals.npz"
 
 MAX_FOLDERS_UP = 2
-"""From the folder of a run, or of a .blend file, to that of its project."""
+"""Levels of folders from the folder of a run, or of a .blend file, up to that of its project."""
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ METRICS = "metrics.jsonl"
 REQUIRED = ("iteration", "seconds", "splats", "evaluation_s", "wall_s")
 """Fields of every line."""
 REGION_PSNR = "psnr_region"
-"""Of the region that a refinement trains, in its evaluations."""
+"""PSNR of the region that a refinement trains, in its evaluations."""
 TRACKING_GAIN = "tracking_gain_db"
 """Field of PSNR that views left out of tracking by the avatar gained by it; NaN where none was."""
 

@@ -41,9 +41,9 @@ EXPOSURE_VIEWS = 24
 EXPOSURE_HEIGHT_PX = 160
 """Height of these images."""
 CAMERA_WEIGHT = 0.2
-"""Of the camera's exposure in that of a view, as a share of the view's pixels."""
+"""Weight of the camera's exposure in a view's exposure, relative to the view's number of pixels."""
 MIN_COVER = 250
-"""Of a mask, of 255, from which a pixel shows the person alone."""
+"""Least value of a mask, of 255, at which a pixel shows the person alone."""
 SHADING_PRIOR = 0.01
 """Weight of the light that the avatar was trained in as a fraction of the pixels, where that of a
 take is fitted."""
@@ -52,7 +52,8 @@ SHADING_ITERATIONS = 6
 SCALE_TIMESTEPS = 6
 """Spread over the take, that the scale is found from."""
 ROUNDS = 2
-"""Of tracking, each from the motion that the one before has led to, smoothed in takes in order."""
+"""Rounds of tracking, each from the motion that the round before led to, smoothed in takes in
+order."""
 IDENTITY = Similarity(1.0, np.eye(3), np.zeros(3))
 
 PART_TIMESTEPS = 16
@@ -91,7 +92,7 @@ def track_recording(
 
     Exposure and white balance of each camera, where they drift of each timestep, are fitted to the
     avatar's colors first, as are the scale of the world and, unless it is kept, how it is turned.
-    The timesteps' parameter files are replaced, and the report says what share of the images is
+    The timesteps' parameter files are replaced, and the report says what fraction of the images is
     left unexplained. Raises StgaError, and what `report` raises.
     """
     timesteps = open_capture(root, read_run(run).flame).timesteps
@@ -121,9 +122,9 @@ def track_recording(
             tracked = tracked.smoothed(sequence.model)
         _replace_heads(root, sequence, tracked)
     stored = read_json(root / REPORT_FILE)  # which scaling changes
-    shares = zip(timesteps, tracked.misfit.tolist(), strict=True)
+    fractions = zip(timesteps, tracked.misfit.tolist(), strict=True)
     stored["avatar"] = avatar_version(run)
-    misfit = {str(timestep): round(share, 3) for timestep, share in shares}
+    misfit = {str(timestep): round(fraction, 3) for timestep, fraction in fractions}
     stored["image_misfit"][tracking_folder.AVATAR_MISFIT] = misfit
     write_json(root / REPORT_FILE, stored)
     return tracked

@@ -50,7 +50,7 @@ from ..schedule import image_scales, take_order
 from . import checkpoint as checkpoints
 from . import folder as folders
 from .continuation import (
-    START_SHARE,
+    START_FRACTION,
     continued_order,
     grouped_evaluation_views,
     starting_state,
@@ -70,9 +70,9 @@ CHECKPOINT_S = 30.0
 """Seconds of training between checkpoints: what a crash may cost."""
 CHECKPOINT_VARIABLE = "STGA_CHECKPOINT_S"
 """Environment variable that replaces it, for machines that are taken away often."""
-TRACKING_START_SHARE = 0.5
+TRACKING_START_FRACTION = 0.5
 """Fraction of the budget after which the avatar tracks its head."""
-TRACKING_TIME_SHARE = 0.2
+TRACKING_TIME_FRACTION = 0.2
 """Fraction of the seconds that this tracking may take."""
 LEFT_OUT_INTERVAL = 12
 """Every how many timesteps one is left out of that tracking where no camera is held out."""
@@ -101,8 +101,8 @@ READERS_BESIDE_GPU = 0.5
 
 def image_readers(device: str) -> int:
     """How many images are decoded at a time beside a training on a device."""
-    share = READERS_BESIDE_CPU if device == "cpu" else READERS_BESIDE_GPU
-    return max(1, round(share * threads()))
+    fraction = READERS_BESIDE_CPU if device == "cpu" else READERS_BESIDE_GPU
+    return max(1, round(fraction * threads()))
 
 
 class Trained(NamedTuple):
@@ -196,12 +196,12 @@ def _usable(capture: Capture) -> Capture:
 
 
 class _Addition(NamedTuple):
-    """Training beyond the budget: its seconds, and the seconds and the share of the schedule at
+    """Training beyond the budget: its seconds, and the seconds and the fraction of the schedule at
     which it begins."""
 
     seconds: float
     begun_s: float
-    begun_share: float
+    begun_fraction: float
 
 
 @dataclass
@@ -239,11 +239,11 @@ class _Session:
 
     def begin_addition(self, seconds: float) -> None:
         """Train so long from here on, whatever budget and goals the run began with."""
-        begun_share = min(self._spent().share, START_SHARE)
-        self.addition = _Addition(seconds, self.elapsed_s, begun_share)
+        begun_fraction = min(self._spent().fraction, START_FRACTION)
+        self.addition = _Addition(seconds, self.elapsed_s, begun_fraction)
         evaluator = self.evaluator
         evaluator.settings = replace(evaluator.settings, target_psnr=None, stop_when_flat=False)
-        evaluator.count = int(begun_share * EVALUATIONS)
+        evaluator.count = int(begun_fraction * EVALUATIONS)
         tracking = self.trainer.tracking
         if tracking is not None:  # unseen heads are fitted to the later avatar again
             tracking.rounds = min(tracking.rounds, 1)
@@ -251,7 +251,7 @@ class _Session:
     def complete(self) -> None:
         """Train until the budget is spent, a goal is reached or the report asks to stop."""
         if self.trainer.tracking is not None and self._without_training_views():
-            self.fitting_s = TRACKING_TIME_SHARE * (self.run.settings.seconds or 0.0)
+            self.fitting_s = TRACKING_TIME_FRACTION * (self.run.settings.seconds or 0.0)
         # meanwhile, the splats are shown as they begin
         self._tell("Compiling kernels", longer=1.0)
         precompile_kernels(self.run.device)
@@ -284,12 +284,12 @@ class _Session:
         interval_s = _asked_interval_s()
         with ExitStack() as stack:
             loader = stack.enter_context(self._loader())
-            while self._refinement_is_due() or not self._spent().share >= 1:
+            while self._refinement_is_due() or not self._spent().fraction >= 1:
                 begin = perf_counter()
                 # a run that was stopped in the middle of it has made the step before
                 if not self._refinement_is_due():
                     view, image, mask, mesh = next(loader)
-                    loss = trainer.step(view, image, self._spent().share, mask, mesh)
+                    loss = trainer.step(view, image, self._spent().fraction, mask, mesh)
                     self.elapsed_s += perf_counter() - begin
                     if loss is not None:
                         self.losses.append(loss)
@@ -318,8 +318,8 @@ class _Session:
     def _refinement_is_due(self) -> bool:
         """Whether the avatar is to track its head now, before anything else."""
         tracking = self.trainer.tracking
-        share = self._spent().share
-        return tracking is not None and not tracking.rounds and share >= TRACKING_START_SHARE
+        fraction = self._spent().fraction
+        return tracking is not None and not tracking.rounds and fraction >= TRACKING_START_FRACTION
 
     def _is_trained(self) -> bool:
         return self._is_finished() and not self._refinement_is_due()
@@ -395,8 +395,8 @@ class _Session:
         def scale(position: int) -> float:
             """Of the captured size; by the clock, a few images ahead of it."""
             total = settings.iterations
-            share = self._spent().share if total is None else (first + position) / total
-            return coarse if share < settings.coarse_share else full
+            fraction = self._spent().fraction if total is None else (first + position) / total
+            return coarse if fraction < settings.coarse_share else full
 
         tracking = self.trainer.tracking
         # refined meshes change halfway
@@ -474,12 +474,12 @@ class _Session:
     def _squared_error(self, views: Sequence[View]) -> float:
         """Mean over the views, of images as high as the avatar tracks in; never quite 0."""
         settings = self.run.settings
-        share = self._spent().share
+        fraction = self._spent().fraction
         errors = []
         prepare = image_preparation(self.capture, settings)
         for view in views:
             small, image = read_small(view, MAX_HEIGHT_PX, settings, prepare)
-            drawn = self.trainer.render(small, share)
+            drawn = self.trainer.render(small, fraction)
             errors.append(np.square(drawn - image.transpose(2, 0, 1) / 255).mean())
         return float(np.mean(errors)) + 1e-12 if errors else math.nan
 
@@ -504,7 +504,7 @@ class _Session:
         trained = TrainedAvatar(avatar, settings)
         capture = tracking.refined(capture)
         chosen = tracked_timesteps(settings, capture, tracked)
-        seconds = None if settings.seconds is None else TRACKING_TIME_SHARE * settings.seconds
+        seconds = None if settings.seconds is None else TRACKING_TIME_FRACTION * settings.seconds
         try:
             found = track_by_avatar(trained, capture, chosen, seconds, stops)
         except Cancelled:
@@ -525,10 +525,10 @@ class _Session:
         """Fields of a metrics line of the avatar of now, which is written where it is to be kept;
         sets_aside: after the one before was."""
         begin = perf_counter()
-        share = min(1.0, self._spent().share)
+        fraction = min(1.0, self._spent().fraction)
         limits = self._strain_limits() if self.trainer.tracking is not None else None
         with self.trainer.frames.strain_within(limits):
-            render = partial(self.trainer.render, progress=share)
+            render = partial(self.trainer.render, progress=fraction)
             quality, is_kept = self.evaluator.evaluate(render, perceptual)
         self._require_folder()
         if is_kept:
@@ -556,18 +556,18 @@ class _Session:
     def _spent(self) -> Spent:
         settings = self.run.settings
         iterations = self.trainer.iteration
-        begun_share = done_s = 0.0
+        begun_fraction = done_s = 0.0
         budget_s = settings.seconds
         if self.addition is not None:
-            budget_s, done_s, begun_share = self.addition
+            budget_s, done_s, begun_fraction = self.addition
         if budget_s is not None:
             done_s = self.elapsed_s - done_s
-            share = begun_share + (1 - begun_share) * done_s / budget_s
+            fraction = begun_fraction + (1 - begun_fraction) * done_s / budget_s
             left_s = max(0.0, budget_s - done_s)
         else:
-            share = iterations / (settings.iterations or 1)
-            left_s = max(0.0, self.elapsed_s * (1 / share - 1)) if share > 0 else math.nan
-        return Spent(share, self.elapsed_s, iterations, left_s)
+            fraction = iterations / (settings.iterations or 1)
+            left_s = max(0.0, self.elapsed_s * (1 / fraction - 1)) if fraction > 0 else math.nan
+        return Spent(fraction, self.elapsed_s, iterations, left_s)
 
     def _is_finished(self) -> bool:
         return self.evaluator.is_finished(self._spent())
@@ -599,10 +599,10 @@ class _Session:
             with suppress(StgaError):
                 write_avatar(path, self._avatar())
 
-        share = min(1.0, spent.share)
+        fraction = min(1.0, spent.fraction)
         detail = evaluator.forecast_text
         lines = tuple(evaluator.lines)
-        return self.report(Progress(share, stage, detail, known, preview, metrics=lines))
+        return self.report(Progress(fraction, stage, detail, known, preview, metrics=lines))
 
     def _gain(self) -> dict[str, float]:
         """Accuracy of the region of a refinement before it, and now."""

@@ -55,7 +55,7 @@ def test_one_run(toy, tmp_path, monkeypatch):
     replies = io.StringIO()
     work(run.out, io.StringIO("0.5\n1.0\n"), replies)
     first, second, last = (json.loads(line) for line in replies.getvalue().splitlines())
-    assert (first["iteration"], second["share"], last) == (1, 0.5, {"done": True})
+    assert (first["iteration"], second["fraction"], last) == (1, 0.5, {"done": True})
     quality = json.loads((run.out / QUALITY).read_text())
     for split in ("val", "test"):
         assert {"psnr", "ssim", "psnr_mask", "psnr_moving"} <= set(quality[split])
@@ -88,7 +88,7 @@ def test_a_slice_is_stopped_and_goes_on(toy, tmp_path, monkeypatch):
     assert all(0.5 <= elapsed < 1.9 for elapsed in kept.values())
     said.clear()
     shares = []
-    perform(request, lambda progress: bool(shares.append(progress.share)), said.append)
+    perform(request, lambda progress: bool(shares.append(progress.fraction)), said.append)
     starts = [text for text in said if "Starting" in text]
     assert starts == [f"Starting {name}" for name in VARIANTS]
     assert shares == sorted(shares)
@@ -106,7 +106,7 @@ def test_a_slice_is_stopped_and_goes_on(toy, tmp_path, monkeypatch):
     assert (tmp_path / "benchmark.csv").read_text().startswith("variant,seed,iteration,seconds,")
     assert (tmp_path / "benchmark.png").stat().st_size > 1000
     said.clear()
-    perform(request, say=said.append)
+    perform(request, log=said.append)
     assert [text for text in said if "Starting" in text] == []
     with refusal("holds a run with other settings"):
         perform(replace(request, seconds=3.0))
@@ -134,7 +134,7 @@ def test_workers_that_end_or_fail(toy, tmp_path, monkeypatch):
     interpreter = tmp_path / "python"  # trains in one turn, or cannot in the folder `lost`
     interpreter.write_text(
         '#!/bin/sh\ncase "$*" in */lost*) echo \'{"error": "nowhere"}\'; exit;; esac\n'
-        'echo \'{"share": 0.1}\'\nread share\ntouch "$0.trained"\necho \'{"done": true}\'\n'
+        'echo \'{"fraction": 0.1}\'\nread share\ntouch "$0.trained"\necho \'{"done": true}\'\n'
     )
     interpreter.chmod(0o755)
     monkeypatch.setattr(sys, "executable", str(interpreter))

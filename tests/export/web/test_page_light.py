@@ -103,7 +103,7 @@ def set_lighting(browser, lighting):
 )
 def test_colors_are_the_relighters(options, exact, browser, tmp_path):
     """Catches albedo, harmonics, the turn of the head, light between skin and skin, shadows (of
-    lashes as well), highlights or a share of recorded colors that differ from Python's, and a
+    lashes as well), highlights or a fraction of recorded colors that differ from Python's, and a
     picture that shows other colors."""
     alike = options.pop("alike", False)
     head = lit_head(lashes=True, **options)
@@ -119,7 +119,7 @@ def test_colors_are_the_relighters(options, exact, browser, tmp_path):
     order = np.lexsort((relighter.face, head.avatar.splats.face))
     assert len(relighter.lashes.face) == LASHES
     sun = Light("sun", sun_light["color"], direction=-np.array(SUN["toward"]))
-    share = relighter.distant_in_head(head.meshes[0], Lighting(world, (sun,)))[1].share
+    share = relighter.distant_in_head(head.meshes[0], Lighting(world, (sun,)))[1].fraction
     assert 0.3 < share < 0.95 if alike else share < 0.1
     for frame in (0, 2):
         lighting = Lighting(world, (sun,), exposure=0.5)

@@ -23,7 +23,7 @@ from .scenes import unlike_cameras
 # What each effect calls, by where the call is made from.
 CALLS = {
     "background": (cpu_backend, "change_background"),
-    "hull-points": (initial_splats, "hull_points"),
+    "hull-points": (initial_splats, "visual_hull_points"),
     "density": (DensityControl, "apply"),
     "selection": (session, "select_capture"),
     "strain-color": (frames, "strain_basis"),

@@ -28,7 +28,7 @@ def test_splats_start_with_the_colors_of_the_images(painted, monkeypatch):
     assert np.percentile(error[front], 95) < 15
     assert not splats.sh[:, 1:].any()
     colors = triangle_colors(capture, capture.views["train"])
-    monkeypatch.setattr("stga_addon.training.optimize.initial_splats.MIN_ONE_SIDED_SHARE", 2.0)
+    monkeypatch.setattr("stga_addon.training.optimize.initial_splats.MIN_ONE_SIDED_FRACTION", 2.0)
     assert_array_equal(colors, triangle_colors(capture, capture.views["train"]))
 
 

@@ -448,7 +448,7 @@ def test_each_timestep_is_posed_once(painted, monkeypatch):
     capture = replace(painted(), timesteps=tuple(range(500)), neutral=neutral, flame=flame)
     capture = replace(capture, expression_mesh=expression_mesh)
     facts = CaptureFacts(capture, SETTINGS)
-    assert facts.selected_share == 1
+    assert facts.selected_fraction == 1
     assert facts.lip_gap_mm == pytest.approx(0)
     assert len(posed) == len(set(posed)) == MAX_TIMESTEPS
     assert {0, 499} <= set(posed)

@@ -59,8 +59,8 @@ export function orbited(camera, pivot, up, yaw, pitch) {
   const axis = unit(up);
   const elevation = Math.asin(Math.max(-1, Math.min(1, dotProduct(row(camera.matrix, 2), axis))));
   const tilt = Math.max(-MAX_ELEVATION - elevation, Math.min(MAX_ELEVATION - elevation, pitch));
-  const aside = turned(camera, pivot, axis, yaw);
-  return turned(aside, pivot, row(aside.matrix, 0), tilt);
+  const yawed = turned(camera, pivot, axis, yaw);
+  return turned(yawed, pivot, row(yawed.matrix, 0), tilt);
 }
 
 // Shift a camera's picture by pixels; returns the camera and the point to orbit about, which shifts
@@ -145,8 +145,8 @@ export function addControls(element, player, changed) {
     const [yaw, pitch] = [dx * ORBIT_PER_PIXEL, dy * ORBIT_PER_PIXEL];
     if (event.altKey && after.length === 1 && lighting?.sun) {
       // With what faces the camera.
-      const aside = rotatedAbout(lighting.sun.toward, row(camera.matrix, 1), -yaw);
-      const toward = rotatedAbout(aside, row(camera.matrix, 0), pitch);
+      const yawed = rotatedAbout(lighting.sun.toward, row(camera.matrix, 1), -yaw);
+      const toward = rotatedAbout(yawed, row(camera.matrix, 0), pitch);
       shown.lighting = { ...lighting, sun: { ...lighting.sun, toward } };
       changed('lightchange');
       return;

@@ -259,12 +259,12 @@ export class FaceFrames {
     }
     for (let f = 0, to = 0; f < change.position.length; f += 3) {
       const [x, y, z] = [change.position[f], change.position[f + 1], change.position[f + 2]];
-      const growth = Math.exp(change.scale[f]);
+      const enlargement = Math.exp(change.scale[f]);
       for (const end = to + 12; to < end; to += 4) {
         world[to + 3] += world[to] * x + world[to + 1] * y + world[to + 2] * z;
-        world[to] *= growth;
-        world[to + 1] *= growth;
-        world[to + 2] *= growth;
+        world[to] *= enlargement;
+        world[to + 1] *= enlargement;
+        world[to + 2] *= enlargement;
       }
     }
   }

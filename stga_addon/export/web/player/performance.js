@@ -13,7 +13,7 @@ const DEFAULT_FPS = 60;
 const MAX_FPS = 1000; // and at least 1
 const TIMECODE = /^(\d{1,3}):(\d{1,2}):(\d{1,2})([:;.])(\d{1,3})(\.\d{1,6})?$/;
 const TIMECODE_BASES = [24, 25, 30, 48, 50, 60, 100, 120];
-const USUAL_BASE = 60; // of a take of less than a second, whose frame numbers do not tell
+const TYPICAL_BASE = 60; // of a take of less than a second, whose frame numbers do not show it
 const DROP_RATIO = 1000 / 1001; // of drop-frame timecodes, with a semicolon: frames come slower
 const DAY_S = 86400;
 const SECONDS = ['timecode', 'time', 'timestamp', 'seconds'];
@@ -135,7 +135,7 @@ function baseOf(fields) {
   const possible = TIMECODE_BASES.filter(base => base > largest);
   if (!possible.length) return Math.floor(largest) + 1;
   const seconds = fields.map(({ minutes, second }) => 60 * minutes + second);
-  if (new Set(seconds).size < 2) return possible.includes(USUAL_BASE) ? USUAL_BASE : possible[0];
+  if (new Set(seconds).size < 2) return possible.includes(TYPICAL_BASE) ? TYPICAL_BASE : possible[0];
   const spreads = possible.map(base =>
     unevenness(seconds.map((second, row) => second + fields[row].frames / base)),
   );
@@ -145,10 +145,10 @@ function baseOf(fields) {
 /** @param {number[]} times */
 function unevenness(times) {
   const steps = times.slice(1).map((time, row) => time - times[row]);
-  const usual = steps.filter(step => step > 0 && step < 1);
-  if (!usual.length) return 0;
-  const middle = median(usual);
-  const mean = usual.reduce((sum, step) => sum + Math.abs(step - middle), 0) / usual.length;
+  const frameSteps = steps.filter(step => step > 0 && step < 1);
+  if (!frameSteps.length) return 0;
+  const middle = median(frameSteps);
+  const mean = frameSteps.reduce((sum, step) => sum + Math.abs(step - middle), 0) / frameSteps.length;
   return Math.round(1e6 * mean) / 1e6;
 }
 

@@ -223,7 +223,7 @@ void main() {
     vec3 local = uToSun * (lifted - uMiddle);
     float depth = (local.z - shadow_bias(facing, uTexel)) / uRadius * 0.5 + 0.5;
     vec2 place = (local.xy / uRadius * 0.5 + 0.5) * float(MAP_SIZE);
-    vec3 light = uSunColor * facing * lit_share(ivec2(0), place, depth);
+    vec3 light = uSunColor * facing * lit_fraction(ivec2(0), place, depth);
     arriving += light;
     highlight += light * ggx(normal, towardSun, view, pow(roughness, 4.0));
   }

@@ -14,7 +14,7 @@ import { DepthSort, Renderer, RendererError } from './renderer.js';
 import { vector } from './vector.js';
 
 const MAX_PIXEL_RATIO = 2;
-const TIMING_SHARE = 0.1; // of the newest frame in the running mean
+const TIMING_FRACTION = 0.1; // of the newest frame in the running mean
 const MAX_STEP_S = 0.25; // of playback time between two frames: a hidden tab resumes where it was
 
 // One avatar on one canvas: follows motion and camera, and draws when something has changed.
@@ -63,7 +63,7 @@ export class Player {
     const order = this.prepare(camera);
     this.renderer.draw(order, camera, this);
     const spent = performance.now() - begin;
-    this.milliseconds += (this.milliseconds ? TIMING_SHARE : 1) * (spent - this.milliseconds);
+    this.milliseconds += (this.milliseconds ? TIMING_FRACTION : 1) * (spent - this.milliseconds);
   }
 
   // Pixels of the current frame from `camera`, which has its own size (Renderer.read).
