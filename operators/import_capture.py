@@ -20,6 +20,8 @@ from ..stga_addon.capture.transforms import (
     VIDEO_SUFFIXES,
     transforms_files,
 )
+from ..stga_addon.driving.demo_speech import SPEECH_FILE, demo_speech
+from ..stga_addon.driving.inverse import write_performance
 from ..stga_addon.driving.performers import READ_SUFFIXES
 from ..stga_addon.errors import StgaError
 from ..stga_addon.export.skinned_reader import (
@@ -37,6 +39,7 @@ from ..stga_addon.flame.sequence import FIELD_ALIASES, FRAME_FIELDS
 from ..stga_addon.scene import tags
 from ..stga_addon.scene.avatar_scene import frame_head, hide_default_cube, place_beside
 from ..stga_addon.scene.cameras import central, configure_scene, import_cameras
+from ..stga_addon.scene.demo_shot import build_shot
 from ..stga_addon.scene.objects import (
     COLLECTIONS,
     Warn,
@@ -51,10 +54,23 @@ from ..stga_addon.scene.objects import (
 from ..stga_addon.scene.record import capture_of, store_path
 from ..stga_addon.scene.rig.head import import_head
 from ..stga_addon.scene.rig.keyframes import has_shapes
+from ..stga_addon.scene.rig.poses import bring_presets
 from ..stga_addon.tracking.folder import describe_focal_length, is_tracked
 from ..stga_addon.training.run.folder import has_run, next_folder
 from . import options
-from .common import Edit, FileImport, call, file_path, flame_model_path, is_head, need, package
+from .common import (
+    Edit,
+    FileImport,
+    call,
+    file_path,
+    flame_model_path,
+    head_of,
+    is_head,
+    need,
+    needs_rig,
+    own_motion,
+    package,
+)
 from .kernels import begin_preparing
 from .options import ONCE
 from .pose import begin_sliders
@@ -107,6 +123,7 @@ class HeadImport(Edit):
         had_sliders = any(has_shapes(each) for each in heads if each not in others)
         used = _used_actions()
         head = import_head(capture, warn=warn, correctives=correctives)
+        bring_presets(head)
         if others and is_new:
             place_beside(head, others)
         if set_up_scene is None:
@@ -321,6 +338,21 @@ class OpenDemo(HeadImport, bpy.types.Operator):
 
     needs = (need(lambda _: DEMO.is_dir(), "Only the complete edition brings the demo capture"),)
 
+    shot: options.boolean(
+        "Shot",
+        "Train it, and build a film scene around the avatar when it is trained",
+        options=ONCE,
+    )
+
+    @classmethod
+    def description(cls, context: Any, properties: Any) -> str:
+        if properties.shot:
+            return (
+                "Train the avatar of a generated person for a minute, then build a shot around it: "
+                "a body, a room, lamps, a moving camera, speech"
+            )
+        return ""  # that of the class
+
     def run(self, context: Any) -> None:
         # in Blender's folder for user files, where an update of the add-on leaves it in place
         own = Path(bpy.utils.extension_path_user(package(), path="demo", create=True)) / "capture"
@@ -333,8 +365,28 @@ class OpenDemo(HeadImport, bpy.types.Operator):
         runs = Path.home() / "STGA Demo"
         names = ("run", *(f"run {number}" for number in range(2, 1000)))
         free = next(runs / name for name in names if not has_run(runs / name))
-        context.scene.stga.run_folder = str(free)
-        context.scene.stga.minutes = DEMO_MINUTES
+        settings = context.scene.stga
+        settings.run_folder = str(free)
+        settings.minutes = DEMO_MINUTES
+        settings.shot_run = ""
+        if self.shot:
+            write_performance(own.with_name(SPEECH_FILE), demo_speech())
+            settings.shot_run = str(free.resolve())
+            settings.show_result = True
+            call(bpy.ops.stga.train, directory=str(free), minutes=DEMO_MINUTES)
+
+
+class BuildDemoShot(Edit, bpy.types.Operator):
+    """Build the demo's shot around its avatar"""
+
+    bl_options = Edit.bl_options | {"INTERNAL"}
+
+    needs = (needs_rig,)
+
+    def run(self, context: Any) -> None:
+        head = head_of(context)
+        leave_edit_mode()
+        build_shot(head, own_motion(head), capture_of(head).with_name(SPEECH_FILE))
 
 
 # Files that are dropped

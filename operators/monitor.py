@@ -86,9 +86,10 @@ def follow(
 
 
 def finish(scene: Any, kind: Kind) -> RequestState:
-    """Bring the result of a request that was waited for into the scene, but that of `Train`."""
+    """Bring the result of a request that was waited for into the scene, of `Train` only that which
+    gets the demo's shot."""
     state = _states[scene.session_uid, kind]
-    shows = kind != Kind.TRAINING
+    shows = kind != Kind.TRAINING or bool(scene.stga.shot_run)
     state = handle(scene, kind, replace(_read_status(scene, state), show_result=shows))
     while state.loading is not None:
         state = handle(scene, kind, states.SceneFree())

@@ -15,6 +15,8 @@ from ..stga_addon.schema import MAX_COUNT, alternatives, type_hints
 
 ONCE = {"SKIP_SAVE"}
 """Options of a property that holds for one call: Blender does not remember it for the next."""
+FACTOR = {"min": 0.0, "max": 1.0, "subtype": "FACTOR"}
+"""Limits of a number from 0 to 1 that is drawn as a slider."""
 DEFAULT = re.compile(r" \(default:? ([^)]*)\)")
 """Statement of the default in a help, which Blender shows by itself, or for which 0 or nothing
 stands."""

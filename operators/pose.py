@@ -9,15 +9,27 @@ from bpy.app.handlers import persistent
 
 from ..stga_addon.capture.open import open_capture
 from ..stga_addon.driving.head_map import head_map
-from ..stga_addon.errors import StgaError
+from ..stga_addon.errors import StgaError, shorten
 from ..stga_addon.scene import tags
 from ..stga_addon.scene.compat import select_bones
 from ..stga_addon.scene.objects import Identity, leave_edit_mode, show_kind
-from ..stga_addon.scene.rig import keyframes
+from ..stga_addon.scene.rig import keyframes, poses
 from ..stga_addon.scene.rig.head import usable_rig
 from ..stga_addon.scene.rig.motion import mirror_pose
-from . import common, timers
-from .common import AtEnd, Edit, head_of, need, needs_bones, needs_own_head, needs_rig, rig_or_none
+from . import common, options, timers
+from .common import (
+    AtEnd,
+    Edit,
+    head_of,
+    need,
+    needs_bones,
+    needs_own_head,
+    needs_rig,
+    needs_rig_or_shapes,
+    rig_or_none,
+    rig_or_shapes,
+)
+from .options import FACTOR, ONCE
 from .windows import push_undo, redraw
 
 POLL_INTERVAL_S = 0.3
@@ -90,6 +102,70 @@ class MirrorPose(Edit, bpy.types.Operator):
             )
 
 
+# Poses
+
+
+class SavePose(Edit, bpy.types.Operator):
+    """Store the pose in the asset browser: sliders that are not 0, and bones that are turned"""
+
+    needs = (needs_rig_or_shapes,)
+
+    name: options.text("Name", "Name of the pose", default="Pose", options=ONCE)
+    sliders: options.boolean("Sliders", "Store sliders that are not 0", default=True, options=ONCE)
+    bones: options.boolean(
+        "Bones",
+        "Store neck, jaw and eyes as far as they are turned; not where the head is",
+        default=True,
+        options=ONCE,
+    )
+
+    def invoke(self, context: Any, event: Any) -> set[str]:
+        chosen: set[str] = context.window_manager.invoke_props_dialog(self)
+        return chosen
+
+    def run(self, context: Any) -> None:
+        head = head_of(context)
+        parts = [part for part in poses.PARTS if getattr(self, part)]
+        action = poses.save_pose(head, rig_or_shapes(head), self.name, parts)
+        self.inform(f"{action.name}: is in the asset browser, and in Poses")
+
+
+def _list_poses(owner: Any, context: Any, text: str) -> list[str]:
+    return [action.name for action in poses.poses()]
+
+
+class ApplyPose(Edit, bpy.types.Operator):
+    """Give the head a pose of the asset browser; sliders and bones that are not in it stay"""
+
+    needs = (needs_rig_or_shapes,)
+
+    pose: options.text("Pose", "Name of the pose", search=_list_poses, options=ONCE)
+    strength: options.number(
+        "Strength", "1: the pose; 0.5: halfway to it", default=1.0, **FACTOR, options=ONCE
+    )
+    keyframe: options.boolean(
+        "Keyframe", "Keyframe what the pose changes, in the current frame", options=ONCE
+    )
+
+    def run(self, context: Any) -> None:
+        head = head_of(context)
+        rig = rig_or_shapes(head)
+        action = next((each for each in poses.poses() if each.name == self.pose), None)
+        if action is None:
+            raise StgaError(f"{self.pose}: is no pose of this file; save one, or append one")
+        keyed = self.keyframe or context.scene.tool_settings.use_keyframe_insert_auto
+        for owner in filter(None, (rig, head.data.shape_keys) if keyed else ()):
+            keyframes.check_keyable(owner)
+        applied = poses.apply_pose(head, rig, action, self.strength)
+        for key in applied.sliders if keyed else ():
+            key.keyframe_insert("value")
+        for bone in applied.bones if keyed else ():
+            bone.keyframe_insert("rotation_quaternion")
+        if applied.missing:
+            lacks = f"lacks {shorten(', '.join(applied.missing))} of the pose {action.name}"
+            self.warn(f"{head.name}: {lacks}; the rest was applied")
+
+
 # Sliders
 
 
@@ -110,6 +186,7 @@ class AddArkitControls(Edit, bpy.types.Operator):
     def run(self, context: Any) -> None:
         head = head_of(context)
         keyframes.add_shapes(head, *_compute_shapes(common.capture_source(head), head.name))
+        poses.bring_presets(head)
 
 
 def _compute_shapes(source: tuple[Any, ...], name: str) -> tuple[Any, ...]:
@@ -167,6 +244,7 @@ class _Sliders:
             if head.mode == "EDIT":
                 return POLL_INTERVAL_S
             keyframes.add_shapes(head, *self._made[0])
+            poses.bring_presets(head)
             push_undo()
             redraw()
         return None

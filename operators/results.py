@@ -281,6 +281,17 @@ def _show_avatar(scene: Any, state: RequestState) -> Answer:
     return Shown(undoable=not is_update)
 
 
+def _show_trained(scene: Any, state: RequestState) -> Answer:
+    """Show the avatar; around that of the demo's shot, the shot."""
+    answer = _show_avatar(scene, state)
+    is_result = state.loading_path.name == AVATAR
+    if not (isinstance(answer, Shown) and is_result and scene.stga.shot_run == str(_run(state))):
+        return answer
+    scene.stga.shot_run = ""
+    with _in_panel(scene, request_head(scene, state)):
+        return _operate(scene, bpy.ops.stga.build_demo_shot)
+
+
 def _show_made(scene: Any, state: RequestState) -> Answer:
     """Import the capture once it is tracked; then show the previews and the avatar, at last on the
     head that training refined."""
@@ -392,7 +403,7 @@ ADDS = {Kind.LIGHT: splat_object.store_light, Kind.EXACT: splat_object.store_lin
 """Kind of request -> function that stores what it adds to a run's avatar in the object that shows
 it."""
 SHOW = {
-    Kind.TRAINING: _show_avatar,
+    Kind.TRAINING: _show_trained,
     Kind.TRACKING: _import,
     Kind.AVATAR: _show_made,
     Kind.ANALYSIS: _fill_effects,

@@ -22,7 +22,6 @@ BLENDER = {"bpy", "bmesh", "gpu", "mathutils", "bl_ext"}
 BLENDERS = (
     "stga_addon/scene/",
     "stga_addon/development/demo/studio.py",
-    "stga_addon/development/demo/shot.py",
     "operators/",
     "ui/",
 )

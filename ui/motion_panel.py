@@ -15,6 +15,7 @@ from ..stga_addon.jobs.table import Kind
 from ..stga_addon.scene.objects import mover_of
 from ..stga_addon.scene.rig.keyframes import EXPRESSION_KEY, IDENTITY_KEY
 from ..stga_addon.scene.rig.motion import outside_now, stored_range
+from ..stga_addon.scene.rig.poses import poses
 from .sidebar import ClosedPanel, SidebarPanel, draw_running, draw_text
 
 MAX_SLIDERS = 10  # the first components vary most
@@ -73,6 +74,33 @@ class FacePanel(SidebarPanel, bpy.types.Panel):
         column = self.layout.column(align=True)
         for name in [name for name in ARKIT_SHAPES if name in keys]:
             column.prop(keys[name], "value", text=name, slider=True)
+
+
+class PosesPanel(ClosedPanel, bpy.types.Panel):
+    """Poses of the asset browser, a button each."""
+
+    bl_label = "Poses"
+    bl_parent_id = MotionPanel.bl_idname
+
+    @classmethod
+    def poll(cls, context: Any) -> bool:
+        return is_head(context.scene.stga.head)
+
+    def draw(self, context: Any) -> None:
+        layout = self.layout
+        settings = context.scene.stga
+        row = layout.row(align=True)
+        row.prop(settings, "pose_strength", slider=True)
+        row.prop(settings, "key_pose", text="", icon="KEY_HLT", toggle=True)
+        grid = layout.grid_flow(columns=2, align=True)
+        for action in poses():
+            button = grid.operator("stga.apply_pose", text=action.name)
+            button.pose = action.name
+            button.strength = settings.pose_strength
+            button.keyframe = settings.key_pose
+        row = layout.row(align=True)
+        row.operator("stga.save_pose", text="Save Pose…", icon="ADD")
+        row.operator("stga.mirror_pose", icon="MOD_MIRROR")
 
 
 class TrainedPanel(ClosedPanel, bpy.types.Panel):

@@ -76,6 +76,8 @@ class NextStepPanel(SidebarPanel, bpy.types.Panel):
             layout.operator("stga.import_capture", icon="IMPORT")
             if has_demo:
                 layout.operator("stga.open_demo", icon="USER")
+                shot = layout.operator("stga.open_demo", text="Open Demo Shot", icon="SCENE")
+                shot.shot = True
         elif monitor.state_of(scene, Kind.TRAINING).is_running:
             appear = "splats appear on the head soon"
             done = appear if settings.splats is None else "the splats follow as it goes on"

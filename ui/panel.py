@@ -18,6 +18,7 @@ CLASSES = (
     show_panel.ShowPanel,
     show_panel.LightingPanel,
     motion_panel.MotionPanel,
+    motion_panel.PosesPanel,
     motion_panel.FacePanel,
     motion_panel.DrivePanel,
     motion_panel.TrainedPanel,

@@ -8,6 +8,7 @@ import bpy
 from ..operators import options
 from ..operators.common import AtEnd, package, register_classes
 from ..operators.drive import DriveSettings
+from ..operators.options import FACTOR
 from ..operators.results import follow_head, panel_path, store_panel_path
 from ..operators.track import TrackOptions
 from ..operators.train import ExtendOptions, RefineOptions, TrainOptions, preset_property
@@ -130,6 +131,7 @@ class SceneSettings(TrainOptions, bpy.types.PropertyGroup):
     avatar_shown: _hidden(bpy.props.BoolProperty)
     training_run: _hidden(bpy.props.StringProperty)
     result_shown: _hidden(bpy.props.BoolProperty)
+    shot_run: _hidden(bpy.props.StringProperty)  # the run whose avatar gets the demo's shot
     # heads that these are trained for (`operators.results.HEADS`)
     avatar_head: object_property("Head", "Head of the avatar of a video", options={"HIDDEN"})
     training_head: object_property("Head", "Head that is trained", options={"HIDDEN"})
@@ -144,6 +146,10 @@ class SceneSettings(TrainOptions, bpy.types.PropertyGroup):
         poll=_is_body,
     )
     body_bone: options.text("Bone", "Bone that carries the avatar, such as the body's neck")
+    pose_strength: options.number(
+        "Strength", "Of the next pose; 1: the pose, 0.5: halfway to it", default=1.0, **FACTOR
+    )
+    key_pose: options.boolean("Keyframe", "Keyframe what the next pose changes")
     drive: bpy.props.PointerProperty(type=DriveSettings)
     splats: object_property("Splats", "Splats whose display is set here")
     run_folder: options.path(

@@ -228,6 +228,7 @@ class RenderPanel(bpy.types.Panel):
             layout.prop(context.scene.eevee, "taa_render_samples", text="Samples")
         layout.prop(context.scene.render, "film_transparent", text="Transparent Film")
         layout.prop(context.view_layer, "use_pass_z", text="Depth Pass")
+        layout.prop(context.view_layer, "use_pass_vector", text="Vector Pass")
         if missing_packages() and not has_gpu_context():
             renderer = "Rendered by another Python" if has_python else "No Python here can render"
             lacks = f"Blender's Python lacks {', '.join(missing_packages())}"

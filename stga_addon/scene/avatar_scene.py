@@ -28,6 +28,7 @@ from .objects import (
     show_kind,
 )
 from .rig.head import import_head
+from .rig.poses import bring_presets
 
 DISTANCE = 2.2
 """Distance from the viewport's eye to the head's center, in radii of the sphere around its bounding
@@ -46,7 +47,7 @@ def frame_head(head: Any, camera: Any, screens: Iterable[Any]) -> None:
     high = matrix @ Vector(vertices.max(0))
     center = (low + high) / 2
     radius = (high - low).length / 2
-    for area in _viewports(screens):
+    for area in viewports(screens):
         space = area.spaces.active
         space.overlay.show_relationship_lines = False
         region = space.region_3d
@@ -105,7 +106,7 @@ def open_sidebar(tab: str, screens: Iterable[Any]) -> bool:
     """Open the viewports' sidebar at a tab; whether they show it: Blender knows a sidebar's tabs
     only once it was drawn, so call it until it returns True."""
     is_shown = True
-    for area in _viewports(screens):
+    for area in viewports(screens):
         area.spaces.active.show_region_ui = True
         sidebar = next(region for region in area.regions if region.type == "UI")
         with suppress(AttributeError, TypeError):  # not drawn yet
@@ -114,7 +115,8 @@ def open_sidebar(tab: str, screens: Iterable[Any]) -> bool:
     return is_shown
 
 
-def _viewports(screens: Iterable[Any]) -> list[Any]:
+def viewports(screens: Iterable[Any]) -> list[Any]:
+    """3D viewports of the screens, as areas."""
     return [area for screen in screens for area in screen.areas if area.type == "VIEW_3D"]
 
 
@@ -124,6 +126,7 @@ WORLD_NAME = "World splats"
 def set_up_head(capture: Capture) -> Any:
     """Import the capture's head and cameras into the empty scene; the head. Raises StgaError."""
     head = import_head(capture)
+    bring_presets(head)
     model = capture.flame_file
     # so that Train works in the saved file
     head[tags.FLAME_MODEL] = "" if model is None else str(model.resolve())

@@ -51,9 +51,21 @@ def action_curves(owner: Any) -> Any:
         return action.fcurves
     if animation.action_slot is None:
         animation.action_slot = action.slots.new(id_type=owner.id_type, name=owner.name)
+    return _slot_curves(action, animation.action_slot)
+
+
+def new_action_curves(action: Any, id_type: str, name: str) -> Any:
+    """The f-curves of a new slot of an action for a kind of data-block ("OBJECT", "KEY"); of
+    all kinds where actions have no slots."""
+    if not SLOTTED_ACTIONS:
+        return action.fcurves
+    return _slot_curves(action, action.slots.new(id_type=id_type, name=name))
+
+
+def _slot_curves(action: Any, slot: Any) -> Any:
     layer = action.layers[0] if action.layers else action.layers.new("Layer")
     strip = layer.strips[0] if layer.strips else layer.strips.new(type="KEYFRAME")
-    return strip.channelbag(animation.action_slot, ensure=True).fcurves
+    return strip.channelbag(slot, ensure=True).fcurves
 
 
 def strip_curves(strip: Any) -> Any:

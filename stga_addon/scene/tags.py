@@ -33,6 +33,7 @@ STORED_IN = "stga_stored_in"  # on owners of paths: the .blend file that these w
 WORLD = "stga_world"  # on splats of a run's world: their file
 PERFORMANCE = "stga_performance"  # on an action: keyframes of another motion than the capture's
 IMPORTED = "stga_imported"  # on an action: digest of the keyframes that an import gave it
+POSE = "stga_pose"  # on an action: a pose in the asset browser, `rig.poses`
 HELD = "stga_held"  # on an action: the part of the capture's motion that is held outside of it
 
 SET = "stga_set"  # on a scene: the scene that renders its set, `render.film_set`

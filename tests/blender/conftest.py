@@ -105,7 +105,8 @@ def stand_in(extension, monkeypatch, tmp_path):
 
     def replace(body):
         python = write_interpreter(tmp_path / "python", body)
-        monkeypatch.setattr(extension.operators.train, "training_python", lambda context: python)
+        found = lambda context, given="": python  # noqa: E731
+        monkeypatch.setattr(extension.operators.train, "training_python", found)
 
     return replace
 

@@ -174,6 +174,58 @@ def assert_renders(folder, avatar, head, camera, background=0.0, what=""):
     return expected
 
 
+def vectors(folder):
+    """(H, W, 4) of the pass Vector of one image."""
+    render(folder)
+    found = read_exr(folder / "image.exr").items()
+    return np.stack(
+        [next(v for k, v in found if k.endswith(f"Vector.{c}")) for c in "XYZW"], axis=-1
+    )
+
+
+@pytest.mark.parametrize("device", ["GPU", "CPU"])
+def test_vectors_are_those_of_cycles(device, monkeypatch, tmp_path):
+    """Catches motion of another sign, order, unit or frame than Cycles' of the mesh below the
+    splats, without what the camera or the head's shape does, and a pass that nobody asked for."""
+    if device == "CPU":
+        monkeypatch.setattr(engine, "SplatRenderer", no_context)
+    avatar = textured(avatar_of("stga"), -4.5)
+    avatar.splats.opacity[:] = 8.0
+    shown, head = show(avatar)
+    camera = camera_at()
+    scene = bpy.context.scene
+    for frame, place in {4: (0.0, 0.02, 0.0), 5: (0.0, 0.0, 0.0), 6: (0.03, 0.01, 0.04)}.items():
+        head.delta_location = place
+        head.keyframe_insert("delta_location", frame=frame)
+    for frame, x in {3: 0.0, 7: 0.05}.items():
+        camera.delta_location.x = x
+        camera.keyframe_insert("delta_location", index=0, frame=frame)
+    for curve in [*compat.action_curves(head), *compat.action_curves(camera)]:
+        for key in curve.keyframe_points:
+            key.interpolation = "LINEAR"
+    scene.frame_set(5)
+    alpha = render(tmp_path)["A"]
+    assert not any("Vector" in name for name in read_exr(tmp_path / "image.exr"))
+    scene.view_layers[0].use_pass_vector = True
+    ours = vectors(tmp_path)
+    assert scene.frame_current_final == 5
+    assert not ours[alpha == 0].any()
+    shown.hide_render = True
+    head.hide_render = False
+    scene.render.engine = "CYCLES"
+    scene.cycles.samples = 1
+    scene.cycles.use_denoising = False
+    scene.cycles.pixel_filter_type = "BOX"
+    theirs = vectors(tmp_path)
+    covered = (alpha > 0.99) & theirs.any(axis=-1)
+    assert covered.sum() > 200
+    sizes = np.abs(theirs[covered]).mean(axis=0)
+    assert sizes.min() > 0.5, "hardly anything moves"
+    error = np.abs(ours - theirs)[covered]
+    assert (np.median(error, axis=0) < 0.1 * sizes).all()
+    assert (np.quantile(error, 0.9, axis=0) < 0.3 * sizes).all()
+
+
 def no_context():
     raise SystemError("GPU functions are not available")
 

@@ -19,6 +19,8 @@ from ...capture.images import read_image
 from ...capture.model import Capture, evenly_spread
 from ...capture.open import open_capture
 from ...cli.commands import carry_out
+from ...driving.demo_speech import SPEECH_FILE, demo_speech
+from ...driving.inverse import write_performance
 from ...errors import StgaError
 from ...export.formats import export_avatar
 from ...export.playback import Playback
@@ -52,7 +54,8 @@ def run_demo(
     """Unpack the demo's capture, import it into Blender, select, train, and show the avatar.
 
     budget: the setting that limits training, `seconds` or `iterations`; device: one of
-    `choose_device`; with_shot: also write shot.blend, a film scene around the avatar.
+    `choose_device`; with_shot: also write shot.blend, a film scene around the avatar,
+    and speech.csv, the performance that it speaks from.
 
     Leaves avatar.npz, avatar.html, demo.blend, comparison.png, selection.png and metrics.json in
     `out`. Needs Blender's bpy. Raises StgaError where the folder cannot be written or Blender
@@ -68,9 +71,11 @@ def run_demo(
     avatar = _train(capture, out, budget, selection, device)
     error = _show(capture, avatar, head, out / "demo.blend")
     if with_shot:
-        from .shot import make_shot  # needs Blender
+        from ...scene.demo_shot import make_shot  # needs Blender
 
-        make_shot(out / "shot.blend")
+        assert capture.flame is not None
+        write_performance(out / SPEECH_FILE, demo_speech())
+        make_shot(out / "shot.blend", capture.flame, out / SPEECH_FILE)
     _picture(capture, avatar, selection, out)
     _page(capture, avatar, selection, out / "avatar.html")
     metrics = {

@@ -23,7 +23,7 @@ from ..gpu.renderer import CompositeTarget, SplatRenderer
 from ..layers import SceneLayer
 from ..light import settings_values
 from ..objects import Warn, after_render, log_warning
-from . import lens
+from . import lens, motion_vectors
 from .film_set import shows_set, update_set
 from .lens import Sample
 from .scene_splats import SplatCache, all_layers
@@ -100,6 +100,8 @@ class SplatsEngine(bpy.types.RenderEngine):  # type: ignore[misc]
         self.register_pass(scene, renderlayer, "Combined", 4, "RGBA", "COLOR")
         if renderlayer.use_pass_z:
             self.register_pass(scene, renderlayer, "Depth", 1, "Z", "VALUE")
+        if renderlayer.use_pass_vector:
+            self.register_pass(scene, renderlayer, "Vector", 4, "XYZW", "VECTOR")
 
     def render(self, depsgraph: Any) -> None:
         # x, y, width, height in pixels of the render region, from below, rounded as by Blender
@@ -165,6 +167,11 @@ class SplatsEngine(bpy.types.RenderEngine):  # type: ignore[misc]
                 self.update_progress((taken + 1) / len(samples))
                 if self.test_break():
                     break
+            passes = dict[str, np.ndarray]()
+            if depsgraph.view_layer.use_pass_vector:
+                offset = -1.0
+                place = partial(self._view, depsgraph, border, view_name, lens.SHARP)
+                passes["Vector"] = self._motion(depsgraph, frame, place, cache, renderers)
         finally:
             if offset:
                 self._go_to(frame)
@@ -172,7 +179,32 @@ class SplatsEngine(bpy.types.RenderEngine):  # type: ignore[misc]
         chosen = 0.0 if with_set else depsgraph.view_layer.pass_alpha_threshold
         covered = fraction / count >= max(chosen, MIN_ALPHA)
         depth = np.where(covered, distance / np.maximum(fraction, MIN_ALPHA), BACKGROUND_DEPTH)
-        return {"Combined": color / count, "Depth": depth[..., None]}
+        return passes | {"Combined": color / count, "Depth": depth[..., None]}
+
+    def _motion(
+        self,
+        depsgraph: Any,
+        frame: float,
+        view_now: Callable[[], View],
+        cache: SplatCache,
+        renderers: list[SplatRenderer],
+    ) -> np.ndarray:
+        """(H, W, 4) pixels, right and up: previous minus current place, current minus next.
+        view_now: of the frame that the scene is at."""
+        places = []
+        for offset in (-1.0, 1.0, 0.0):
+            self._go_to(frame + offset)
+            cache.frame_changed()
+            layers = all_layers(depsgraph, cache)
+            view = view_now()
+            places.append(motion_vectors.pixel_centers(layers, view))
+        before, after, now = places
+        found = []
+        for other in (before, after):
+            shown, scale = motion_vectors.painted(layers, motion_vectors.moved(now, other))
+            image = self._image(shown, view, renderers)
+            found.append(motion_vectors.read_motion(image, scale, MIN_ALPHA))
+        return np.concatenate([found[0], -found[1]], axis=2)
 
     def _go_to(self, frame: float) -> None:
         whole = int(np.floor(frame))

@@ -14,7 +14,9 @@ from stga_addon.cli.main import main
 from stga_addon.development.demo import run
 from stga_addon.development.demo.capture import unpack_capture
 from stga_addon.files import read_json, write_json
+from stga_addon.scene.compat import all_curves
 from stga_addon.scene.render.film_set import shows_set
+from stga_addon.scene.rig.head import find_rig
 
 bpy = pytest.importorskip("bpy", reason="Blender's module bpy is not installed")
 
@@ -42,7 +44,8 @@ def unpack_few(folder):
 
 @pytest.mark.slow
 def test_demo(tmp_path, monkeypatch):
-    """Catches a break in the README's first command, and a demo.blend that is empty."""
+    """Catches a break in the README's first command, a demo.blend that is empty, and a shot that
+    plays another performance than its file, or without the keyframes over it."""
     monkeypatch.setattr(run, "unpack_capture", unpack_few)
     demo = tmp_path / "demo"
     run.run_demo(demo, {"iterations": 60}, with_shot=True)
@@ -76,14 +79,42 @@ def test_demo(tmp_path, monkeypatch):
         )
         assert region.view_distance < 1, "the head is a dot on Blender's grid"
     bpy.ops.wm.open_mainfile(filepath=str(demo / "shot.blend"))
+    check_shot(demo / "speech.csv")
+
+
+def check_shot(speech):
+    """Against the file's own rows, read as a table."""
     scene = bpy.context.scene
     assert shows_set(scene)
     head = next(each for each in scene.objects if each.get("stga_kind") == "head")
+    keys = head.data.shape_keys
+    rows = np.genfromtxt(speech, delimiter=",", names=True)
+    assert len(rows) == 60 * scene.frame_end / scene.render.fps
+    strip = keys.animation_data.nla_tracks[-1].strips[0]
+    assert strip.action["stga_performance"]
+    assert (strip.frame_start, strip.frame_end) == (scene.frame_start, scene.frame_end)
+    own = all_curves(keys.animation_data.action)
+    assert {curve.data_path.split('"')[1] for curve in own} == {"eyeBlinkLeft", "eyeBlinkRight"}
     turned = []
-    for frame in (scene.frame_start, scene.frame_end):
+    lids = []
+    gazes = []
+    for frame in range(scene.frame_start, scene.frame_end + 1):
         scene.frame_set(frame)
+        spoken = rows[round(60 * (frame - 1) / scene.render.fps)]
+        if (60 * (frame - 1) / scene.render.fps) % 1 == 0:  # a row of the file
+            for name in ("jawOpen", "mouthClose", "mouthSmileLeft", "browInnerUp"):
+                value = spoken[name[0].upper() + name[1:]]
+                assert keys.key_blocks[name].value == pytest.approx(value, abs=1e-4)
+        lids.append(keys.key_blocks["eyeBlinkLeft"].value - spoken["EyeBlinkLeft"])
         turned.append(head.matrix_world.to_quaternion())
-    assert turned[0].rotation_difference(turned[1]).angle > 0.4, "the head stays as the body turns"
+        eye = find_rig(head).pose.bones["left_eye"]
+        gazes.append(eye.matrix_basis.to_euler().y)
+    assert turned[0].rotation_difference(turned[-1]).angle > 0.4, "the head stays as the body turns"
+    assert max(rows["JawOpen"]) > 0.3
+    assert max(lids) == pytest.approx(0.9, abs=0.02)
+    assert np.count_nonzero(np.array(lids) > 0.01) < 10, "more than a blink"
+    assert np.degrees(max(gazes)) == pytest.approx(16, abs=0.1)
+    assert min(gazes) == pytest.approx(0, abs=1e-3)
 
 
 @pytest.mark.parametrize(

@@ -9,16 +9,24 @@ import bpy
 import numpy as np
 from mathutils import Vector
 
-from ...scene import light, tags
-from ...scene.arrays import evaluated_vertices
-from ...scene.compat import enable_nodes
-from ...scene.duplicate import attach_to_bone
-from ...scene.light import lighting_settings
-from ...scene.objects import save_file, set_frames_per_second
-from ...scene.render import engine
-from ...scene.render.film_set import show_set
-from ...scene.render.scene_splats import SplatCache, level_exposure
-from ...scene.render.viewport_display import ENGINE
+from ..driving.open_motion import MotionOptions, performed
+from ..driving.performers import read_performance
+from ..flame.quaternions import from_axis_angle
+from ..flame.sequence import FlameSequence
+from . import light, tags
+from .arrays import evaluated_vertices
+from .avatar_scene import viewports
+from .compat import action_curves, enable_nodes
+from .duplicate import attach_to_bone
+from .light import lighting_settings
+from .objects import save_file, set_frames_per_second
+from .render import engine
+from .render.film_set import show_set
+from .render.scene_splats import SplatCache, level_exposure
+from .render.viewport_display import ENGINE
+from .rig.head import usable_rig
+from .rig.keyframes import EYES, Placement, key_value_path, rotation_path
+from .rig.motion import apply_motion
 
 FRAMES = 96
 FRAMES_PER_SECOND = 24
@@ -46,31 +54,20 @@ FACE_M = 0.0, -0.07, 0.04
 """Offset from the neck to the face, at which the camera looks."""
 CORNERS = 32
 """Corners of a ring."""
-SPEECH = {
-    1: {},
-    8: {"jawOpen": 0.35},
-    13: {"mouthFunnel": 0.5, "jawOpen": 0.15},
-    18: {"mouthClose": 0.1},
-    24: {"jawOpen": 0.45, "mouthSmileLeft": 0.2, "mouthSmileRight": 0.2},
-    29: {"mouthPucker": 0.6},
-    35: {"jawOpen": 0.25, "mouthStretchLeft": 0.3, "mouthStretchRight": 0.3},
-    42: {},
-    60: {"mouthSmileLeft": 0.7, "mouthSmileRight": 0.7, "cheekSquintLeft": 0.4},
-    96: {"mouthSmileLeft": 0.5, "mouthSmileRight": 0.5},
-}
-"""Frame -> sliders of the mouth."""
-BLINK = {44: 0.0, 46: 1.0, 48: 1.0, 51: 0.0}
-"""Frame -> both lids."""
+BLINK = {44: 0.0, 46: 0.9, 48: 0.9, 51: 0.0}
+"""Frame -> how much more both lids close than in the performance."""
+LOOK_DEG = {62: 0.0, 65: 16.0, 82: 16.0, 86: 0.0}
+"""Frame -> turn of both eyes to the person's left."""
 TURN_DEG = {1: -14.0, 40: 6.0, 96: 16.0}
 """Frame -> turn of the body about its spine."""
 
 
-def make_shot(path: Path) -> None:
+def make_shot(path: Path, person: FlameSequence, speech: Path) -> None:
     """Build the shot around the head with splats in the open file, and save it. Raises
     StgaError."""
     heads = [each for each in bpy.context.scene.objects if each.get(tags.KIND) == tags.HEAD]
     with _registered():
-        _build(heads[0])
+        build_shot(heads[0], person, speech)
         save_file(path)
 
 
@@ -89,20 +86,23 @@ def _registered() -> Iterator[None]:
         light.unregister()
 
 
-def _build(head: Any) -> None:
+def build_shot(head: Any, person: FlameSequence, speech: Path) -> None:
+    """Build the shot around a head with splats in the open scene. person: of the head; speech: the
+    performance that it speaks from. Raises StgaError."""
     scene = bpy.context.scene
+    set_frames_per_second(scene, FRAMES_PER_SECOND)
+    _act(head, person, speech)
     scene.frame_start = 1
     scene.frame_end = FRAMES
-    set_frames_per_second(scene, FRAMES_PER_SECOND)
     vertices = evaluated_vertices(head) @ np.array(head.matrix_world)[:3, :3].T
     vertices += np.array(head.matrix_world)[:3, 3]
     middle = Vector((vertices.min(0) + vertices.max(0)) / 2)
     neck = Vector((middle.x, middle.y + NECK_BEHIND_M, vertices[:, 2].min()))
     armature = _body(neck)
     attach_to_bone(head, armature, "chest")
-    _act(head, armature)
+    _turn(armature)
     _room(middle)
-    _lamps(middle)
+    _lamps(scene, middle)
     _camera(scene, middle)
     render = scene.render
     render.engine = ENGINE
@@ -111,6 +111,8 @@ def _build(head: Any) -> None:
     scene.eevee.taa_render_samples = SAMPLES
     lighting_settings(scene).mode = "scene"
     scene.frame_set(1)
+    for area in viewports(bpy.data.screens):
+        area.spaces.active.region_3d.view_perspective = "CAMERA"
     show_set(scene)
     exposure = level_exposure(SplatCache())
     if exposure is not None:
@@ -182,34 +184,39 @@ def _body(neck: Vector) -> Any:
     return armature
 
 
-def _act(head: Any, armature: Any) -> None:
-    """Keyframes of the mouth, the lids, the eyes and the body."""
+def _act(head: Any, person: FlameSequence, speech: Path) -> None:
+    """The performance as a strip, and keyframes of lids and eyes that are added to it."""
+    performance = read_performance(speech)
+    rate = float(FRAMES_PER_SECOND)
+    motion = performed(performance, person, head.name, MotionOptions(), fps=rate)
+    frames = motion.sequence.frames()
+    apply_motion(head, frames, Placement(1, speech.stem, as_strip=True))
     keys = head.data.shape_keys
-    rig = next((each for each in head.parent.children if each.get(tags.KIND) == tags.RIG), None)
-    for owner in (keys, rig):  # the expressions of the capture
-        if owner is not None and owner.animation_data is not None:
-            owner.animation_data.action = None
-    for block in keys.key_blocks[1:]:
-        if not block.name.startswith("identity"):
-            block.value = 0.0
-    used = sorted({name for pose in SPEECH.values() for name in pose})
-    for frame, pose in SPEECH.items():
-        _key_sliders(keys, frame, {name: pose.get(name, 0.0) for name in used})
-    for frame, value in BLINK.items():
-        _key_sliders(keys, frame, {"eyeBlinkLeft": value, "eyeBlinkRight": value})
-    chest = armature.pose.bones["chest"]
-    chest.rotation_mode = "XYZ"
-    for frame, angle in TURN_DEG.items():
-        chest.rotation_euler.y = np.radians(angle)
-        chest.keyframe_insert("rotation_euler", index=1, frame=frame)
+    rig = usable_rig(head)
+    keys.animation_data.action_blend_type = "ADD"
+    rig.animation_data.action_blend_type = "COMBINE"
+    for side in ("Left", "Right"):
+        _key(keys, key_value_path(f"eyeBlink{side}"), {f: [v] for f, v in BLINK.items()})
+    turns = from_axis_angle(np.radians([[0, angle, 0] for angle in LOOK_DEG.values()]))
+    for eye in EYES:
+        _key(rig, rotation_path(eye), dict(zip(LOOK_DEG, turns.tolist(), strict=True)))
+    bpy.context.scene.frame_set(1)
 
 
-def _key_sliders(keys: Any, frame: int, values: Mapping[str, float]) -> None:
-    for name, value in values.items():
-        block = keys.key_blocks.get(name)
-        if block is not None:
-            block.value = value
-            block.keyframe_insert("value", frame=frame)
+def _turn(armature: Any) -> None:
+    """Keyframes of the body."""
+    armature.pose.bones["chest"].rotation_mode = "XYZ"
+    turns = {frame: [0.0, np.radians(angle), 0.0] for frame, angle in TURN_DEG.items()}
+    _key(armature, 'pose.bones["chest"].rotation_euler', turns)
+
+
+def _key(owner: Any, path: str, values: Mapping[int, Sequence[float]]) -> None:
+    """Keyframe a property of `owner`, frame -> its elements."""
+    curves = action_curves(owner)
+    for index in range(len(next(iter(values.values())))):
+        curve = curves.new(path, index=index)
+        for frame, elements in values.items():
+            curve.keyframe_points.insert(frame, elements[index])
 
 
 def _room(middle: Vector) -> None:
@@ -235,8 +242,11 @@ def _room(middle: Vector) -> None:
         _painted(_placed(name, _lathe(name, rings), middle + Vector(at)), color, 0.3)
 
 
-def _lamps(middle: Vector) -> None:
-    """A warm lamp from the left and above, a cool one from behind, and a dim world."""
+def _lamps(scene: Any, middle: Vector) -> None:
+    """A warm lamp from the left and above, a cool one from behind, and a dim world, in place of the
+    scene's light."""
+    for lamp in [each for each in scene.objects if each.type == "LIGHT"]:
+        lamp.hide_render = True
     for name, at, watts, size, color in (
         ("Key", (-0.8, -0.9, 0.6), 22.0, 0.5, (1.0, 0.86, 0.7)),
         ("Rim", (0.7, 0.8, 0.5), 18.0, 0.4, (0.65, 0.8, 1.0)),
@@ -247,7 +257,8 @@ def _lamps(middle: Vector) -> None:
         data.color = color
         lamp = _placed(name, data, middle + Vector(at))
         lamp.rotation_euler = Vector(at).to_track_quat("Z", "Y").to_euler()
-    background = enable_nodes(bpy.context.scene.world).nodes["Background"]
+    scene.world = bpy.data.worlds.new("Shot")
+    background = enable_nodes(scene.world).nodes["Background"]
     background.inputs["Color"].default_value = (0.05, 0.06, 0.08, 1.0)
 
 
