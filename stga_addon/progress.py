@@ -86,7 +86,7 @@ class TimeLeft:
 
 
 MAX_REPORTED_FRACTION = 0.99
-"""Before the end: 100 % is said of what is done."""
+"""Largest fraction that is reported before the end: 100 % means finished work."""
 
 
 class Clock:

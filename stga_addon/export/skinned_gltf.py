@@ -133,7 +133,7 @@ IRRADIANCE_STEPS = 1023
 MIN_SLIDER_RANGE = 1.0
 """Sliders reach ±this at least."""
 SLIDER_HEADROOM = 1.5
-"""And beyond the motion by this factor."""
+"""Factor by which sliders also reach beyond the motion."""
 
 
 def skinned_glb(rigged: RiggedAvatar, playback: Playback, exact: bool = False) -> bytes:

@@ -239,7 +239,7 @@ WRITER = "tracking is writing this capture"
 MAX_MISFIT = 0.5
 """Median fraction of the head's pixels beyond which the avatar is another person's."""
 TRACKING_FRACTION = 0.5
-"""Of the progress, before an avatar tracks or is trained."""
+"""Fraction of the progress before an avatar tracks or is trained."""
 
 
 def refuse_tracked(request: Track) -> None:

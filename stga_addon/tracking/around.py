@@ -39,7 +39,7 @@ FRAMES = 40
 MIN_IMAGES = 8
 """Images with a camera, below which the take is not one of many cameras."""
 MIN_IMAGES_FRACTION = 0.5
-"""Of the images that were looked at."""
+"""Least fraction of the chosen images that get a camera."""
 MIN_ON_HEAD = 30
 """Points on the face, below which it was the room alone whose structure was found."""
 TIME_LIMIT_S = 900.0

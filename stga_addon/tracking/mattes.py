@@ -50,13 +50,14 @@ HEAD_MARGIN_FRACTION = 0.06
 BAND_FRACTION = 0.018
 """Half of the soft band's width as a fraction of the head's size."""
 HAIR_BAND_FRACTION = 0.1
-"""The same within the outline where hair stands out from the tracked head: the backdrop is seen
+"""The same within the outline where hair stands out from the tracked head: the backdrop is visible
 between strands."""
 HAIR_ROWS_FRACTION = 0.6
-"""Of the tracked head's height, from its top, in which such hair is; below it are clothes."""
+"""Upper part of the tracked head in which hair stands out, as a fraction of its height; below it
+are clothes."""
 OPAQUE_HAIR_FRACTION = 0.9
-"""Of the way from the backdrop's color to the hair's, from which hair is opaque: gloss is a little
-nearer to a bright backdrop."""
+"""Position between the backdrop's color, 0, and the hair's, 1, from which on hair is opaque: gloss
+is a little nearer to a bright backdrop."""
 EVEN_COLORS_WEIGHT = 4.0
 """Weight of the variance of both sides' colors, beside SIMILAR_COLORS_LEVELS, in the confidence of
 hair's coverage: before a room and in dyed hair, a pixel's color is no evidence."""

@@ -38,9 +38,8 @@ IDENTITY_SWEEPS = (
 OUTLINE_SWEEPS = Sweep(0.003, 0.0005, 0.001), Sweep(0.003, 0.0005, 0.001)
 """Sweeps after the others where the masks' outlines are those of the skin."""
 TAKE_SWEEPS = (Sweep(0.004, 0.0005, 0.001), 300), (Sweep(0.0015, 0.0005, 0.001), 1000)
-"""At every timestep, and how many of the points that are usually found are looked for. The first
-starts at the pose of the landmarks, from which patches do not lie on the skin that they are of
-yet."""
+"""Sweeps at every timestep, and the number of mostly found points that they look for. The first
+starts at the pose of the landmarks, where patches do not yet lie on their skin."""
 SURFACE_POINTS = 2000
 """Points over the whole head."""
 SURFACE_TIMESTEPS = 6

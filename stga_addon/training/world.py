@@ -25,7 +25,8 @@ MAX_PLATE_VIEWS = 24
 MAX_PLATE_PIXELS = 500_000
 """Larger images are read smaller."""
 MATTE_MARGIN_FRACTION = 0.008
-"""Around the person, where a matte is uncertain; fraction of the image's height."""
+"""Width of the zone around the person where a matte is uncertain, as a fraction of the image's
+height."""
 PERSON = 256
 """Value above every level of a pixel, so that it is sorted behind them."""
 RADII = 24

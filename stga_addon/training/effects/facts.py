@@ -24,7 +24,7 @@ from .samples import Samples, take_samples
 MAX_TIMESTEPS = 64
 """Timesteps that are posed to measure motion, evenly spread."""
 MIN_WHITE_FRACTION = 0.1
-"""Of the pixels beside the mesh: with a white background, more of them than this are white."""
+"""Least fraction of white pixels beside the mesh with which the background is white."""
 
 
 class CaptureFacts:

@@ -34,8 +34,8 @@ MASK_EDGE_PIXELS = 3
 TRACKING_ERROR_FRACTION = 0.01
 """Foreground up to this fraction of the image's height beside the mesh counts as tracking error."""
 DEPTH_TOLERANCE_FRACTION = 0.003
-"""How far a visible triangle's center may lie behind the nearest one, as a fraction of its
-depth."""
+"""Depth of a visible triangle's center behind the nearest one, as a fraction of its depth, up to
+which it is visible."""
 
 
 @dataclass(frozen=True)
