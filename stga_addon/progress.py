@@ -13,9 +13,8 @@ import numpy as np
 
 Item = TypeVar("Item")
 
-PACE_FRACTION = (
-    0.1  # Fraction of the work, the last that was done, whose pace says how much time is left
-)
+PACE_FRACTION = 0.1
+"""Fraction of the work, the last that was done, whose pace says how much time is left."""
 MAX_OVERRUN_RATIO = 1.25  # Times what was said to be left, from which on that was too little
 MIN_PACE_S = 5.0  # For which the work's own forecast is watched before it is corrected
 MAX_STEP_FRACTION = 0.05  # Of a step; beyond, an interrupted call had done it before
@@ -67,7 +66,7 @@ class TimeLeft:
     def __init__(self, clock: Callable[[], float] = monotonic) -> None:
         self._clock = clock
         self._last = clock(), 0.0
-        # Seconds and fractions of the steps that tell the pace
+        # Seconds and fractions of the steps that determine the pace
         self._steps: deque[tuple[float, float]] = deque()
 
     def after(self, fraction: float) -> float:
@@ -148,7 +147,7 @@ def counted(
     items: Iterable[Item], total: int, report: Report, stage: str, unit: str
 ) -> Iterator[Item]:
     """The items, each reported as `unit` when the next one is asked for. Raises Cancelled where the
-    report says to stop."""
+    report stops the work."""
     report(Progress(stage=stage))
     for number, item in enumerate(items, 1):
         yield item

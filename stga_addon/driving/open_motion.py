@@ -255,7 +255,7 @@ class MotionOptions:
         needs=(SHAPES,),
     )
     recorded_fps: float | None = option(
-        "frames per second of a face performance whose file does not tell its times",
+        "frames per second of a face performance whose file has no times",
         None,
         MIN_FPS,
         MAX_FPS,

@@ -103,7 +103,7 @@ class Performance:
     fps      rows per second where none is lost
     warnings  one sentence each: what was guessed
     guessed_fps  rate that frame numbers or rows without times were taken to count, as the last of
-             the warnings says; None: the file tells its times
+             the warnings says; None: the file has times
     """
 
     times: np.ndarray

@@ -275,7 +275,7 @@ def _add_light(
 
 
 def _header(avatar: Avatar, rig: Rig, playback: Playback) -> dict[str, Any]:
-    """All but what tells of shapes, light and arrays."""
+    """All fields but those of shapes, light and arrays."""
     # Sliders: every expression with its range, those that the motion uses most first.
     names = rig.shape_names
     used = rig.coefficients[:, : rig.expressions]

@@ -50,7 +50,7 @@ class _Seen(NamedTuple):
 def fit_linear(avatar: Avatar, capture: Capture, report: Report = ignore) -> np.ndarray:
     """`Avatar.linear_base` (N, 4) with which blending in linear light comes nearest to
     `render_avatar`, in display values, in views of the capture. Raises StgaError without any,
-    Cancelled where the report says to stop."""
+    Cancelled when the report stops it."""
     views = capture.views.get("train", ())
     if not views:
         raise StgaError(f"{capture.root}: has no training views, by which colors could be fitted")

@@ -332,7 +332,7 @@ def average_texture(samples: Sequence[Sample]) -> Texture:
     first = _robust_mean([own.values[0] for own in samples], weight)
     luma = np.tile(np.median(first[known if known.any() else ...], axis=0), (len(first), 1))
     lights = {own.camera: np.eye(own.basis.shape[1])[0] for own in samples}
-    lit = [own.values for own in samples]
+    lit = [sample.values for sample in samples]
     values = [luma]
     for number in range(TEXTURE_ITERATIONS):
         scale = TEXTURE_SCALE if number else ALBEDO_SCALE

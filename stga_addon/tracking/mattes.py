@@ -107,8 +107,8 @@ def with_mattes(
 
     Frames that have one keep it. For the others, mattes are written into the folder of the
     capture's masks and, where an interrupted call with the same `source` wrote them, read from
-    there. A camera's clean plate tells the person from the backdrop, else the network. Bars of one
-    color at the edges of all frames belong to nobody.
+    there. A camera's clean plate separates the person from the backdrop, else the network. Bars of
+    one color at the edges of all frames belong to nobody.
     """
     path = out / MATTES_FILE
     total = len(list(footage.views()))
@@ -231,7 +231,7 @@ def find_matte(image: np.ndarray, probability: np.ndarray, head: np.ndarray) -> 
     small = tuple(max(1, round(scale * side)) for side in whole)
     pixels = cv2.resize(image, small, interpolation=cv2.INTER_AREA)
     seeds = probability, head.astype(np.float32)
-    likely, heads = (reduced(own, small) for own in seeds)
+    likely, heads = (reduced(seed, small) for seed in seeds)
     cut = _cut(cv2, pixels, likely, heads > 0.5, scale * size).astype(np.float32)
     person = cv2.resize(cut, whole, interpolation=cv2.INTER_LINEAR) > 0.5
     # coverage in a band along the person's outline, and what is near it

@@ -38,7 +38,7 @@ def reprojection_errors(fit: HeadFit, take: RecordedTake, footage: Footage) -> E
 
 def median_px(errors: Errors) -> float:
     """Median in pixels over all cameras and timesteps."""
-    return float(np.median([pixels for own in errors.values() for pixels, _ in own.values()]))
+    return float(np.median([pixels for error in errors.values() for pixels, _ in error.values()]))
 
 
 def misread_cameras(errors: Errors) -> list[str]:

@@ -27,7 +27,7 @@ from .posed_points import head_rotation
 from .torso_take import HELD_OUT, BothWays, Motion, Rows, TorsoShot, TorsoTake, states_along
 
 BLOCK_PX = 12
-"""Side of blocks of pixels; one in HELD_OUT is not fitted, and tells whether to bend."""
+"""Side of blocks of pixels; one in HELD_OUT is held out, and shows whether to bend."""
 ROUGHNESS_M = 0.0005
 """Standard deviation of a vertex from the mean of its neighbors."""
 BEND_SIGMA_M = 0.02

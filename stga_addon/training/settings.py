@@ -252,7 +252,7 @@ class TrainingSettings:
         return self.lattice_order(triangles) - begins_coarse
 
     def check(self) -> None:
-        """Raise StgaError for settings at odds, and rows and names that types do not tell."""
+        """Raise StgaError for settings at odds, and rows and names that types do not show."""
         given = (self.seconds is not None) + (self.iterations is not None)
         if given > 1 or (given == 0 and self.preset is None):
             raise StgaError("the budget must be given either in seconds or in iterations")

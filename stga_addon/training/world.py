@@ -41,7 +41,7 @@ it."""
 SAMPLED_POINTS = 4000
 """Pixels of each plate by which shells are compared."""
 MIN_SHARED = 0.1
-"""Fraction of the sampled pixels that another plate must contain for a shell to tell the world's
+"""Fraction of the sampled pixels that another plate must contain for a shell to show the world's
 distance."""
 MIN_SIMILARITY = 0.3
 """Correlation of what both plates show there at least."""

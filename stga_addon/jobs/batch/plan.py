@@ -57,7 +57,7 @@ class Job:
     name      unique in the batch, the same each time that the plan is read
     folder    what the request writes lies in it; the request itself in `request_folder`
     after     names of the jobs that have to be finished before
-    minutes   how long the plan says that it takes
+    minutes   its time as stated in the plan
     """
 
     name: str
