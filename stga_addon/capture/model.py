@@ -92,7 +92,7 @@ class Capture:
 
     @property
     def all_views(self) -> list[View]:
-        """Of every split, in their order."""
+        """Views of every split, in the splits' order."""
         return [view for views in self.views.values() for view in views]
 
     def flame_motion(self, name: str = "") -> FlameSequence:

@@ -60,8 +60,8 @@ RECORDED_SUFFIXES = tuple(suffix for suffix in PERFORMERS if suffix not in READ_
 
 
 def performer_of(path: Path) -> Performer | None:
-    """By a file's suffix; None for what is no performance. The folder of a Live Link Face take is
-    read as its table."""
+    """The performer for a file's suffix; None for a file that is no performance. The folder of a
+    Live Link Face take is read as its table."""
     if is_folder(path):
         is_capture = is_folder(path / "flame_param") or matching(path, "transforms*.json")
         return None if is_capture or not _tables(path) else PERFORMERS[".csv"]

@@ -105,7 +105,8 @@ def _bounded(load: Callable[[Any], None]) -> Callable[[Any], None]:
 
 
 def _load_bytearray(unpickler: Any) -> None:
-    """Of as many bytes as the file holds; the library's allocates what the opcode promises."""
+    """Load at most as many bytes as the file holds; the library allocates what the opcode
+    promises."""
     unpickler.append(bytearray(unpickler.read(int.from_bytes(unpickler.read(8), "little"))))
 
 

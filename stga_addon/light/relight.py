@@ -40,8 +40,8 @@ class Kept(NamedTuple):
 
 
 def kept(recorded: np.ndarray, distant: np.ndarray) -> Kept:
-    """By the capture's and the scene's light (9, 3), lamps far away, compared as irradiance by
-    direction, each channel but for a factor."""
+    """The part of recorded colors that is kept, from the capture's and the scene's light (9, 3) of
+    lamps far away. They are compared as irradiance by direction, each channel up to a factor."""
     old, new = (LAMBERT[:COUNT, None] * light for light in (recorded, distant))
     gain = np.maximum((old * new).sum(0) / np.maximum((old * old).sum(0), 1e-12), 0)
     same = gain * old

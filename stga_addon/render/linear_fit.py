@@ -119,6 +119,6 @@ def _gradient(avatar: Avatar, change: np.ndarray, seen: _Seen, buffers: BufferPo
 
 
 def _slope(srgb: np.ndarray) -> np.ndarray:
-    """Of linear light by sRGB."""
+    """Derivative of linear light by sRGB."""
     curve = 2.4 / 1.055 * ((srgb + 0.055) / 1.055) ** 1.4
     return np.where(srgb > 0.04045, curve, 1 / 12.92)

@@ -106,7 +106,7 @@ def is_of_footage(out: Path, footage: Footage) -> bool:
 
 
 def footage_state(footage: Footage) -> dict[str, Any]:
-    """Of each camera the first frame, the state of all files, and the undistortion; as JSON."""
+    """Each camera's first frame, the state of all files, and the undistortion; as JSON."""
     cameras = {}
     for camera in footage.cameras:
         own: list[Any] = [camera.source(camera.timesteps[0]), file_state(camera.frames.files)]

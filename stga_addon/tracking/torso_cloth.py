@@ -304,7 +304,7 @@ class _Cloth:
         return [float(own) for own in total / max(count, 1)]
 
     def _numbers(self, shot: TorsoShot) -> list[int]:
-        """Of the cameras that see the sheet at first and now, in images of one size."""
+        """Numbers of the cameras that see the sheet at first and now, in images of one size."""
         return [
             number
             for number, own in self._references.items()

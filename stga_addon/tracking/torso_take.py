@@ -292,7 +292,8 @@ def states_along(
 
 
 def _distance(start: np.ndarray, end: np.ndarray) -> float:
-    """Of positions (N, 3) from others; but for what is hardly seen, which is anywhere."""
+    """Upper quartile of the distances of positions (N, 3) from others: hardly visible ones may be
+    anywhere."""
     return float(np.quantile(np.linalg.norm(end - start, axis=-1), 0.75))
 
 

@@ -240,7 +240,8 @@ class TrainingSettings:
         return bool(self.driven_offsets)
 
     def lattice_order(self, triangles: int) -> int:
-        """Of a mesh of so many triangles: decides how many splats there will be."""
+        """Order of the lattice on a mesh of so many triangles, which decides how many splats there
+        will be."""
         if self.lattice is not None:
             return self.lattice
         return 2 if triangles <= MAX_FINE_TRIANGLES else 1

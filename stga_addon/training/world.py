@@ -91,7 +91,8 @@ class CleanPlate:
 
 
 def clean_plates(capture: Capture, correct: Correction | None = None) -> list[CleanPlate]:
-    """Of each camera with masks, of training views; correct: their exposure. Raises StgaError."""
+    """A clean plate of each camera with masks, from training views; correct: their exposure. Raises
+    StgaError."""
     masked = [view for view in capture.views.get("train", ()) if view.mask is not None]
     plates = []
     for _, views in sorted(views_by_camera(masked).items()):

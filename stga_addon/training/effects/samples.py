@@ -96,7 +96,8 @@ def sample_views(views: Sequence[View], seed: int = 0) -> list[View]:
 
 
 def take_samples(capture: Capture, seed: int = 0) -> Samples:
-    """Of a few training views, two images at a time. Raises StgaError where one cannot be read."""
+    """Samples of a few training views, two images at a time. Raises StgaError where one cannot be
+    read."""
     views = sample_views(capture.views["train"], seed)
     rng = np.random.default_rng(seed)
     count = len(capture.faces)

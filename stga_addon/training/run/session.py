@@ -363,7 +363,7 @@ class _Session:
         return fitted is not None
 
     def _write_what_is_missing(self) -> None:
-        """Of the files of a finished run that was resumed."""
+        """Write the missing files of a finished run that was resumed."""
         avatar, residuals = (self.folder / name for name in (AVATAR, folders.RESIDUALS))
         if not avatar.exists():
             text = "it is written anew from the checkpoint, the last state of training"
@@ -393,7 +393,7 @@ class _Session:
         coarse, full = image_scales(settings, capture.views["train"])
 
         def scale(position: int) -> float:
-            """Of the captured size; by the clock, a few images ahead of it."""
+            """Fraction of the captured size; by the clock, a few images ahead of it."""
             total = settings.iterations
             fraction = self._spent().fraction if total is None else (first + position) / total
             return coarse if fraction < settings.coarse_share else full
