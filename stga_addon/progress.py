@@ -14,10 +14,17 @@ import numpy as np
 Item = TypeVar("Item")
 
 PACE_FRACTION = 0.1
-"""Fraction of the work, the last that was done, whose pace says how much time is left."""
-MAX_OVERRUN_RATIO = 1.25  # Times what was said to be left, from which on that was too little
-MIN_PACE_S = 5.0  # For which the work's own forecast is watched before it is corrected
-MAX_STEP_FRACTION = 0.05  # Of a step; beyond, an interrupted call had done it before
+"""Fraction of the work, the last that was done, whose pace gives the time that is left."""
+MAX_OVERRUN_RATIO = 1.25
+"""Ratio of the time that the work took to its forecast, above which the forecast was too short."""
+MIN_FALL = 0.1
+"""Seconds by which the time left falls each second, where the work reports no time left."""
+MIN_LEFT_S = 1.0
+"""Time left of work that takes longer than was forecast."""
+MIN_PACE_S = 5.0
+"""Time for which the work's forecast is watched before it is corrected."""
+MAX_STEP_FRACTION = 0.05
+"""Largest fraction of a step; beyond it, an interrupted call had done the work before."""
 
 
 @dataclass(frozen=True)
@@ -96,24 +103,35 @@ class Clock:
         self._clock = clock
         self._by_fraction = TimeLeft(clock)
         self._left_s = math.inf
+        self._reported_s = clock()
         # When work lately reported how many seconds are left, and how many
         self._asked: deque[tuple[float, float]] = deque()
 
     def reported(self, progress: Progress) -> dict[str, float]:
         """The finite figures of some progress; `left_s`, by the fraction where the work does not
-        say, else as before, is the least so far, and `longer` 1 where that is, or the work knows it
-        to be, too little."""
+        say, else as before, always falls, more slowly where it was too little, and `longer` is 1
+        where it is, or the work knows it to be."""
         self.fraction = max(self.fraction, min(progress.fraction, MAX_REPORTED_FRACTION))
         figures = {"left_s": self._by_fraction.after(progress.fraction), **progress.figures()}
         figures = {name: value for name, value in figures.items() if math.isfinite(value)}
         asked_s = figures.get("left_s", self._left_s)
         if math.isfinite(asked_s):
             expected_s = self._expected_s(asked_s)
-            self._left_s = min(self._left_s, expected_s)
+            self._left_s = min(self._fallen_s(expected_s), expected_s)
             figures["left_s"] = self._left_s
             if expected_s > MAX_OVERRUN_RATIO * self._left_s + 1:
                 figures["longer"] = 1.0
         return figures
+
+    def _fallen_s(self, expected_s: float) -> float:
+        """What was left when it was last reported, less what fits to reach 0 when it is expected
+        to: a number that stands still looks like work that does."""
+        silent_s = self._clock() - self._reported_s
+        self._reported_s += silent_s
+        if not math.isfinite(self._left_s):
+            return self._left_s
+        fall = min(1.0, self._left_s / expected_s) if expected_s > 0 else 1.0
+        return _fallen_s(self._left_s, max(MIN_FALL, fall) * silent_s)
 
     def _expected_s(self, asked_s: float) -> float:
         """What is left where it goes on to fall as slowly as it lately did."""
@@ -130,8 +148,14 @@ class Clock:
 
 def after_silence(figures: Mapping[str, float], silent_s: float) -> Mapping[str, float]:
     """The figures that were reported so long ago, of which more is left than they say by now."""
-    patience_s = MIN_PACE_S + (MAX_OVERRUN_RATIO - 1) * figures.get("left_s", math.inf)
-    return {**figures, "longer": 1.0} if silent_s > patience_s else figures
+    left_s = figures.get("left_s", math.inf)
+    if silent_s <= MIN_PACE_S + (MAX_OVERRUN_RATIO - 1) * left_s:
+        return figures
+    return {**figures, "left_s": _fallen_s(left_s, MIN_FALL * silent_s), "longer": 1.0}
+
+
+def _fallen_s(left_s: float, by_s: float) -> float:
+    return max(left_s - by_s, min(left_s, MIN_LEFT_S))
 
 
 class Cancelled(Exception):

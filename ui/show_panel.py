@@ -66,6 +66,9 @@ class ShowPanel(SidebarPanel, bpy.types.Panel):
         filmed = settings.splats.get(tags.FILMED)
         if filmed:
             draw_text(layout, context, filmed.capitalize(), "INFO")
+        lost = splat_object.triangles_hint(settings.splats, context.view_layer.depsgraph)
+        if lost:
+            draw_text(layout, context, lost, "ERROR")
         mode = splat_object.display_mode(settings.splats)
         layout.operator_menu_enum("stga.choose_display", "display", text=f"Display: {mode}")
         column = layout.column(align=True)

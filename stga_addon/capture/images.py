@@ -83,6 +83,12 @@ def is_turned(path: Path) -> bool:
         return _orientation(image) != 1
 
 
+def has_alpha(path: Path) -> bool:
+    """Whether an image has a channel or a color of transparency, which may be its mask."""
+    with _opened(path) as image:
+        return image.getbands()[-1] in ("A", "a") or "transparency" in image.info
+
+
 def is_plain(path: Path) -> bool:
     """Whether programs that know neither EXIF's orientation nor color profiles show the image as it
     is read here."""

@@ -12,7 +12,7 @@ import numpy as np
 
 from ..errors import StgaError
 from .camera import Camera
-from .images import read_view
+from .images import has_alpha, read_view
 from .model import Capture, View, evenly_spread, views_by_camera
 
 COMPARED_HEIGHT_PX = 160
@@ -24,11 +24,15 @@ MIN_COVERAGE = 1e-3
 MAX_ONE_COLOR_LEVELS = 4
 """Range of each channel, of 255, in a small image, up to which it is of one color; levels up to
 which it is black."""
+INSIDE_LEVEL = 128
+"""Level of a small mask, of 255, from which a pixel shows the person."""
+OPAQUE_LEVEL = 254
+"""Level of a small image's transparency, of 255, from which the white behind it does not show."""
 MAX_VIEWS_READ = 64
 """Number of views up to which all are read."""
-SMALL_FILE_FRACTION = 0.5
-"""Fraction of the median file size, below which a file is read among more views than that: what
-shows nothing compresses to little."""
+EXTREME_FILES = 2
+"""Number of a camera's smallest and of its largest images and masks that are read among more views
+than that: what shows nothing compresses best, and noise worst."""
 SAMPLED_VIEWS = 24
 """Number of views among more than MAX_VIEWS_READ that are read whatever their files' sizes are."""
 READERS = 4
@@ -89,15 +93,14 @@ def _timesteps(views: Iterable[View]) -> str:
 
 def _unusable(views: Sequence[View]) -> tuple[set[Path], set[Path]]:
     """Images of views with empty masks, and images of one color."""
-    chosen = list(views)
     if len(views) > MAX_VIEWS_READ:
-        sampled = evenly_spread(views, SAMPLED_VIEWS)
-        certain = {view.image for view in sampled}
-        # otherwise, failures that the sizes of files do not show may be anywhere
-        if not any(_found(sampled)):
-            small = _small_files(views)
-            chosen = [view for view in views if view.image in certain | small]
-    return _found(chosen)
+        certain = {view.image for view in evenly_spread(views, SAMPLED_VIEWS)}
+        for own in views_by_camera(views).values():
+            certain |= _suspects(own)
+        found = _found([view for view in views if view.image in certain])
+        if not any(found):
+            return found
+    return _found(views)
 
 
 def _found(views: Sequence[View]) -> tuple[set[Path], set[Path]]:
@@ -113,16 +116,21 @@ def _found(views: Sequence[View]) -> tuple[set[Path], set[Path]]:
     return empty, {path for path, content in contents.items() if content.is_one_color}
 
 
-def _small_files(views: Sequence[View]) -> set[Path]:
-    """Images of views that are, or whose mask is, small beside the others of its camera."""
-    small = set[Path]()
-    for own in views_by_camera(views).values():
-        for files in ([view.image for view in own], [view.mask for view in own]):
-            sizes = [path.stat().st_size if path and path.is_file() else 0 for path in files]
-            least = SMALL_FILE_FRACTION * statistics.median(sizes)
-            pairs = zip(own, sizes, strict=True)
-            small |= {view.image for view, size in pairs if size < least}
-    return small
+def _suspects(views: Sequence[View]) -> set[Path]:
+    """Images of a camera's views, of which some show nobody if any of its views does: those whose
+    files are the smallest and the largest. All, where sizes tell nothing: of transparency that is
+    the mask, and of files that are not compressed."""
+    if any(view.mask is None and has_alpha(view.image) for view in views):
+        return {view.image for view in views}
+    suspects = set[Path]()
+    for files in ([view.image for view in views], [view.mask for view in views]):
+        sizes = [path.stat().st_size if path and path.is_file() else 0 for path in files]
+        if max(sizes) == min(sizes) > 0:
+            return {view.image for view in views}
+        order = np.argsort(sizes, kind="stable")
+        extreme = *order[:EXTREME_FILES], *order[-EXTREME_FILES:]
+        suspects |= {views[row].image for row in extreme}
+    return suspects
 
 
 def _content(view: View) -> _Content:
@@ -147,7 +155,8 @@ def _content_of(
     view = View(0, 0, camera, image.name, image, mask, is_mask_inverted=is_inverted)
     _, pixels, covered = read_view(view, scale)
     coverage = None if covered is None else float(covered.mean()) / 255
-    masked = pixels[covered > 127] if covered is not None else pixels.reshape(-1, 3)
+    least = OPAQUE_LEVEL if mask is None else INSIDE_LEVEL
+    inside = np.ones(pixels.shape[:2], bool) if covered is None else covered >= least
     is_plain = np.ptp(pixels.reshape(-1, 3), axis=0).max() <= MAX_ONE_COLOR_LEVELS
-    is_black = len(masked) > 0 and masked.max() <= MAX_ONE_COLOR_LEVELS
+    is_black = inside.any() and pixels[inside].max() <= MAX_ONE_COLOR_LEVELS
     return _Content(coverage, bool(is_plain or is_black))

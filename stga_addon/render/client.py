@@ -28,6 +28,7 @@ from .device import Composer
 REQUIRED_PACKAGES = ("numba", "platformdirs")
 """Packages that the kernels need beside numpy."""
 SPLAT_FIELDS = [field.name for field in fields(Splats)]
+LAYER_FIELDS = [field.name for field in fields(PosedSplats)][2:]
 FRAME_FIELDS = [field.name for field in fields(FaceFrames)]
 
 
@@ -145,7 +146,7 @@ def pack_layers(
         if not is_same:
             arrays |= {f"{index} splats {name}": values for name, values in splats.items()}
         arrays |= {f"{index} frames {name}": getattr(layer.frames, name) for name in FRAME_FIELDS}
-        arrays |= {f"{index} to_world": layer.to_world, f"{index} antialiased": layer.antialiased}
+        arrays |= {f"{index} {name}": getattr(layer, name) for name in LAYER_FIELDS}
     return arrays
 
 
@@ -160,8 +161,8 @@ def unpack_layers(
         else:
             splats = before[index].splats
         frames = FaceFrames(*(arrays[f"{index} frames {name}"] for name in FRAME_FIELDS))
-        antialiased = bool(arrays[f"{index} antialiased"])
-        layers.append(PosedSplats(splats, frames, arrays[f"{index} to_world"], antialiased))
+        to_world, antialiased, holdout = (arrays[f"{index} {name}"] for name in LAYER_FIELDS)
+        layers.append(PosedSplats(splats, frames, to_world, bool(antialiased), bool(holdout)))
     return layers
 
 

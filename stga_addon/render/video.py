@@ -4,6 +4,7 @@ import re
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from fractions import Fraction
+from functools import partial
 from itertools import count
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -14,7 +15,7 @@ from ..capture.camera import Camera
 from ..errors import StgaError
 from ..export.playback import check_rate
 from ..files import NumberedFiles, check_writable, file_address, naming, replacing
-from ..raster.posed_splats import ComposedImage, PosedSplats
+from ..raster.posed_splats import ComposedImage, PosedSplats, with_holdouts
 from ..worker.messages import receive, send
 from .client import pack_camera, pack_layers, unpack_camera, unpack_layers
 from .device import Composer
@@ -163,7 +164,8 @@ def recorded_images(path: Path, count: int, composer: Composer) -> Iterator[Comp
             for _ in range(count):
                 message = receive(stream)
                 layers = unpack_layers(message, layers)
-                yield composer.compose(layers, unpack_camera(message))
+                draw = partial(composer.compose, camera=unpack_camera(message))
+                yield with_holdouts(layers, draw)
     except (OSError, EOFError, KeyError, ValueError) as error:
         kind = type(error).__name__
         raise StgaError(f"{path}: cannot be read as the images of a video ({kind})") from error
@@ -172,12 +174,13 @@ def recorded_images(path: Path, count: int, composer: Composer) -> Iterator[Comp
 def finished(
     image: ComposedImage, background: tuple[float, float, float] | None, opaque: bool
 ) -> np.ndarray:
-    """(H, W, 3) uint8 sRGB over the background; if that is None, straight alpha or `opaque`."""
-    color = image.rgb.transpose(1, 2, 0)
-    alpha = image.alpha[..., None]
-    if background is None and not opaque:
-        straight = color / np.maximum(alpha, np.finfo(np.float32).tiny)
+    """(H, W, 3) uint8 sRGB over the background; if that is None, or holdouts hide some of it,
+    straight alpha or `opaque`, where they are black."""
+    behind = np.array(background or (0, 0, 0), np.float32)
+    pixels = image.rgb.transpose(1, 2, 0) + (1 - image.alpha[..., None]) * behind
+    if not opaque and not (background is not None and image.hidden is None):
+        alpha = image.alpha if background is None else np.ones_like(image.alpha)
+        alpha = (alpha if image.hidden is None else alpha - image.hidden)[..., None]
+        straight = pixels / np.maximum(alpha, np.finfo(np.float32).tiny)
         pixels = np.concatenate([straight, alpha], axis=2)
-    else:
-        pixels = color + (1 - alpha) * np.array(background or (0, 0, 0), np.float32)
     return np.asarray(np.rint(np.clip(pixels, 0, 1) * 255), np.uint8)

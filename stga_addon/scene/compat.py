@@ -14,6 +14,7 @@ SLOTTED_ACTIONS = bpy.app.version >= (4, 4, 0)
 MODIFIER_INPUT_PROPERTIES = bpy.app.version >= (5, 2, 0)
 EEVEE = "BLENDER_EEVEE" if bpy.app.version >= (5, 0, 0) else "BLENDER_EEVEE_NEXT"
 NATIVE_SPLATS = hasattr(bpy.types, "GeometryNodePointsSetType")  # from 5.3 on
+WARNING_NODE = hasattr(bpy.types, "GeometryNodeWarning")  # from 4.3 on
 APPENDED: list[Any] = getattr(bpy.app.handlers, "blend_import_post", [])  # from 4.3 on
 SAVE_FAILED: list[Any] = getattr(bpy.app.handlers, "save_post_fail", [])  # from 4.0 on
 

@@ -10,7 +10,7 @@ from ..avatar.splats import SH_C0, Splats
 from ..capture.color import linear_to_srgb
 from ..light.relight import Relighter
 from ..light.values import Caster, Lighting
-from ..raster.posed_splats import PosedSplats
+from ..raster.posed_splats import PosedSplats, in_gray
 
 FROZEN_COLOR = (0.25, 0.25, 0.25, 1.0)  # linear; splats that the current frame does not train
 UNSEEN_COLOR = (0.02, 0.2, 0.6, 1.0)  # linear; splats that no camera saw
@@ -75,9 +75,7 @@ class SceneLayer:
 
     def painted(self, value: float) -> "SceneLayer":
         """The same splats in one gray of 0…1, sRGB."""
-        sh = np.full((len(self.splats), 1, 3), (value - 0.5) / SH_C0, np.float32)
-        splats = replace(self.splats, sh=sh)
-        frames = replace(self.frames, color=NO_COLUMNS)
+        splats, frames = in_gray(self.splats, self.frames, value)
         settings = replace(self.settings, show_selection=False, show_unseen=False)
         return replace(self, splats=splats, frames=frames, settings=settings, relit=None)
 
@@ -114,7 +112,7 @@ class SceneLayer:
             factor = np.float32(np.log(max(settings.size, 1e-6)))
             splats = replace(splats, log_scale=splats.log_scale + factor)
         splats = splats if visible.all() else splats.rows(visible)
-        return PosedSplats(splats, frames, self.to_world, self.antialiased)
+        return PosedSplats(splats, frames, self.to_world, self.antialiased, self.holdout)
 
     def eye_in_avatar(self, eye: np.ndarray) -> np.ndarray:
         """(3,) of a position (3,) in the scene."""

@@ -23,12 +23,14 @@ from stga_addon.capture.camera import Camera
 from stga_addon.errors import StgaError
 from stga_addon.export.ply import write_ply
 from stga_addon.jobs.table import Kind
+from stga_addon.raster.cpu.compose import compose
 from stga_addon.raster.posed_splats import ComposedImage
 from stga_addon.render.video import check_output
 from stga_addon.scene.render import drawn_video
 from stga_addon.scene.render.drawn_video import DrawnVideo, png_bytes
 
 from .session import failure, ops, panel, picture
+from .test_engine import veil_before
 from .test_operators import write_ball_avatar
 from .test_splat_object import active_camera
 
@@ -129,6 +131,33 @@ def test_image_sequence_of_the_scene(extension, shown, monkeypatch):
         assert opaque.mean() > 0.1
         assert np.abs(image - expected)[opaque].max() <= 2
         assert np.abs(image[..., 3] - expected[..., 3]).max() <= 1
+
+
+@pytest.mark.parametrize("is_drawn", [False, True])
+@pytest.mark.parametrize("transparent", [False, True])
+def test_holdouts(extension, shown, transparent, is_drawn, monkeypatch):
+    """Catches objects that mask what is behind them in F12's images and are seen in a video's."""
+    scene = bpy.context.scene
+    scene.frame_end = scene.frame_start
+    scene.render.film_transparent = transparent
+    veil_before(scene.camera).is_holdout = True
+    expected = engine_image(scene.frame_start, shown / "engine.png")
+    assert expected[..., 3].min() < 128 < 250 < expected[..., 3].max()
+    if is_drawn:  # as the GPU draws it, by the rasterizer
+        video = extension.operators.render_video
+        monkeypatch.setattr(video, "has_training_python", lambda _: False)
+        monkeypatch.setattr(video, "has_gpu_context", lambda: True)
+
+        def draw(layers, view):
+            posed = [layer.posed(view.camera.position) for layer in layers]
+            return compose(posed, view.camera)
+
+        monkeypatch.setattr(extension.stga_addon.scene.render.drawn_video, "draw_image", draw)
+    ops.render_video(filepath=shown / "images", path="scene", format="png")
+    image = np.asarray(Image.open(shown / "images/0001.png")).astype(int)
+    seen = expected[..., 3] > 25
+    assert np.abs(image - expected)[seen].max() <= 3
+    assert np.abs(image[..., 3] - expected[..., 3]).max() <= 1
 
 
 def test_undo_and_a_removed_scene_meanwhile(extension, shown, monkeypatch, temporary):

@@ -38,6 +38,7 @@ from stga_addon.scene.display.splat_object import (
     show_avatar,
     show_world_splats,
     stored_avatar,
+    triangles_hint,
     update_splats,
 )
 
@@ -266,6 +267,25 @@ def test_splats_follow_a_subdivided_head(names):
     subdivision.show_viewport = False
     bpy.context.view_layer.update()
     assert_allclose(found, evaluated_splats(shown)[0], atol=1e-6)
+
+
+@pytest.mark.parametrize("names", [(), ("strain_position",)])
+@pytest.mark.parametrize("kind", ["DECIMATE", "REMESH", "WELD"])
+def test_a_head_of_other_triangles_shows_no_splats(kind, names):
+    """Catches splats that are scattered where a modifier has made other triangles."""
+    shown, head = show_on_head(driven_avatar("stga", names))
+    set_input(shown, splat_nodes.DISPLAY, POINTS)
+    depsgraph = bpy.context.evaluated_depsgraph_get()
+    assert sum(len(cloud.points) for cloud in point_clouds()) > 0
+    assert triangles_hint(shown, depsgraph) is None
+    changed = head.modifiers.new("other", kind)
+    for name, value in {"voxel_size": 0.005, "ratio": 0.7, "merge_threshold": 0.02}.items():
+        if hasattr(changed, name):
+            setattr(changed, name, value)
+    bpy.context.view_layer.update()
+    assert sum(len(cloud.points) for cloud in point_clouds()) == 0
+    if kind != "REMESH":
+        assert "check its modifiers" in triangles_hint(shown, depsgraph)
 
 
 def test_updated_splats_follow_strain_anew():

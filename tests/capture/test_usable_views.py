@@ -1,6 +1,7 @@
 """Views whose matte or image failed: left out of a training, and named."""
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -18,42 +19,60 @@ from . import factory
 SHAPE = factory.HEIGHT, factory.WIDTH
 
 
-def with_mask(view, lit):
-    mask = np.zeros(SHAPE, np.uint8)
-    mask[:1, :lit] = 255
-    Image.fromarray(mask).save(view.mask)
-    return view
+def with_mask(view, is_failed, lit=0, suffix=".png"):
+    mask = np.asarray(Image.open(view.mask)).copy()
+    if is_failed:
+        mask[:] = 0
+        mask[:1, :lit] = 255
+    path = view.mask.with_suffix(suffix)
+    Image.fromarray(mask).save(path)
+    return replace(view, mask=path)
 
 
-def with_transparency(view):
-    """What is seen is as it was, but its transparency, which is the mask, is empty."""
-    image = Image.open(view.image).convert("RGB")
-    image.putalpha(0)
-    image.save(view.image)
+def with_transparency(view, is_failed, level=None):
+    """Transparency as the mask: empty where it has failed, or behind an image of one level."""
+    pixels = np.asarray(Image.open(view.image).convert("RGB")).copy()
+    matte = np.asarray(Image.open(view.mask)).copy()
+    matte[:, :1] = 200  # a soft edge
+    if is_failed and level is None:
+        matte[:] = 0
+    elif is_failed:
+        pixels[:] = level
+    Image.fromarray(np.dstack([pixels, matte])).save(view.image)
     return replace(view, mask=None)
 
 
-def with_level(view, level):
-    Image.fromarray(np.full((*SHAPE, 3), level, np.uint8)).save(view.image)
-    return view
+def with_level(view, is_failed, level, noise=0, suffix=".png"):
+    pixels = np.asarray(Image.open(view.image))
+    if is_failed:
+        added = np.random.default_rng(view.camera_index).integers(0, noise + 1, (*SHAPE, 1))
+        pixels = np.broadcast_to(level + added, (*SHAPE, 3)).astype(np.uint8)
+    path = view.image.with_suffix(suffix)
+    Image.fromarray(pixels).save(path)
+    return replace(view, image=path)
 
 
+EMPTY = "have an empty mask"
+PLAIN = "are of one color"
 FAILURES = {
-    "empty mask": (lambda view: with_mask(view, 0), "have an empty mask"),
-    "speck": (lambda view: with_mask(view, 1), "have an empty mask"),
-    "transparent": (with_transparency, "have an empty mask"),
-    "black": (lambda view: with_level(view, 0), "are of one color"),
-    "gray": (lambda view: with_level(view, 99), "are of one color"),
+    "empty mask": (with_mask, EMPTY),
+    "speck": (partial(with_mask, lit=1), EMPTY),
+    "uncompressed mask": (partial(with_mask, suffix=".bmp"), EMPTY),
+    "transparent": (with_transparency, EMPTY),
+    "black": (partial(with_level, level=0), PLAIN),
+    "noise": (partial(with_level, level=0, noise=4), PLAIN),
+    "gray": (partial(with_level, level=99), PLAIN),
+    "uncompressed": (partial(with_level, level=0, suffix=".bmp"), PLAIN),
+    "black in its matte": (partial(with_transparency, level=0), PLAIN),
 }
 
 
 def failed(root, name, timesteps):
     """The capture, its views of some timesteps having failed."""
     capture = open_capture(root)
+    change = FAILURES[name][0]
     views = {
-        split: tuple(
-            FAILURES[name][0](view) if view.timestep in timesteps else view for view in own
-        )
+        split: tuple(change(view, view.timestep in timesteps) for view in own)
         for split, own in capture.views.items()
     }
     return replace(capture, views=views)
@@ -71,7 +90,7 @@ def test_failed_views_are_left_out_and_named(name, is_long, root, monkeypatch):
     where only a few of many views are read."""
     if is_long:
         monkeypatch.setattr(usable_views, "MAX_VIEWS_READ", 4)
-        monkeypatch.setattr(usable_views, "SAMPLED_VIEWS", 2)
+        monkeypatch.setattr(usable_views, "SAMPLED_VIEWS", 1)
     usable, told = with_usable_views(failed(root, name, {1}))
     assert {view.timestep for view in usable.all_views} == {0, 3, 4}
     assert len(usable.all_views) == 9

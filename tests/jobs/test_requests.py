@@ -256,28 +256,29 @@ def test_no_more_is_left_than_is_told():
 
 
 def test_what_has_not_come_true_is_not_said_again():
-    """Catches "About 20 s left" for a minute and a half."""
-    series = ((0.0, 20.0), (20.0, 19.9), (90.0, 19.8))
+    """Catches "About 20 s left" for a minute and a half, a number that stands still, and no number
+    where work takes much longer."""
+    series = ((0.0, 20.0), (20.0, 19.9), (90.0, 19.8), (900.0, 19.7))
     said = [sentence for _, sentence in as_told(series)]
-    assert said == ["About 20 s left", "More than 20 s left", "More than 20 s left"]
+    assert said == ["About 20 s left", *(f"More than {left} s left" for left in (18, 11, 1))]
 
 
 def test_work_that_says_no_more_how_long_it_takes():
     """Catches a time in the panel that comes and goes from stage to stage."""
     series = ((0.0, math.nan), (1.0, 20.0), (2.0, math.nan), (40.0, math.nan))
     said = [sentence for _, sentence in as_told(series)]
-    assert said == ["", *["About 20 s left"] * 2, "More than 20 s left"]
+    assert said == ["", "About 20 s left", "About 19 s left", "More than 15 s left"]
 
 
 def test_who_is_silent_takes_longer(tmp_path):
     """Catches "About 28 s left" for as long as a worker compiles and says nothing."""
     with status_writer(tmp_path) as writer:
         writer.report(Progress(stage="Analyzing", figures=lambda: {"left_s": 28.0}))
-        for silent_s, expected in ((5.0, "About"), (20.0, "More than")):
+        for silent_s, expected in ((5.0, "About 28"), (20.0, "More than 26")):
             told = time.time() - silent_s
             os.utime(tmp_path / STATUS_FILE, (told, told))
             sentence = describe_left(inspect_worker(tmp_path).status.figures)
-            assert sentence == f"{expected} 28 s left"
+            assert sentence == f"{expected} s left"
 
 
 def test_an_analysis_says_how_long_it_takes(monkeypatch):

@@ -212,6 +212,11 @@ def test_backgrounds():
     assert finished(image, None, opaque=False).tolist() == [[[128, 128, 128, 128]]]
     assert finished(image, None, opaque=True).tolist() == [[[64, 64, 64]]]
     assert finished(image, (1.0, 0.0, 0.5), opaque=True).tolist() == [[[191, 64, 128]]]
+    # a quarter of the pixel is hidden by a holdout
+    image = replace(image, hidden=np.full((1, 1), 0.25, np.float32))
+    assert finished(image, None, opaque=False).tolist() == [[[255, 255, 255, 64]]]
+    assert finished(image, (1.0, 0.0, 0.5), opaque=False).tolist() == [[[255, 85, 170, 191]]]
+    assert finished(image, (1.0, 0.0, 0.5), opaque=True).tolist() == [[[191, 64, 128]]]
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="there is no /dev/full")

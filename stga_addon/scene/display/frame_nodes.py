@@ -10,8 +10,13 @@ import bpy
 from ...avatar.embedding import CONVENTIONS, MIN_AREA_RATIO, UPRIGHT_COSINE
 from ...avatar.offsets import COLOR, OFFSETS, SCALE
 from ...avatar.strain import AVERAGING_ROUNDS, MIN_SQUARED_NORMAL, STRAIN_COMPONENTS, STRAIN_GAIN
+from .. import compat
 from . import splat_attributes as stored
 from .node_builder import NodeGroup, Nodes
+
+MAX_AREA_RATIO = 4.0
+"""Of the area of the splats' triangles to the evaluated head's, up to which the head's first
+vertices are theirs; a remeshed head's are anywhere."""
 
 # Temporary attributes on the head's faces.
 _FRAME_ORIGIN = "stga_frame_origin"
@@ -149,6 +154,31 @@ def _posed(nodes: Nodes, head: Any, neutral: Any) -> Any:
     return nodes.switch("GEOMETRY", nodes.logic("AND", differs, is_known), head, moved)
 
 
+def _following(nodes: Nodes, splats: Any, head: Any, neutral: Any) -> Any:
+    """The splats; none where the head has lost the vertices that they are bound to."""
+    points = []
+    for mesh in (head, neutral):
+        size = nodes.add("GeometryNodeAttributeDomainSize", {"Geometry": mesh}, component="MESH")
+        points.append(size.outputs["Point Count"])
+    areas = []
+    for mesh in (nodes.group(POSED, head, neutral), head):
+        inputs = {"Geometry": mesh, "Attribute": nodes.out("GeometryNodeInputMeshFaceArea")}
+        statistic = nodes.add("GeometryNodeAttributeStatistic", inputs, domain="FACE")
+        areas.append(
+            next(each for each in statistic.outputs if each.enabled and each.name == "Sum")
+        )
+    most = nodes.math("MULTIPLY", areas[1], MAX_AREA_RATIO)
+    is_torn = nodes.compare("GREATER_THAN", areas[0], most)
+    is_lost = nodes.logic("OR", nodes.compare("LESS_THAN", *points), is_torn)
+    if compat.WARNING_NODE:
+        message = "The head has other triangles than its splats; check its modifiers"
+        inputs = {"Show": is_lost, "Message": message}
+        is_lost = nodes.out("GeometryNodeWarning", inputs, warning_type="ERROR")
+    return nodes.out(
+        "GeometryNodeSwitch", {"Switch": is_lost, "False": splats}, input_type="GEOMETRY"
+    )
+
+
 def _deformed(nodes: Nodes, posed: Any, neutral: Any) -> Any:
     """`_moved_neutral` with deformation tensors (`avatar.strain`)."""
     mesh = _moved_neutral(nodes, posed, neutral)
@@ -218,6 +248,7 @@ def _in_range(nodes: Nodes, vector: Any, ends: tuple[str, str]) -> Any:
 
 
 POSED = _meshes("Posed Triangles", _posed, "Head", "Neutral")
+FOLLOWING = _meshes("Splats of a Head", _following, "Splats", "Head", "Neutral")
 
 DEFORMED = _meshes("Triangle Deformation", _deformed, "Posed", "Neutral")
 """Posed and neutral mesh -> the mesh with its triangles' deformation."""

@@ -38,7 +38,7 @@ def is_current(tree: bpy.types.NodeTree) -> bool:
 
 def _version() -> str:
     lit = " and lit native" if compat.NATIVE_SPLATS else ""
-    return f"{__version__} with unseen{lit} splats on subdivided heads"
+    return f"{__version__} with unseen{lit} splats on subdivided, not on lost heads"
 
 
 def new_socket(tree: bpy.types.NodeTree, name: str, side: str, kind: str) -> Any:

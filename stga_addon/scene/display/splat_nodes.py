@@ -12,7 +12,16 @@ from ...capture.meshes import SELECTED_WEIGHT
 from .. import compat, tags
 from ..layers import FROZEN_COLOR, UNSEEN_COLOR
 from . import splat_attributes as stored
-from .frame_nodes import DEFORMED, FACE_COLOR, FRAMES, PLACED, POSED, SIGNALS, driven
+from .frame_nodes import (
+    DEFORMED,
+    FACE_COLOR,
+    FOLLOWING,
+    FRAMES,
+    PLACED,
+    POSED,
+    SIGNALS,
+    driven,
+)
 from .lit_nodes import LIGHTS, LIT, RECORDED, SCENE_LIGHT, SURFACE
 from .node_builder import NodeGroup, Nodes, find_tree, kept_material, new_socket, new_tree
 
@@ -361,7 +370,7 @@ def build_next_node_group(options: TreeOptions) -> bool:
     groups = [PLACED[convention], _RELIT, *MODES.values(), *SH_BANDS[:degree]]
     if convention is not None:
         groups += [FRAMES[convention], _FROZEN_SPLATS, _MARKED, _PAINT]
-        groups += [DEFORMED if offsets else POSED]
+        groups += [POSED, FOLLOWING, *([DEFORMED] if offsets else [])]
         groups += [SIGNALS[name] for name in options.signals]
         groups += [driven(name, convention) for name in offsets]
     if degree > 0 or options.is_colored:
@@ -429,6 +438,7 @@ def _build(nodes: Nodes, options: TreeOptions) -> None:
     else:
         head = nodes.object_info(inputs[HEAD]).outputs["Geometry"]
         neutral = nodes.object_info(inputs[NEUTRAL], "ORIGINAL").outputs["Geometry"]
+        splats = nodes.group(FOLLOWING, splats, head, neutral)
         mesh = nodes.group(DEFORMED if options.offsets else POSED, head, neutral)
         for name in options.signals:
             mesh = nodes.group(SIGNALS[name], mesh)

@@ -279,6 +279,22 @@ def is_partly_filmed(splat_object: Any) -> bool:
     return splat_object.get(tags.FILMED, "") not in ("", FROM_ALL_SIDES)
 
 
+def triangles_hint(splat_object: Any, depsgraph: Any) -> str | None:
+    """A sentence where a head has lost the vertices that the splats are bound to, or None."""
+    head, neutral = (
+        get_input(splat_object, name) for name in (splat_nodes.HEAD, splat_nodes.NEUTRAL)
+    )
+    if head is None or neutral is None:
+        return None
+    shown = head.evaluated_get(depsgraph)
+    if shown.type == "MESH" and len(shown.data.vertices) >= len(neutral.data.vertices):
+        return None
+    follower = splat_object.name
+    return (
+        f"{head.name}: has other triangles than {follower}, which follows it; check its modifiers"
+    )
+
+
 def set_input(splat_object: Any, name: str, value: Any) -> None:
     """Set an input of the splat modifier by its displayed name. Raises StgaError where it has
     none."""

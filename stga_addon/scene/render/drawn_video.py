@@ -4,6 +4,7 @@ import shutil
 import struct
 import zlib
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 
 import bpy
@@ -11,6 +12,7 @@ import numpy as np
 
 from ...errors import StgaError
 from ...files import replacing
+from ...raster.posed_splats import ComposedImage, with_holdouts
 from ...render.video import finished, is_video, sequence_files
 from ..compat import choose_format, sequencer_strips
 from ..gpu.packing import View
@@ -33,13 +35,11 @@ class DrawnVideo:
 
     def add(self, layers: Sequence[SceneLayer], view: View) -> None:
         """Draw an image. Raises StgaError where the GPU cannot, or the disk is full."""
-        image = draw_image(list(layers), view)
-        if image is None:
-            raise StgaError("The video cannot be drawn: Blender has no GPU context, or it fails")
+        image = with_holdouts(layers, partial(_drawn, view=view))
         path = self._folder / f"{len(self._images) + 1:04d}.png"
         pixels = finished(image, self._background, is_video(self._output))
-        with replacing(path) as partial:
-            partial.write_bytes(png_bytes(pixels))
+        with replacing(path) as file:
+            file.write_bytes(png_bytes(pixels))
         self._images.append(path)
 
     def encode(self, fps: float) -> None:
@@ -47,13 +47,13 @@ class DrawnVideo:
         sequence. Raises StgaError."""
         if is_video(self._output):
             video = self._encoded(fps)
-            with replacing(self._output) as partial:
-                shutil.copyfile(video, partial)
+            with replacing(self._output) as file:
+                shutil.copyfile(video, file)
             return
         with sequence_files(self._output) as next_file:
             for image in self._images:
-                with next_file() as partial:
-                    shutil.copyfile(image, partial)
+                with next_file() as file:
+                    shutil.copyfile(image, file)
 
     def _encoded(self, fps: float) -> Path:
         """The video, encoded beside the images in a scene of its own, which is removed."""
@@ -93,6 +93,13 @@ class DrawnVideo:
         if not video.is_file():
             raise StgaError("Blender could not encode the video; see the console")
         return video
+
+
+def _drawn(layers: list[SceneLayer], view: View) -> ComposedImage:
+    image = draw_image(layers, view)
+    if image is None:
+        raise StgaError("The video cannot be drawn: Blender has no GPU context, or it fails")
+    return image
 
 
 def png_bytes(pixels: np.ndarray) -> bytes:

@@ -13,7 +13,7 @@ from bpy.app.handlers import persistent
 
 from ...capture.camera import Camera
 from ...errors import StgaError
-from ...raster.posed_splats import ComposedImage
+from ...raster.posed_splats import ComposedImage, with_holdouts
 from ...raster.splat_shader import MIN_ALPHA
 from ...render.client import RenderClient
 from ..cameras import Eye, render_camera
@@ -158,7 +158,9 @@ class SplatsEngine(bpy.types.RenderEngine):  # type: ignore[misc]
                     cache.frame_changed()
                 layers = all_layers(depsgraph, cache)
                 view = self._view(depsgraph, border, view_name, sample)
-                image, hidden = self._layers_image(layers, view, renderers)
+                draw = partial(self._image, view=view, renderers=renderers)
+                image = with_holdouts(layers, draw)
+                hidden = np.zeros_like(image.alpha) if image.hidden is None else image.hidden
                 color = color + combined(image.rgb, image.alpha, background, inverse, hidden)
                 seen = image.alpha - hidden
                 fraction = fraction + seen
@@ -215,22 +217,6 @@ class SplatsEngine(bpy.types.RenderEngine):  # type: ignore[misc]
             problem = "The view transform could not be measured in time and changes colors"
             self.report({"WARNING"}, f"{problem}; render again, or choose Standard")
 
-    def _layers_image(
-        self, layers: list[SceneLayer], view: View, renderers: list[SplatRenderer]
-    ) -> tuple[ComposedImage, np.ndarray]:
-        """One image, and the part (H, W) of its alpha that holdouts hide. renderers: as of
-        `draw_image`."""
-        held_out = any(layer.holdout for layer in layers)
-        shown = [layer.painted(0.0) if layer.holdout else layer for layer in layers]
-        image = self._image(shown, view, renderers)
-        hidden = np.zeros_like(image.alpha)
-        if held_out:  # white where splats are seen, black where holdouts hide them
-            white = [layer.painted(0.0 if layer.holdout else 1.0) for layer in layers]
-            hidden = np.clip(
-                image.alpha - self._image(white, view, renderers).rgb[0], 0, image.alpha
-            )
-        return image, hidden
-
     def _view(
         self, depsgraph: Any, border: tuple[int, int, int, int], view_name: str, sample: Sample
     ) -> View:
@@ -251,6 +237,7 @@ class SplatsEngine(bpy.types.RenderEngine):  # type: ignore[misc]
     def _image(
         self, layers: list[SceneLayer], view: View, renderers: list[SplatRenderer]
     ) -> ComposedImage:
+        """renderers: as of `draw_image`."""
         image = draw_image(layers, view, partial(self.report, {"WARNING"}), renderers)
         if image is None:
             posed = [in_range(layer.posed(view.camera.position), view) for layer in layers]
