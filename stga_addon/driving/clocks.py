@@ -64,12 +64,14 @@ MIN_ROWS_PER_S = 1.5
 gives such a rate."""
 MAX_ROWS_PER_S = 250.0
 """Most rows a second that they have."""
-MAX_FRAME_STEP = 4  # Between rows that are numbered by frames of `DEFAULT_FPS`
-DEFAULT_FPS = 60.0  # Of files that hold neither times nor a rate: ARKit's own
+MAX_FRAME_STEP = 4  # Largest step between rows that are numbered by frames of `DEFAULT_FPS`
+DEFAULT_FPS = 60.0  # Frame rate of files with neither times nor a rate: ARKit's
 RATES = tuple(sorted({rate * ratio for rate in (10, 12, 15, *BASES) for ratio in (1, DROP_RATIO)}))
-MAX_RATE_DIFFERENCE = 0.02  # Of a standard rate from that of the times, relative
-GRID_TOLERANCE = 0.1  # Of a row's distance, within which all rows come evenly
-LONG_STEP = 1.5  # Times the median, above which rows are missing between two
+
+MAX_RATE_DIFFERENCE = 0.02
+"""Largest relative difference between a standard rate and that of the times."""
+GRID_TOLERANCE = 0.1  # Largest deviation, in distances of rows, with which all rows come evenly
+LONG_STEP = 1.5  # Multiple of the median step, above which rows are missing between two
 
 
 @dataclass(frozen=True)

@@ -69,7 +69,7 @@ MAX_PARTS = 6
 """Keys of nested dictionaries that the name of a value in a JSON frame has."""
 MAX_LISTED = 16
 """Dictionaries of a list in a JSON frame that are examined."""
-MAX_PERCENT = 110.0  # Of weights, of which some are a little above the whole
+MAX_PERCENT = 110.0  # Largest weight in percent; some are a little above 100
 FRAME_KEYS = ("frames", "weightMat", "weights", "blendShapeWeights", "data")
 RATE_KEYS = ("exportFps", "fps", "FPS", "frameRate", "frame_rate", "framerate", "FrameRate")
 NAME_KEYS = ("facsNames", "names", "blendShapeNames", "blendshapes", "blendShapes")

@@ -25,7 +25,7 @@ ALIKE_AT_SPLAT = 0.25
 other objects' shadows."""
 UNLIKE_AT_SPLAT = 0.75
 """The same from which on nothing is kept."""
-RIDGE = 1e-6  # For meshes without light in some harmonics
+RIDGE = 1e-6  # Ridge for meshes without light in some harmonics
 
 
 class Kept(NamedTuple):

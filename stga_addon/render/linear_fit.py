@@ -34,7 +34,7 @@ FINENESS = 2
 samples, and do not blur what is thinner than a pixel, as ours does."""
 BEHIND = 0.0, 1.0
 """Grays behind one half of the views and the other: what is behind an avatar is not known."""
-MAX_SRGB = 1.12  # of what is shown natively (`scene.display.splat_nodes`)
+MAX_SRGB = 1.12  # Largest value that is shown natively (`scene.display.splat_nodes`)
 
 
 class _Seen(NamedTuple):

@@ -68,7 +68,7 @@ FAR_WEIGHT = 1e-3
 """Weight of the wider neighborhood in a mean over two."""
 MIN_NEIGHBORHOOD_PX = 2.0
 """Standard deviation of the smaller neighborhood, in pixels of the image of the means."""
-MIN_OBSERVATIONS = 1.0  # Sum of its views' weights, below which a point's texture is not known
+MIN_OBSERVATIONS = 1.0  # Least sum of the views' weights with which a point's texture is known
 
 
 @dataclass(frozen=True)

@@ -36,7 +36,8 @@ from .torso import FollowedTorso, follow_torso
 ENOUGH_TURN_DEG = 30.0
 """Largest angle between two poses of a head, beyond which turning determines a lens little
 better."""
-LONG_TAKE = 50  # From which the fit is worth a helping process: threads slow its small matrices
+LONG_TAKE = 50
+"""Timesteps from which on the fit gets a helping process: threads slow its small matrices."""
 
 Misfits = dict[str, dict[int, float]]
 """Region of the face -> timestep -> how badly images are explained (`Misfit`)."""

@@ -68,7 +68,9 @@ OFFSET_DENSITY = 1.5e10
 SMOOTHING_M = 0.009  # Length over which offsets are smoothed
 OFFSET_SIGMA_M = 0.03  # Prior of an offset: how fast offsets vanish where no surface is seen
 OFFSET_ITERATIONS = 5
-MAX_COTANGENT = 5.0  # Of an angle, 11°: those of needles would outweigh all others
+
+MAX_COTANGENT = 5.0
+"""Largest cotangent of an angle, 11°: needles would outweigh all other triangles."""
 SURFACE_SIGMA_M = 0.0005
 MAX_OUTLINE_CAMERAS = 8  # Cameras whose masks are compared at every timestep
 

@@ -167,7 +167,7 @@ PLAN_KEYS = ("out", "resources", "job")
 TABLE_KEYS = ("request", "after", "resources", "minutes")
 """Keys of a job's table that are not fields of its request."""
 REPLACED = "replaced"  # Folder of the batch that keeps what changed jobs wrote before
-NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,199}", re.ASCII)  # Of a job, whose folder has it
+NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,199}", re.ASCII)  # Name of a job, and of its folder
 
 
 @dataclass(frozen=True)
