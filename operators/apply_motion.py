@@ -151,7 +151,7 @@ class ApplyMotion(Edit, bpy.types.Operator, FileImport, MotionProperties):
     fps: options.number(
         "Recorded At",
         "Frames per second of the recording; 0: one timestep for each frame of the "
-        "scene. Of a face performance: where its file does not tell its times",
+        "scene. Of a face performance: where its file has no times",
         min=0.0,
         max=1000.0,
         options=ONCE,

@@ -111,7 +111,8 @@ def _head_of_capture(scene: Any, capture: Path) -> Any:
 
 
 def forget_heads() -> None:
-    """Of the file before, whose session ids are no longer valid; files store theirs."""
+    """Forget the heads of the file before: its session ids are no longer valid; files store
+    theirs."""
     _heads.clear()
 
 

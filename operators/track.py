@@ -62,7 +62,7 @@ class TrackOptions:
     step: options.field(Track, "step")
     mattes: options.choice(
         "Mattes",
-        "Masks that tell the person from the background",
+        "Masks that separate the person from the background",
         *((name, name.title(), text.capitalize()) for name, text in jobs.MATTES.items()),
         ("folder", "Folder", "Those of a folder, named as the images"),
     )

@@ -53,7 +53,8 @@ def telling_refusals() -> Iterator[None]:
 
 
 def exit_code(work: Callable[[], object]) -> int:
-    """Of a program that does this work: 0, or 2 after a StgaError, which goes to stderr."""
+    """Exit code of a program that does this work: 0, or 2 after a StgaError, which goes to
+    stderr."""
     try:
         with telling_refusals():
             work()

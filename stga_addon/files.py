@@ -357,12 +357,12 @@ def _is_running(process: int) -> bool:
 
 
 def is_file(path: Path) -> bool:
-    """Whether there is a regular file. Raises StgaError where the system does not tell."""
+    """Whether there is a regular file. Raises StgaError where the system does not know."""
     return stat.S_ISREG(_mode(path))
 
 
 def is_folder(path: Path) -> bool:
-    """Whether there is a folder. Raises StgaError where the system does not tell."""
+    """Whether there is a folder. Raises StgaError where the system does not know."""
     return stat.S_ISDIR(_mode(path))
 
 
@@ -721,8 +721,8 @@ def _read_array(stream: IO[bytes], size: int) -> np.ndarray:
 
 
 def _read_outline(stream: IO[bytes], size: int) -> tuple[tuple[int, ...], np.dtype[Any]]:
-    """Shape and type that the header of a npy stream of `size` bytes says. Raises ValueError where
-    they do not make up its size."""
+    """Shape and type in the header of a npy stream of `size` bytes. Raises ValueError where they do
+    not make up its size."""
     version = np.lib.format.read_magic(stream)  # type: ignore[no-untyped-call]
     if version != (1, 0):  # newer ones are for headers of more than 64 kB, of many named columns
         raise ValueError(f"npy format {version} is not supported")

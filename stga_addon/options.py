@@ -13,7 +13,7 @@ from .errors import StgaError, shorten
 from .files import usable_path
 from .schema import alternatives, expectation, setting, type_hints
 
-MAX_DIGITS = 18  # Of a whole number on the command line, which fits 64 bits
+MAX_DIGITS = 18  # Digits of a whole number on the command line, which fits 64 bits
 
 
 @dataclasses.dataclass(frozen=True)

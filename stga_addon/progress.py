@@ -13,12 +13,18 @@ import numpy as np
 
 Item = TypeVar("Item")
 
-PACE_FRACTION = 0.1  # Fraction of the work, the last that was done, whose pace gives the time left
-MAX_OVERRUN_RATIO = 1.25  # Times what was said to be left, from which on that was too little
-MIN_FALL = 0.1  # Seconds that are left fewer each second, where the work says that none are
-MIN_LEFT_S = 1.0  # That is left of work that takes longer than was said
-MIN_PACE_S = 5.0  # For which the work's own forecast is watched before it is corrected
-MAX_STEP_FRACTION = 0.05  # Of a step; beyond, an interrupted call had done it before
+PACE_FRACTION = 0.1
+"""Fraction of the work, the last that was done, whose pace gives the time that is left."""
+MAX_OVERRUN_RATIO = 1.25
+"""Ratio of the time that the work took to its forecast, above which the forecast was too short."""
+MIN_FALL = 0.1
+"""Seconds by which the time left falls each second, where the work reports no time left."""
+MIN_LEFT_S = 1.0
+"""Time left of work that takes longer than was forecast."""
+MIN_PACE_S = 5.0
+"""Time for which the work's forecast is watched before it is corrected."""
+MAX_STEP_FRACTION = 0.05
+"""Largest fraction of a step; beyond it, an interrupted call had done the work before."""
 
 
 @dataclass(frozen=True)
@@ -67,7 +73,7 @@ class TimeLeft:
     def __init__(self, clock: Callable[[], float] = monotonic) -> None:
         self._clock = clock
         self._last = clock(), 0.0
-        # Seconds and fractions of the steps that tell the pace
+        # Seconds and fractions of the steps that determine the pace
         self._steps: deque[tuple[float, float]] = deque()
 
     def after(self, fraction: float) -> float:
@@ -86,7 +92,7 @@ class TimeLeft:
 
 
 MAX_REPORTED_FRACTION = 0.99
-"""Before the end: 100 % is said of what is done."""
+"""Largest fraction that is reported before the end: 100 % means finished work."""
 
 
 class Clock:
@@ -165,7 +171,7 @@ def counted(
     items: Iterable[Item], total: int, report: Report, stage: str, unit: str
 ) -> Iterator[Item]:
     """The items, each reported as `unit` when the next one is asked for. Raises Cancelled where the
-    report says to stop."""
+    report stops the work."""
     report(Progress(stage=stage))
     for number, item in enumerate(items, 1):
         yield item

@@ -35,7 +35,7 @@ CURVE = "curve.png"
 MAX_DRAWING_FRACTION = 0.01
 """Largest fraction of the time that drawing the curve may take while a run trains."""
 
-FIRST_DRAWING_S = 30.0  # Until the first: loading the library takes a few
+FIRST_DRAWING_S = 30.0  # Time before the first drawing: loading the library takes a few seconds
 
 
 class CurveUpdater:

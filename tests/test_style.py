@@ -45,7 +45,15 @@ def described_in_groups(nodes):
                 yield text.lineno
 
 
-RULES = (described_in_groups, packed_values, long_functions)
+def fragments(nodes):
+    """Lines of docstrings that begin with "Of", and leave out what they describe."""
+    for node in nodes:
+        is_text = isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant)
+        if is_text and str(node.value.value).startswith("Of "):
+            yield node.lineno
+
+
+RULES = (described_in_groups, packed_values, long_functions, fragments)
 
 
 @cache
@@ -68,6 +76,12 @@ def breaking(rule, folder):
 def test_a_docstring_describes_one_constant(folder):
     """Catches a paragraph for several constants, whose parts nobody can map to their names."""
     assert not breaking(described_in_groups, folder)
+
+
+@pytest.mark.parametrize("folder", FOLDERS[:3])
+def test_docstrings_name_what_they_describe(folder):
+    """Catches fragments that make sense only together with the name, such as "Of a frame."."""
+    assert not breaking(fragments, folder)
 
 
 @pytest.mark.parametrize("folder", FOLDERS)

@@ -78,7 +78,7 @@ class AvatarLight:
     occlusion   (V,) float32, 0…1: cosine-weighted fraction of the sky that the head leaves open
     irradiance  (V, 3) float32: of the capture, with light that the head reflects onto itself, mean
                 over its timesteps; an albedo is π times linear color over this
-    roughness   (V,) float32: of highlights; 0: skin, whose roughness the scene's lighting says
+    roughness   (V,) float32: of highlights; 0: skin, whose roughness is in the scene's lighting
     residual    how far recorded colors are from what `radiance` explains, as a fraction of them
                 (robust deviation)
     damping     0…1 by which albedo is pulled to its mean, because the light is too hard to take
@@ -422,7 +422,7 @@ def _light_parts(light: AvatarLight) -> tuple[dict[str, np.ndarray], dict[str, A
 
 
 def _light(path: Path, arrays: Mapping[str, np.ndarray], rest: object) -> AvatarLight:
-    """By what the header says. Raises StgaError naming the file and what is wrong."""
+    """As the header states. Raises StgaError naming the file and what is wrong."""
     values: dict[str, Any] = {}
     for name in _LIGHT_ARRAYS:
         array = arrays[_PREFIX + name]

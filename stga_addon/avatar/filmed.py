@@ -59,7 +59,7 @@ def filmed_avatar(path: Path, avatar: Avatar) -> Avatar:
     StgaError naming `path` where the avatar does not know them, or all are."""
     unseen = avatar.regions.get(UNSEEN_REGION)
     if unseen is None:
-        problem = "does not say what was filmed, as files of older versions; train it again"
+        problem = "does not state what was filmed, as files of older versions; train it again"
         raise StgaError(f"{path}: {problem}")
     avatar = avatar.as_trained
     kept = ~unseen[avatar.splats.face]

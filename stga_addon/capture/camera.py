@@ -22,7 +22,7 @@ MIN_PROJECTION_DEPTH = 1e-6
 GL_TO_CV = np.diag([1.0, -1.0, -1.0, 1.0])
 TURNTABLE_S = 6.0  # Duration of a turntable, unless the motion is longer
 UP = (0.0, 1.0, 0.0)  # Captures are y-up
-MAX_GAP_RAD = np.radians(100)  # Radians without a camera from which on a side counts as unseen
+MAX_GAP_RAD = np.radians(100)  # Angle without a camera above which a side counts as unseen
 
 
 def is_image_size(width: float, height: float) -> bool:

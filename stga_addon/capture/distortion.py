@@ -15,8 +15,8 @@ LISTED = (*RADIAL[:4], *TANGENTIAL)  # nerfstudio's order in `distortion_params`
 PINHOLES = ("SIMPLE_PINHOLE", "PINHOLE", "PERSPECTIVE")
 PERSPECTIVES = (*PINHOLES, "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
 FISHEYE_MODELS = ("OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
-OTHER_LENSES = ("ftheta_p0", "latlong", "equirectangular")  # Of instant-ngp
-MAX_SHIFT_PX = 0.5  # At the image's corners, up to which a distortion shows nowhere
+OTHER_LENSES = ("ftheta_p0", "latlong", "equirectangular")  # Lenses of instant-ngp
+MAX_SHIFT_PX = 0.5  # Largest distortion at the image's corners that is not visible
 
 
 def distortion(frames: Sequence[Frame]) -> str | None:

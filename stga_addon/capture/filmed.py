@@ -113,7 +113,7 @@ def directions_picture(cells: tuple[int, ...]) -> np.ndarray:
 
 def filmed_directions(capture: Capture, timesteps: Sequence[int]) -> np.ndarray:
     """(N, 2) degrees to the head's left and up, from which cameras see it in all views of some
-    timesteps. Empty where the mesh does not tell where eyes and mouth are."""
+    timesteps. Empty where the mesh does not show where eyes and mouth are."""
     neutral = np.asarray(capture.neutral, np.float64)
     axes = head_axes(neutral[capture.faces].mean(1), capture.regions)
     if axes is None:

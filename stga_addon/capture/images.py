@@ -105,7 +105,7 @@ def read_image(view: View, background: tuple[int, int, int] = WHITE) -> np.ndarr
 
     Gray, palette and 16-bit images are converted, and so are color profiles, PNG's gAMA and cICP;
     EXIF's orientation is applied unless the camera has the size of the pixels as stored. Raises
-    StgaError naming the file where it is missing, truncated or not as large as the camera says.
+    StgaError naming the file where it is missing, truncated or not as large as the camera's.
     """
     return _over(_undistorted(view, _decode(view.image, view, "image")), background)
 

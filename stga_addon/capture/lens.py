@@ -122,7 +122,7 @@ def undistortion(recorded: Camera, lens: Lens, where: str) -> Undistortion | Non
 
 @lru_cache(CACHED_MAPS)
 def _least_zoom(recorded: Intrinsics, lens: Lens) -> float | None:
-    """Of ZOOM_RANGE, the least with which every pixel was recorded; None without any."""
+    """The least zoom of ZOOM_RANGE with which every pixel was recorded; None without any."""
     low, high = ZOOM_RANGE
     if not _is_inside(recorded, lens, high):
         return None

@@ -17,7 +17,8 @@ CHUNK_PIXELS = 1 << 21
 """Candidate pixels that are tested at a time, to bound the memory."""
 LIPS_AHEAD = np.radians(12.4)
 """Radians between straight down and where the lips are, seen from between the eyes."""
-MIN_EYE_HEIGHT_FRACTION = 0.1  # Of the eyes' distance from each other, over the mouth
+MIN_EYE_HEIGHT_FRACTION = 0.1
+"""Least height of the eyes over the mouth, in distances of the eyes from each other."""
 MIN_DEPTH_M = 0.01  # Triangles nearer to the camera's plane, or behind it, are not drawn
 
 

@@ -20,10 +20,8 @@ Mesh = tuple[np.ndarray, np.ndarray]
 """Vertices (V, 3) and triangles (F, 3)."""
 MESH_SUFFIXES = (".obj", ".ply", ".glb", ".stl")
 
-PRIMITIVE_NUMBERS = (
-    1000  # That each primitive counts for: trimesh takes time even where it is small
-)
-"""Numbers that each primitive counts for: trimesh takes time even where it is small."""
+PRIMITIVE_NUMBERS = 1000
+"""Numbers that each primitive counts for: trimesh takes time even for a small one."""
 CACHE_BYTES = 96 << 20
 """Memory for posed meshes: of a take of ten seconds, each is posed once."""
 MAX_MESH_BYTES = 512 << 20

@@ -25,7 +25,7 @@ MAX_NEUTRAL_DIFFERENCE_M = 1e-4
 coefficients."""
 MAX_SCALE_FACTOR = 5.0
 """Largest ratio of the head's sizes in two takes; another unit makes it 10 or more."""
-COMPARED = 8  # Views, and timesteps, of a take whose scale is looked at
+COMPARED = 8  # Number of views, and of timesteps, by which a take's scale is judged
 
 
 @dataclass(frozen=True)
@@ -92,7 +92,7 @@ class Capture:
 
     @property
     def all_views(self) -> list[View]:
-        """Of every split, in their order."""
+        """Views of every split, in the splits' order."""
         return [view for views in self.views.values() for view in views]
 
     def flame_motion(self, name: str = "") -> FlameSequence:

@@ -178,7 +178,7 @@ def is_capture(path: Path) -> bool:
         return False
     files = transforms_files(path)
     tracked = any(
-        key in read_bytes(own) for own in files for key in (b'"mesh_path"', b'"flame_param_path"')
+        key in read_bytes(file) for file in files for key in (b'"mesh_path"', b'"flame_param_path"')
     )
     is_listed = is_folder(path / PARAMETERS) or bool(matching(path / "meshes", "mesh_*.json"))
     if tracked or is_listed or is_file(path / CANONICAL_NAME):

@@ -122,8 +122,8 @@ def ply_header(path: Path, data: bytes) -> tuple[list[Element], str, int]:
 
 def ply_rows(path: Path, data: bytes, names: Sequence[str]) -> dict[str, Rows]:
     """The rows of the named elements that the contents of a PLY file have, in file order. Raises
-    StgaError where it is malformed or shorter than its header says; nothing is allocated before the
-    file is known to hold it."""
+    StgaError where it is malformed or shorter than its header states; nothing is allocated before
+    the file is known to hold it."""
     elements, order, position = ply_header(path, data)
     lines: list[bytes] = []
     if order == "=":
@@ -153,7 +153,7 @@ def ply_rows(path: Path, data: bytes, names: Sequence[str]) -> dict[str, Rows]:
 
 
 def _require(path: Path, element: Element, most: int) -> None:
-    """Raise StgaError where the file has not as many rows as the header says."""
+    """Raise StgaError where the file has not as many rows as the header states."""
     if element.count > most:
         raise StgaError(
             f"{path}: is truncated: it cannot hold {element.count} rows of {shorten(element.name)}"

@@ -52,7 +52,7 @@ Z_UP = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
 class Repair:
     """Another way to read a capture.
 
-    about     what is wrong with the files, as a message says it
+    about     what is wrong with the files, in the words of a message
     camera    the camera as it is meant, of the one as it was read
     turn      (3, 3) that turns the mesh's vertices, or the cameras' world back; None: none
     inverted  whether masks are 255 outside

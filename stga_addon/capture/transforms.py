@@ -101,7 +101,7 @@ class Frame:
     principal  (cx, cy) in pixels as written in the file; the image center where they are missing
     camera_id  name of the camera in the file, or None
     mesh, flame  file of the tracked mesh or FLAME parameters of the frame's timestep, or None
-    record     the entry, with what the top level says besides
+    record     the entry, with the fields of the top level
     repairs    what was read in another way than it is written, in a few words each
     """
 
@@ -134,7 +134,7 @@ def camera_entry(camera: Camera) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class Transforms:
-    """All frames by split, and what the top level says, None where it is missing."""
+    """All frames by split, and the fields of the top level, None where it is missing."""
 
     splits: dict[str, tuple[Frame, ...]]
     canonical_mesh: Path | None
@@ -163,11 +163,11 @@ def read_transforms(
     they exist.
 
     A frame's own intrinsics take precedence over the top level's, which are wrong in some exports.
-    `transform_matrix` is camera-to-world with OpenGL axes. `principal_point` says what `cy` means:
-    "vhap" (H − cy from the top, as VHAP's exporter writes it), "opencv" (from the top) or "center"
-    (cx and cy are ignored, as GaussianAvatars does). Paths are relative to the file's folder and
-    may leave it only for a sibling folder (union sets of VHAP); moved: those of images that lead
-    elsewhere are sought by their names. Raises StgaError naming the file and the field.
+    `transform_matrix` is camera-to-world with OpenGL axes. `principal_point` defines `cy`: "vhap"
+    (H − cy from the top, as VHAP's exporter writes it), "opencv" (from the top) or "center" (cx and
+    cy are ignored, as GaussianAvatars does). Paths are relative to the file's folder and may leave
+    it only for a sibling folder (union sets of VHAP); moved: those of images that lead elsewhere
+    are sought by their names. Raises StgaError naming the file and the field.
     """
     return _numbered(_timed(_read_frames(path, read_json(path), principal_point, moved)))
 

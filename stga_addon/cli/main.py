@@ -39,7 +39,7 @@ LIBRARY_FAILURES = (
 )
 """Exceptions that libraries raise when they get no memory, while they load or later; a library of
 which a part was not loaded raises the last two."""
-DROPPED_INTERRUPT_S = 0.05  # After which an interrupt that was dropped is raised again
+DROPPED_INTERRUPT_S = 0.05  # Time after which a dropped interrupt is raised again
 
 
 class _Parser(argparse.ArgumentParser):

@@ -79,7 +79,7 @@ def _files(folder: Path) -> list[Path]:
 
 
 def _digest(wheels: Path) -> str:
-    """Of the sources that the kernels come from, and of the compiler's version."""
+    """Digest of the sources that the kernels come from, and of the compiler's version."""
     found = hashlib.sha256()
     for file in sorted(ROOT.joinpath("stga_addon/raster/cpu").glob("*.py")):
         found.update(file.read_bytes())

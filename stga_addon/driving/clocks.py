@@ -18,7 +18,7 @@ TIMECODE = re.compile(
 BASES = (24, 25, 30, 48, 50, 60, 100, 120, 240)
 """Frames per second that timecodes count."""
 TYPICAL_BASE = 60
-"""Base of a take whose frame numbers do not tell it, as within one second."""
+"""Base of a take whose frame numbers do not determine it, as within one second."""
 EVEN_TOLERANCE_S = 1e-6
 """Difference of unevenness within which bases explain the frame numbers equally well."""
 OTHER_RATE = "--recorded-fps, in Blender Recorded At, sets another rate"
@@ -32,7 +32,7 @@ DROP_RATIO = 1000 / 1001
 CLOCK_TOLERANCE_S = 0.002
 """Error of milliseconds that are cut off or rounded."""
 MIN_DISTINCT_FRAMES = 3
-"""Frames of a second that tell milliseconds from fractions of a frame."""
+"""Frames of a second that distinguish milliseconds from fractions of a frame."""
 UNITS_S = {
     **dict.fromkeys(("s", "sec", "secs", "second", "seconds"), 1.0),
     **dict.fromkeys(("ms", "msec", "millis", "millisecond", "milliseconds"), 1e-3),
@@ -64,12 +64,14 @@ MIN_ROWS_PER_S = 1.5
 gives such a rate."""
 MAX_ROWS_PER_S = 250.0
 """Most rows a second that they have."""
-MAX_FRAME_STEP = 4  # Between rows that are numbered by frames of `DEFAULT_FPS`
-DEFAULT_FPS = 60.0  # Of files that hold neither times nor a rate: ARKit's own
+MAX_FRAME_STEP = 4  # Largest step between rows that are numbered by frames of `DEFAULT_FPS`
+DEFAULT_FPS = 60.0  # Frame rate of files with neither times nor a rate: ARKit's
 RATES = tuple(sorted({rate * ratio for rate in (10, 12, 15, *BASES) for ratio in (1, DROP_RATIO)}))
-MAX_RATE_DIFFERENCE = 0.02  # Of a standard rate from that of the times, relative
-GRID_TOLERANCE = 0.1  # Of a row's distance, within which all rows come evenly
-LONG_STEP = 1.5  # Times the median, above which rows are missing between two
+
+MAX_RATE_DIFFERENCE = 0.02
+"""Largest relative difference between a standard rate and that of the times."""
+GRID_TOLERANCE = 0.1  # Largest deviation, in distances of rows, with which all rows come evenly
+LONG_STEP = 1.5  # Multiple of the median step, above which rows are missing between two
 
 
 @dataclass(frozen=True)
@@ -189,7 +191,7 @@ def _seconds(
         times, base = seconds_of(where, [str(cell) for cell in cells], fps)
         if base is None:
             return times, None
-        why = "timecodes do not tell how many frames a second has"
+        why = "timecodes do not show how many frames a second has"
         taken = f"they are taken as {base:g} a second"
         return times, Guess(f"column {column.name}: {why}; {taken}; {OTHER_RATE}", base)
     values = numbers(where, column.name, cells)
@@ -254,9 +256,9 @@ def seconds_of(
     where: str, texts: list[str], fps: float | None = None
 ) -> tuple[np.ndarray, float | None]:
     """(T,) seconds from the first of timecodes `HH:MM:SS:FF.sub`, over midnight too; the rate of FF
-    is found from the numbers, and returned where these do not tell it and `fps` is not given. A
-    fraction behind a point is of the second where it has three digits or more, or where that of all
-    rows agrees with FF; so are thousandths behind a colon. Raises StgaError, beginning with
+    is found from the numbers, and returned where these do not determine it and `fps` is not given.
+    A fraction behind a point is of the second where it has three digits or more, or where that of
+    all rows agrees with FF; so are thousandths behind a colon. Raises StgaError, beginning with
     `where`, for other text."""
     fields = []
     digits = []
@@ -334,8 +336,8 @@ def _are_of_clock(frames: np.ndarray, parts: np.ndarray) -> bool:
 
 
 def _base_of(second: np.ndarray, frames: np.ndarray, fps: float | None) -> tuple[int, bool]:
-    """The frames a second for which rows come most evenly, and whether that or `fps` tells it, or
-    it makes no difference."""
+    """The frames a second for which rows come most evenly, and whether that or `fps` determines it,
+    or it makes no difference."""
     bases = [base for base in BASES if base > frames.max()] or [10 ** len(str(int(frames.max())))]
     if len(np.unique(second)) > 1:
         second = second + DAY_S * _days(second)

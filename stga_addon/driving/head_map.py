@@ -22,10 +22,12 @@ PRODUCT_SHAPES = tuple(name for name in ARKIT_SHAPES if name.startswith(("jaw", 
 """Shapes whose products with jawOpen are features: a jaw that turns carries what they move."""
 PRODUCTS = np.array([COLUMN[name] for name in PRODUCT_SHAPES])
 FEATURES = COUNT + len(PRODUCTS)
-GAZE_RAD = 0.61  # Of an eye at weight 1 of an eyeLook shape, the largest in Live Link Face's takes
+
+GAZE_RAD = 0.61
+"""Angle of an eye at weight 1 of an eyeLook shape, the largest in Live Link Face's takes."""
 RIDGE_M = 5e-5  # RMS displacement of the face that a unit of a coefficient must be worth
 JAW_STEPS = 4
-MAX_JAW_RAD = 0.8  # A jaw turns less; further, the fit has left what it is linear in
+MAX_JAW_RAD = 0.8  # Angle that no jaw reaches; beyond it, the fit has left its linear range
 # jawOpen, jawLeft and jawRight at which the other shapes are combined.
 JAW_POSES = (
     (0, 0, 0), (0.25, 0, 0), (0.5, 0, 0), (0.75, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1),
@@ -33,7 +35,7 @@ JAW_POSES = (
     (0.25, 0, 1),
 )  # fmt: skip
 COMBINATIONS = 60  # Random combinations of the other shapes at each of the poses of the jaw
-ACTIVE_FRACTION = 0.35  # Of the shapes in a combination
+ACTIVE_FRACTION = 0.35  # Fraction of the shapes in a combination
 CACHED_MAPS = 8
 _cache: dict[bytes, "HeadMap"] = {}
 

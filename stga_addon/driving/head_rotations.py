@@ -31,7 +31,7 @@ MAX_TURN_RAD_S = 12.0
 TURN_S = 0.1
 """Seconds over which this speed is measured."""
 QUESTIONED_RAD = 0.5
-"""Angle that, where nothing tells the unit, is large in radians and small in degrees."""
+"""Angle that, where nothing states the unit, is large in radians and small in degrees."""
 IF_DEGREES = "if they are degrees, --gain head=0.01745, in Blender Head Gain, scales them"
 """End of a message about guessed radians."""
 HALF_TURN_RAD = math.pi + 0.01

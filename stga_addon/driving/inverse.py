@@ -19,7 +19,9 @@ CONVERGED = 1e-5  # Largest change of a weight in a sweep, below which the desce
 NEWTON_STEPS = 12
 STEP_FRACTIONS = (1.0, 0.5, 0.2, 0.05, 0.0)
 CHUNK = 256  # Rows whose matrices are held at once
-RIDGE = 1e-9  # Fraction of the mean squared displacement, for weights that a head cannot tell apart
+
+RIDGE = 1e-9
+"""Fraction of the mean squared displacement, for weights that a head cannot distinguish."""
 TIMECODE_BASE = 60
 TURNS = "Yaw", "Pitch", "Roll"
 EXTRA_COLUMNS = [f"{part}{turn}" for part in ("Head", "LeftEye", "RightEye") for turn in TURNS]

@@ -51,7 +51,8 @@ NEUTRALS = {
 """Choice of a neutral face -> what it assumes."""
 MIN_WIDTH = {"face": 0.5, "jaw": 0.02, "eyes": 0.1}
 """Least half width of a trained range, in units of coefficients and in radians."""
-OUTER_QUANTILE = 0.01  # Of trained frames, cut off at both ends: single mistracked ones
+OUTER_QUANTILE = 0.01
+"""Quantile of trained frames that is cut off at both ends: single mistracked ones."""
 
 
 @dataclass(frozen=True)
@@ -255,7 +256,7 @@ class MotionOptions:
         needs=(SHAPES,),
     )
     recorded_fps: float | None = option(
-        "frames per second of a face performance whose file does not tell its times",
+        "frames per second of a face performance whose file has no times",
         None,
         MIN_FPS,
         MAX_FPS,

@@ -28,7 +28,9 @@ COLUMN = {name: column for column, name in enumerate(ARKIT_SHAPES)}
 OPTIONAL = ("tongueOut",)  # Shapes that sources of 51 lack; they stay zero
 PARTS = ("face", "jaw", "eyes")
 MAX_NAMED = 8  # Names that an error lists
-MIN_SIMILARITY = 0.8  # Of a mistyped name and the shape that it stands for (`difflib`)
+
+MIN_SIMILARITY = 0.8
+"""Least similarity (`difflib`) of a mistyped name and the shape that it stands for."""
 _KEYS = {name.lower(): name for name in ARKIT_SHAPES}
 _LIKE_A_SHAPE = re.compile("(eye|jaw|mouth|brow|cheek|nose|tongue)(?!yaw|pitch|roll)")
 
@@ -103,7 +105,7 @@ class Performance:
     fps      rows per second where none is lost
     warnings  one sentence each: what was guessed
     guessed_fps  rate that frame numbers or rows without times were taken to count, as the last of
-             the warnings says; None: the file tells its times
+             the warnings says; None: the file has times
     """
 
     times: np.ndarray

@@ -69,7 +69,7 @@ MAX_PARTS = 6
 """Keys of nested dictionaries that the name of a value in a JSON frame has."""
 MAX_LISTED = 16
 """Dictionaries of a list in a JSON frame that are examined."""
-MAX_PERCENT = 110.0  # Of weights, of which some are a little above the whole
+MAX_PERCENT = 110.0  # Largest weight in percent; some are a little above 100
 FRAME_KEYS = ("frames", "weightMat", "weights", "blendShapeWeights", "data")
 RATE_KEYS = ("exportFps", "fps", "FPS", "frameRate", "frame_rate", "framerate", "FrameRate")
 NAME_KEYS = ("facsNames", "names", "blendShapeNames", "blendshapes", "blendShapes")
@@ -79,7 +79,7 @@ SCORED = ("score", "value", "weight")
 
 
 def csv_performance(path: Path) -> Performance:
-    """Of a table with a row a frame. Raises StgaError."""
+    """Performance from a table with a row per frame. Raises StgaError."""
     rows = [row for _, row in read_table(path, MAX_TEXT_BYTES)]
     if not rows:
         raise StgaError(f"{path}: is empty, expected a row of column names")
@@ -114,7 +114,7 @@ def _plain(name: str) -> str:
 
 
 def packet_performance(path: Path) -> Performance:
-    """Of lines that are iFacialMocap's packets. Raises StgaError."""
+    """Performance from lines that are iFacialMocap's packets. Raises StgaError."""
     lines = read_text(path, MAX_TEXT_BYTES).splitlines()
     packets = [parse_packet(line.encode()) for line in lines]
     known = [packet for packet in packets if packet is not None]
@@ -131,18 +131,18 @@ def packet_performance(path: Path) -> Performance:
 
 
 def json_performance(path: Path) -> Performance:
-    """Of frames of weights. Raises StgaError."""
+    """Performance from a JSON file with frames of weights. Raises StgaError."""
     return frames_performance(path, read_json(path))
 
 
 def lines_performance(path: Path) -> Performance:
-    """Of a frame of JSON a line. Raises StgaError."""
+    """Performance from lines that are JSON frames. Raises StgaError."""
     return frames_performance(path, read_lines(path, read_text(path, MAX_TEXT_BYTES)))
 
 
 def text_performance(path: Path) -> Performance:
-    """Of text: iFacialMocap's packets, Face Cap's recording, or a frame of JSON a line. Raises
-    StgaError."""
+    """Performance from text: iFacialMocap's packets, Face Cap's recording, or a JSON frame per
+    line. Raises StgaError."""
     text = read_text(path, MAX_TEXT_BYTES)
     if is_face_cap(text):
         return frames_performance(path, face_cap_frames(path, text))
@@ -150,7 +150,7 @@ def text_performance(path: Path) -> Performance:
 
 
 def frames_performance(path: Path, document: Any) -> Performance:
-    """Of a JSON document with frames of weights. Raises StgaError."""
+    """Performance from a JSON document with frames of weights. Raises StgaError."""
     document = plain_frames(document)
     outer = document if isinstance(document, dict) else {}
     frames = next((outer[key] for key in FRAME_KEYS if isinstance(outer.get(key), list)), document)

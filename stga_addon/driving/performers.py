@@ -60,8 +60,8 @@ RECORDED_SUFFIXES = tuple(suffix for suffix in PERFORMERS if suffix not in READ_
 
 
 def performer_of(path: Path) -> Performer | None:
-    """By a file's suffix; None for what is no performance. The folder of a Live Link Face take is
-    read as its table."""
+    """The performer for a file's suffix; None for a file that is no performance. The folder of a
+    Live Link Face take is read as its table."""
     if is_folder(path):
         is_capture = is_folder(path / "flame_param") or matching(path, "transforms*.json")
         return None if is_capture or not _tables(path) else PERFORMERS[".csv"]
@@ -83,8 +83,8 @@ def read_performance(
     LAM-Audio2Expression, of MediaPipe's blend shapes, or of any named weights per frame;
     iFacialMocap's packets as lines of text; a video of a face. Columns are found by name.
 
-    recorded_fps: the rate of a file that does not tell its times. Raises StgaError naming the file,
-    the row, and the shapes that are missing, and for the rate of a file that tells its times.
+    recorded_fps: the rate of a file without times. Raises StgaError naming the file, the row, and
+    the shapes that are missing, and for the rate of a file with times.
     """
     if is_folder(path):
         files = _tables(path)
@@ -101,7 +101,7 @@ def read_performance(
         )
     performance = performer.read(path, report)
     if recorded_fps is not None and performance.guessed_fps is None:
-        problem = f"{path}: tells its times, so that no rate is taken"
+        problem = f"{path}: has times, so that no rate is taken"
         raise StgaError(f"{problem} (--recorded-fps, in Blender Recorded At)")
     return performance if recorded_fps is None else recorded_at(performance, recorded_fps)
 

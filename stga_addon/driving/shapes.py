@@ -90,7 +90,7 @@ FAR_M = 1.0
 MAX_MATCH_M = 0.003
 """Distance up to which a nearest point counts."""
 MEDIANS = 4.0
-"""And up to this many times the median of all."""
+"""Multiple of the median distance up to which a nearest point counts as well."""
 TANGENTIAL_WEIGHT = 0.1
 PUPIL_WEIGHT = 30.0
 IDENTITY_DEVIATION_M = 0.002

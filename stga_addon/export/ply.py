@@ -181,7 +181,7 @@ def save_columns(path: Path, names: Sequence[str], columns: np.ndarray) -> None:
 def read_vertices(path: Path) -> np.ndarray:
     """Structured array (N,) of a PLY file's vertices, binary or ASCII, one field a property.
 
-    Raises StgaError where the file is missing, malformed, packed or shorter than its header says.
+    Raises StgaError where the file is missing, malformed, packed or shorter than its header states.
     """
     rows = ply_rows(path, read_bytes(path, MAX_SPLAT_BYTES), ["vertex"]).get("vertex")
     names = () if rows is None else rows.scalars.dtype.names

@@ -82,7 +82,7 @@ class Rig:
 
     @property
     def shape_names(self) -> tuple[str, ...]:
-        """Of the first E shapes."""
+        """Names of the first E shapes."""
         numbers = tuple(f"expr_{k:03d}" for k in range(self.expressions))
         return self.expression_names or numbers
 

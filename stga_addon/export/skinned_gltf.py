@@ -133,7 +133,7 @@ IRRADIANCE_STEPS = 1023
 MIN_SLIDER_RANGE = 1.0
 """Sliders reach ±this at least."""
 SLIDER_HEADROOM = 1.5
-"""And beyond the motion by this factor."""
+"""Factor by which sliders also reach beyond the motion."""
 
 
 def skinned_glb(rigged: RiggedAvatar, playback: Playback, exact: bool = False) -> bytes:
@@ -275,7 +275,7 @@ def _add_light(
 
 
 def _header(avatar: Avatar, rig: Rig, playback: Playback) -> dict[str, Any]:
-    """All but what tells of shapes, light and arrays."""
+    """All fields but those of shapes, light and arrays."""
     # Sliders: every expression with its range, those that the motion uses most first.
     names = rig.shape_names
     used = rig.coefficients[:, : rig.expressions]

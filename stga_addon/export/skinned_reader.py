@@ -353,7 +353,7 @@ def _rig(
         joint_rest=rest,
         joint_basis=moved,
         joint_names=tuple(str(nodes[joint]["name"]) for joint in joints),
-        parents=tuple(own[0] if own else -1 for own in parents),
+        parents=tuple(parent[0] if parent else -1 for parent in parents),
         weights=weights,
         coefficients=coefficients,
         pose=to_axis_angle(turns[..., [3, 0, 1, 2]]),

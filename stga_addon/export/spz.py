@@ -56,7 +56,7 @@ OTHERS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
 def write_spz(path: Path, world: Splats, antialiased: bool = False) -> None:
     """Write world-space splats as .spz of version 3, atomically.
 
-    Axes as in the splats: x right, y up, z back. Quantized: positions as MAX_FRACTION_BITS says,
+    Axes as in the splats: x right, y up, z back. Quantized: positions as MAX_FRACTION_BITS defines,
     standard deviations from 45 µm in steps of 6 %, rotations 10 bits a component, opacity and color
     8 bits; coefficients above degree 0 are cut at ±1. antialiased as in `Avatar`. Raises StgaError
     for values that are not finite, and positions beyond MAX_COORDINATE. Source: Niantic's README

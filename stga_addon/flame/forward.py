@@ -269,9 +269,9 @@ def parameters_gradient(
 
 @dataclass(frozen=True)
 class _Posed:
-    """Of a frame: joints (5, 3) and vertices with pose correctives (V, 3), both unposed; rotations
-    (5, 3, 3) of the joints in their parents and in the world; `moved` (5, 3): a joint takes x to R
-    x + moved; R blended (V, 3, 3)."""
+    """A posed frame: joints (5, 3) and vertices with pose correctives (V, 3), both unposed;
+    rotations (5, 3, 3) of the joints in their parents and in the world; `moved` (5, 3): a joint
+    takes x to R x + moved; R blended (V, 3, 3)."""
 
     joints: np.ndarray
     corrected: np.ndarray

@@ -16,9 +16,9 @@ and the end of that."""
 EYE_REGION_RADII = 2.0
 """Radius of an eye's region, in radii of the eyeball."""
 LIP_HEIGHT_FRACTION = 0.18
-"""How far from where lips meet they reach, as a fraction of the width of the mouth."""
+"""Height of lips from the line where they meet, as a fraction of the width of the mouth."""
 NOSE_RADIUS_FRACTION = 0.35
-"""How far a nose reaches from the line from between the eyes to its tip, as a fraction of the eyes'
+"""Radius of a nose around the line from between the eyes to its tip, as a fraction of the eyes'
 height over the mouth."""
 MIDDLE_FRACTION = 0.1
 """Half the width of the middle of a face, as a fraction of the eyes' distance."""

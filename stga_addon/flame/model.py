@@ -154,7 +154,7 @@ def model_arrays(file: NpzFile, names: Collection[str]) -> dict[str, np.ndarray]
 def _check_size(path: Path, arrays: Arrays) -> None:
     template = next((arrays[name] for name in TEMPLATE_KEYS if name in arrays), np.zeros(0))
     vertices = len(template) if template.ndim else 0
-    numbers = sum(own.size for own in arrays.values()) + FILLED_NUMBERS_PER_VERTEX * vertices
+    numbers = sum(array.size for array in arrays.values()) + FILLED_NUMBERS_PER_VERTEX * vertices
     if numbers > MAX_MODEL_NUMBERS:
         problem = f"is a head model of {numbers} numbers; expected up to {MAX_MODEL_NUMBERS}"
         raise StgaError(f"{path}: {problem}")

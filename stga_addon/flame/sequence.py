@@ -60,8 +60,8 @@ JOINT_COUNTS = {"rotation": 1, "neck_pose": 1, "jaw_pose": 1, "eyes_pose": 2}
 # Numbers of a rotation by two rows of its matrix, or the matrix
 ROWS_OF_SIX = 6
 MATRIX_SIZE = 9
-MATRIX_TOLERANCE = 1e-3  # Of exports with a few decimals
-UNREAD_PARTS = ("eyelids", "eyelid_params")  # Of models that FLAME was extended by
+MATRIX_TOLERANCE = 1e-3  # Tolerance for exports with a few decimals
+UNREAD_PARTS = ("eyelids", "eyelid_params")  # Parts of models that extend FLAME
 # Columns of a `pose` that holds several joints -> the fields they are, three columns a joint.
 POSE_LAYOUTS = {6: ("rotation", "jaw_pose"), 15: ("rotation", "neck_pose", "jaw_pose", "eyes_pose")}
 
@@ -69,7 +69,7 @@ BODY_POSE_SIZE = 165
 """Numbers of SMPL-X's pose, as BEAT2 has it in `poses`."""
 BODY_POSE_PARTS = {"neck_pose": (45, 48), "jaw_pose": (66, 69), "eyes_pose": (69, 75)}
 """Field -> its columns there; the neck is moved as SMPL-X's head."""
-MIN_JOINT_ANGLE_DEG = 0.5  # of a joint that moves
+MIN_JOINT_ANGLE_DEG = 0.5  # Least angle of a joint that moves
 
 MAX_OFFSET_BYTES = 256 << 20
 """Offsets of a motion, above which they are left out where they are zero."""
@@ -77,7 +77,7 @@ MAX_ZERO_BYTES = 16 << 30
 """Most that is looked through for that, in a minute."""
 TORSO_SHIFT = "torso_shift"
 SHIFT_SIZE = 3
-MAX_PARAMETER = 1e6  # of coefficients, radians and meters; beyond it, vertices would overflow
+MAX_PARAMETER = 1e6  # Largest coefficient, angle or position; beyond it, vertices would overflow
 MAX_TIMESTEP = 1 << 20  # Blender's last frame
 
 
@@ -403,7 +403,7 @@ PARTS = {
     "neck": ("neck_pose",),
     "head": ("rotation", "translation"),
 }
-TIME_TOLERANCE = 1e-6  # of a timestep; rounding must not drop the last frame
+TIME_TOLERANCE = 1e-6  # Tolerance in timesteps: rounding must not drop the last frame
 
 
 def retimed(sequence: FlameSequence, step: float = 1.0) -> list[FlameFrame]:

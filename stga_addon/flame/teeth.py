@@ -44,7 +44,7 @@ OVERJET = 0.02
 EDGE_THICKNESS = 0.05
 ROOT_THICKNESS = 0.1
 MAX_MOUTH_RINGS = 12
-MAX_LIP_DISTANCE_M = 0.002  # Between opposite vertices of closed lips
+MAX_LIP_DISTANCE_M = 0.002  # Largest distance between opposite vertices of closed lips
 
 
 def with_teeth(model: FlameModel) -> FlameModel:

@@ -23,9 +23,9 @@ from ..errors import StgaError
 from ..files import CHANGED_LINE_ENDS, line_ends_changed, read_bytes
 
 MAX_FILE_BYTES = 2 << 30
-MAX_DENSE_ELEMENTS = 1 << 22  # In a sparse matrix; FLAME's joint regressor has 25,115
+MAX_DENSE_ELEMENTS = 1 << 22  # Elements of a sparse matrix; FLAME's joint regressor has 25,115
 MAX_LISTED = 1 << 18  # Values in lists; FLAME has 29,928 corners of triangles
-MAX_DEPTH = 32  # Of tuples in tuples, and of lists in lists
+MAX_DEPTH = 32  # Largest depth of nested tuples, and of nested lists
 SPARSE_CLASS = re.compile(
     r"scipy\.sparse(\._?(csc|csr|coo))?\.(?P<format>csc|csr|coo)_(matrix|array)"
 )
@@ -105,7 +105,8 @@ def _bounded(load: Callable[[Any], None]) -> Callable[[Any], None]:
 
 
 def _load_bytearray(unpickler: Any) -> None:
-    """Of as many bytes as the file holds; the library's allocates what the opcode promises."""
+    """Load at most as many bytes as the file holds; the library allocates what the opcode
+    promises."""
     unpickler.append(bytearray(unpickler.read(int.from_bytes(unpickler.read(8), "little"))))
 
 

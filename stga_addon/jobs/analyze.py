@@ -19,7 +19,8 @@ from ..training.run.folder import RUN
 from ..training.settings import PRESETS, TrainingSettings, make_settings
 from .train import Selected, Train
 
-FRACTIONS = (0.1, 0.35, 0.65)  # Of an analysis that are over when each preset begins to be timed
+FRACTIONS = (0.1, 0.35, 0.65)
+"""Fractions of an analysis that are done when each preset begins to be timed."""
 
 
 @dataclass(frozen=True)

@@ -36,7 +36,7 @@ SAVED = re.compile(r"Saved: '(?P<path>.+)'")  # What Blender prints when it has 
 LAST_LINES = 30  # Lines of Blender's output that are searched for why it failed
 STOP_TIMEOUT_S = 10.0
 MAX_FRAME = 1_048_574  # Blender's last frame
-FRAME_DIGITS = 6  # Of the name of a frame's picture, as many as this at least
+FRAME_DIGITS = 6  # Least number of digits in the name of a frame's picture
 
 
 @dataclass(frozen=True)

@@ -63,7 +63,7 @@ TIMESTEPS = When(
 class Render:
     """Render an avatar: one PNG per camera entry, a video of its motion, or a turntable.
 
-    output    an .mp4 file where `video` says so, else a folder for PNGs
+    output    an .mp4 file where `video` is set, else a folder for PNGs
     others    as of `avatar_source.Posed`
     """
 

@@ -153,10 +153,10 @@ def request_hint() -> Any:
 
 @dataclass(frozen=True)
 class RequestKind:
-    """What the sidebar says of requests of a kind, and what becomes of their results.
+    """Texts of the sidebar for requests of a kind, and the use of their results.
 
     label, cancel   what is running, for messages; what Cancel does
-    ends            what is said when it finished, was cancelled, failed, or its folder is not found
+    ends            texts when it finished, was cancelled, failed, or its folder is not found
     is_stored       the .blend file remembers it; its folder is in that of what it makes, others'
                     are temporary
     trains          it has a run, whose previews and avatar are shown on the head

@@ -239,7 +239,7 @@ WRITER = "tracking is writing this capture"
 MAX_MISFIT = 0.5
 """Median fraction of the head's pixels beyond which the avatar is another person's."""
 TRACKING_FRACTION = 0.5
-"""Of the progress, before an avatar tracks or is trained."""
+"""Fraction of the progress before an avatar tracks or is trained."""
 
 
 def refuse_tracked(request: Track) -> None:
@@ -412,11 +412,11 @@ class _Steps:
             absent = [Stage.DENSE, Stage.SURFACE, Stage.REFINEMENT]
         if footage.focal != "usual":
             absent.append(Stage.FOCAL_LENGTH)
-        images = sum(len(own.timesteps) for own in footage.cameras)
+        images = sum(len(camera.timesteps) for camera in footage.cameras)
         self._spans = stage_spans(images, absent)
 
     def report(self, stage: Stage, done: int, total: int) -> None:
-        """Raises Cancelled where the report says to stop."""
+        """Raises Cancelled when the report stops it."""
         begin, end = self._spans.get(stage, (stage.begin, stage.end))
         self._before = max(self._before, -math.floor(begin))
         at = begin + (end - begin) * done / max(total, 1)

@@ -112,8 +112,8 @@ def lit_fractions(
 
 
 def _texel_weights(taps: tuple[int, ...], fraction: np.ndarray) -> dict[int, np.ndarray]:
-    """Of texels along an axis: where the taps at whole numbers, moved by the fraction (N,) of a
-    texel, look up linearly."""
+    """Texel along an axis -> its weights in linear lookups at whole-numbered taps, moved by the
+    fraction (N,) of a texel."""
     weights: dict[int, np.ndarray] = {}
     for tap in taps:
         weights[tap] = weights.get(tap, np.float32(0)) + (1 - fraction)

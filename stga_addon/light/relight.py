@@ -25,7 +25,7 @@ ALIKE_AT_SPLAT = 0.25
 other objects' shadows."""
 UNLIKE_AT_SPLAT = 0.75
 """The same from which on nothing is kept."""
-RIDGE = 1e-6  # For meshes without light in some harmonics
+RIDGE = 1e-6  # Ridge for meshes without light in some harmonics
 
 
 class Kept(NamedTuple):
@@ -40,8 +40,8 @@ class Kept(NamedTuple):
 
 
 def kept(recorded: np.ndarray, distant: np.ndarray) -> Kept:
-    """By the capture's and the scene's light (9, 3), lamps far away, compared as irradiance by
-    direction, each channel but for a factor."""
+    """The part of recorded colors that is kept, from the capture's and the scene's light (9, 3) of
+    lamps far away. They are compared as irradiance by direction, each channel up to a factor."""
     old, new = (LAMBERT[:COUNT, None] * light for light in (recorded, distant))
     gain = np.maximum((old * new).sum(0) / np.maximum((old * old).sum(0), 1e-12), 0)
     same = gain * old

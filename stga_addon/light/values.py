@@ -14,7 +14,7 @@ import numpy as np
 
 KINDS = "sun", "point", "spot", "area"
 SHAPES = "rectangle", "ellipse"
-SKIN_ROUGHNESS = 0.45  # Of the highlight on skin (GGX, Blender's Principled BSDF)
+SKIN_ROUGHNESS = 0.45  # Roughness of the highlight on skin (GGX, Blender's Principled BSDF)
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""Whether the rasterizer's kernels are compiled already; numba is not needed to tell."""
+"""Whether the rasterizer's kernels are compiled already; numba is not needed for that."""
 
 import os
 from functools import cache

@@ -107,7 +107,7 @@ def _fastest(task: str) -> tuple[str, str]:
 
 
 def first_line(error: Exception) -> str:
-    """What a driver's error says, without its details."""
+    """The text of a driver's error, without its details."""
     return (str(error).strip() or repr(error)).splitlines()[0].removeprefix("--device gpu: ")
 
 

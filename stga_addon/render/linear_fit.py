@@ -34,7 +34,7 @@ FINENESS = 2
 samples, and do not blur what is thinner than a pixel, as ours does."""
 BEHIND = 0.0, 1.0
 """Grays behind one half of the views and the other: what is behind an avatar is not known."""
-MAX_SRGB = 1.12  # of what is shown natively (`scene.display.splat_nodes`)
+MAX_SRGB = 1.12  # Largest value that is shown natively (`scene.display.splat_nodes`)
 
 
 class _Seen(NamedTuple):
@@ -50,7 +50,7 @@ class _Seen(NamedTuple):
 def fit_linear(avatar: Avatar, capture: Capture, report: Report = ignore) -> np.ndarray:
     """`Avatar.linear_base` (N, 4) with which blending in linear light comes nearest to
     `render_avatar`, in display values, in views of the capture. Raises StgaError without any,
-    Cancelled where the report says to stop."""
+    Cancelled when the report stops it."""
     views = capture.views.get("train", ())
     if not views:
         raise StgaError(f"{capture.root}: has no training views, by which colors could be fitted")
@@ -119,6 +119,6 @@ def _gradient(avatar: Avatar, change: np.ndarray, seen: _Seen, buffers: BufferPo
 
 
 def _slope(srgb: np.ndarray) -> np.ndarray:
-    """Of linear light by sRGB."""
+    """Derivative of linear light by sRGB."""
     curve = 2.4 / 1.055 * ((srgb + 0.055) / 1.055) ** 1.4
     return np.where(srgb > 0.04045, curve, 1 / 12.92)

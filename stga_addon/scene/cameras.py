@@ -232,7 +232,7 @@ def _has_camera_size(scene: Any) -> bool:
 
 
 def central(cameras: list[Any]) -> Any:
-    """Of cameras of `import_cameras`, the one that sees the face; None of none."""
+    """The camera, of those of `import_cameras`, that sees the face; None without cameras."""
     if not cameras:
         return None
     bpy.context.view_layer.update()  # world matrices

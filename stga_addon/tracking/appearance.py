@@ -68,7 +68,7 @@ FAR_WEIGHT = 1e-3
 """Weight of the wider neighborhood in a mean over two."""
 MIN_NEIGHBORHOOD_PX = 2.0
 """Standard deviation of the smaller neighborhood, in pixels of the image of the means."""
-MIN_OBSERVATIONS = 1.0  # Sum of its views' weights, below which a point's texture is not known
+MIN_OBSERVATIONS = 1.0  # Least sum of the views' weights with which a point's texture is known
 
 
 @dataclass(frozen=True)
@@ -332,7 +332,7 @@ def average_texture(samples: Sequence[Sample]) -> Texture:
     first = _robust_mean([own.values[0] for own in samples], weight)
     luma = np.tile(np.median(first[known if known.any() else ...], axis=0), (len(first), 1))
     lights = {own.camera: np.eye(own.basis.shape[1])[0] for own in samples}
-    lit = [own.values for own in samples]
+    lit = [sample.values for sample in samples]
     values = [luma]
     for number in range(TEXTURE_ITERATIONS):
         scale = TEXTURE_SCALE if number else ALBEDO_SCALE

@@ -39,7 +39,7 @@ FRAMES = 40
 MIN_IMAGES = 8
 """Images with a camera, below which the take is not one of many cameras."""
 MIN_IMAGES_FRACTION = 0.5
-"""Of the images that were looked at."""
+"""Least fraction of the chosen images that get a camera."""
 MIN_ON_HEAD = 30
 """Points on the face, below which it was the room alone whose structure was found."""
 TIME_LIMIT_S = 900.0
@@ -65,13 +65,13 @@ face that is visible."""
 PAIR_S = 0.5
 """Time between the two frames of a video in which the room is compared."""
 TYPICAL_FPS = 30.0
-"""Frames per second where a take does not say."""
+"""Frames per second for a take without a rate."""
 PAIR_TURN_DEG = 1.0, 25.0
 """Turns of the head between two frames that are compared."""
 MIN_MATCHES = 8
-"""Points of the room that two frames share, for these to tell whether it moves."""
+"""Least number of the room's points in both frames that shows whether the room moves."""
 MIN_PAIRS = 3
-"""Pairs of frames that tell it."""
+"""Least number of pairs of frames that show it."""
 MATCH_RATIO = 0.75
 """Lowe's ratio test."""
 MAX_LIP_CHANGE = 0.08
@@ -352,7 +352,7 @@ def recognize(camera: FootageCamera, fps: float | None, step: Step) -> dict[str,
             other = min(number + ahead, len(timesteps) - 1)
             later = look.at(timesteps[other]) if other != number else None
             pairs += [(sample, later)] if later is not None else []
-        if photos:  # whose names may tell no order
+        if photos:  # whose names may have no order
             row = {id(sample): sample for pair in pairs for sample in pair}
             row |= {id(sample): sample for sample in samples.values()}
             pairs += pairwise(sorted(row.values(), key=lambda sample: sample.yaw))

@@ -190,7 +190,7 @@ def report_errors(out: Path, model: Path | None) -> float:
                 head = places.on(capture.mesh(timestep), capture.faces)
                 distance = np.linalg.norm(cameras[name].project(head[use])[0] - pixels[use], axis=1)
                 errors[name][timestep] = float(np.median(distance))
-    median = float(np.median([px for own in errors.values() for px in own.values()]))
+    median = float(np.median([px for error in errors.values() for px in error.values()]))
     report = read_json(out / REPORT_FILE)
     report["median_reprojection_px"] = round(median, 3)
     report["reprojection_px"] = rounded(errors)

@@ -103,7 +103,9 @@ def calibrate(
     frame = neutral_frame(model)
     names = np.array(model.expression_names)
     weights = [OPEN_JAW_WEIGHT * (names == "jawOpen"), np.isin(names, BLINKS)]
-    frames = [replace(frame, expr=1.0 * own) for own in weights if len(names) and own.any()]
+    frames = [
+        replace(frame, expr=1.0 * weight) for weight in weights if len(names) and weight.any()
+    ]
     if not len(names) and model.weights[:, JOINTS.index("jaw")].any():
         frames = [replace(frame, jaw_pose=np.array([OPEN_JAW_RAD, 0, 0]))]
     for own in frames:

@@ -33,7 +33,7 @@ FACE_RADIUS_M = 0.035
 LID_DISTANCE_M = 0.005
 """Distance from an eyeball up to which a landmark is one of the lids' edges."""
 HELD_OUT = 8
-"""One point of so many is not fitted, and tells whether the fit is better."""
+"""One point of so many is held out, and shows whether the fit is better."""
 STEPS = (1, 2, 2, 3)
 """One point of so many is fitted, for each level."""
 REGIONS = ("lower face", "middle face", "eyes", "brows")
@@ -113,7 +113,7 @@ class DenseHead:
         fitted = np.flatnonzero(~held)
         others = np.flatnonzero(held)
         self.rows = [*(fitted[::step] for step in STEPS), others, np.arange(len(self.points))]
-        single = in_single_precision(model)  # images tell no more
+        single = in_single_precision(model)  # images determine no more
         self._posed = [PosedPoints(single, self.points[rows]) for rows in self.rows]
         height = at[:, 1]
         low = height[reliable].min()

@@ -86,7 +86,7 @@ SCORE_NAMES = [
 
 @dataclass(frozen=True)
 class FaceScores:
-    """What the networks say of a face: its blend shapes by name, 0 to 1, and its landmarks.
+    """Result of the networks for a face: its blend shapes by name, 0 to 1, and its landmarks.
 
     points  (478, 3) pixels; depth, in pixels too, grows away from the camera
     """

@@ -53,8 +53,8 @@ RESIDUAL_SCALE_M = 0.004
 MAX_RESIDUALS = 25.0
 """Residual in RESIDUAL_SCALE_M beyond which a landmark's weight no longer falls: it would vanish
 below the smallest number."""
-MIN_LANDMARKS = 4  # Of a timestep that the head is fitted to: fewer do not determine a pose
-MIN_FACE_M = 0.01  # Extent of the landmarks on the head, below which they are but a point
+MIN_LANDMARKS = 4  # Least number of landmarks that determine a pose
+MIN_FACE_M = 0.01  # Extent of the landmarks on the head below which they are one point
 POSIT_ITERATIONS = 20
 
 

@@ -169,7 +169,7 @@ def _observed(
     neutral = places.on(head.model.v_template, head.model.faces)
     used = np.ones(len(places), bool)
     points = (head_fit.triangulated(view, used, neutral, 1.0) for view in views)
-    found = [head_fit.observed_landmarks(own, HERE, used) for own in points]
+    found = [head_fit.observed_landmarks(point, HERE, used) for point in points]
     return found, np.stack([head_fit.rigid_start(neutral, own) for own in found])
 
 

@@ -26,7 +26,8 @@ MAX_EXTENT_M = 2.0
 MAX_COMPONENT_M = 100.0
 """Displacement of a vertex by a component at coefficient 1; scales of components differ from model
 to model."""
-MAX_JOINT_FRACTION = 100.0  # Of a vertex in a joint's position, and of a joint in a vertex's motion
+MAX_JOINT_FRACTION = 100.0
+"""Largest weight of a vertex in a joint's position, and of a joint in a vertex's motion."""
 MIN_JOINT_WEIGHT = 0.5  # Skinning weight that some vertex must have for a joint to count as present
 
 

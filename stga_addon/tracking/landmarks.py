@@ -34,7 +34,7 @@ which the footage is not of one person: a pattern on a wall may look like one.""
 MIN_PART_TIMESTEPS = 50
 """Least number of timesteps in a part of a camera's take. There are as many parts as helpers at
 most: each decodes a video from the key frame before it, or from the beginning."""
-MIN_OVERLAP = 0.3  # Two faces whose boxes share this much of their area are one, found twice
+MIN_OVERLAP = 0.3  # Overlap of two faces' boxes above which they are one face, found twice
 
 
 @dataclass(frozen=True)

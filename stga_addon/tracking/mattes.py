@@ -50,13 +50,14 @@ HEAD_MARGIN_FRACTION = 0.06
 BAND_FRACTION = 0.018
 """Half of the soft band's width as a fraction of the head's size."""
 HAIR_BAND_FRACTION = 0.1
-"""The same within the outline where hair stands out from the tracked head: the backdrop is seen
+"""The same within the outline where hair stands out from the tracked head: the backdrop is visible
 between strands."""
 HAIR_ROWS_FRACTION = 0.6
-"""Of the tracked head's height, from its top, in which such hair is; below it are clothes."""
+"""Upper part of the tracked head in which hair stands out, as a fraction of its height; below it
+are clothes."""
 OPAQUE_HAIR_FRACTION = 0.9
-"""Of the way from the backdrop's color to the hair's, from which hair is opaque: gloss is a little
-nearer to a bright backdrop."""
+"""Position between the backdrop's color, 0, and the hair's, 1, from which on hair is opaque: gloss
+is a little nearer to a bright backdrop."""
 EVEN_COLORS_WEIGHT = 4.0
 """Weight of the variance of both sides' colors, beside SIMILAR_COLORS_LEVELS, in the confidence of
 hair's coverage: before a room and in dyed hair, a pixel's color is no evidence."""
@@ -106,8 +107,8 @@ def with_mattes(
 
     Frames that have one keep it. For the others, mattes are written into the folder of the
     capture's masks and, where an interrupted call with the same `source` wrote them, read from
-    there. A camera's clean plate tells the person from the backdrop, else the network. Bars of one
-    color at the edges of all frames belong to nobody.
+    there. A camera's clean plate separates the person from the backdrop, else the network. Bars of
+    one color at the edges of all frames belong to nobody.
     """
     path = out / MATTES_FILE
     total = len(list(footage.views()))
@@ -230,7 +231,7 @@ def find_matte(image: np.ndarray, probability: np.ndarray, head: np.ndarray) -> 
     small = tuple(max(1, round(scale * side)) for side in whole)
     pixels = cv2.resize(image, small, interpolation=cv2.INTER_AREA)
     seeds = probability, head.astype(np.float32)
-    likely, heads = (reduced(own, small) for own in seeds)
+    likely, heads = (reduced(seed, small) for seed in seeds)
     cut = _cut(cv2, pixels, likely, heads > 0.5, scale * size).astype(np.float32)
     person = cv2.resize(cut, whole, interpolation=cv2.INTER_LINEAR) > 0.5
     # coverage in a band along the person's outline, and what is near it

@@ -25,7 +25,7 @@ class TrackingOptions:
     meshes     whether an OBJ is written for each timestep of a FLAME capture as well
     world      "head": meters as the head's size says, y up, the head near the origin; "keep": that
                of the cameras, which is scaled about its origin where it is not in meters; "auto":
-               as the calibration says, else "head"
+               as the calibration states, else "head"
     mattes     whether they are made for frames without a mask (`with_mattes`)
     person     known from another take, with the head file's shapes: then only scale, expressions
                and poses are sought; of an avatar without the networks' bias, and `end_tracking` is
@@ -106,7 +106,7 @@ def is_of_footage(out: Path, footage: Footage) -> bool:
 
 
 def footage_state(footage: Footage) -> dict[str, Any]:
-    """Of each camera the first frame, the state of all files, and the undistortion; as JSON."""
+    """Each camera's first frame, the state of all files, and the undistortion; as JSON."""
     cameras = {}
     for camera in footage.cameras:
         own: list[Any] = [camera.source(camera.timesteps[0]), file_state(camera.frames.files)]

@@ -37,7 +37,7 @@ TILE_SIZE = 2 * PICTURE[0], PICTURE[1] + CAPTION
 NAME_WIDTH = 130
 CELL_HEIGHT = 12
 MAX_CHART_ROWS = 48
-HEAD_MARGIN = 0.08  # Of the head's box in the image, on every side
+HEAD_MARGIN = 0.08  # Margin of the head's box in the image, on every side
 MESH_OPACITY = 0.6
 # Drawn over what lies outside a view's matte
 MATTE_COLOR = (0, 150, 60)
@@ -48,7 +48,7 @@ NO_FACE = (70, 74, 80)
 
 ERROR_COLORS = np.array([(38, 130, 110), (240, 200, 70), (215, 50, 45)], float)
 """Colors of no error, half of the color scale and its end."""
-COLOR_SCALE_END = 3.0  # In medians of all errors
+COLOR_SCALE_END = 3.0  # End of the color scale, in medians of all errors
 
 Errors = Mapping[str, Mapping[int, float]]
 """Camera -> timestep -> reprojection error in pixels; without an entry where no face was found."""

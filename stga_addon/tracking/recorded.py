@@ -33,9 +33,9 @@ from .stages import Stage, Workers
 BUNDLED_PLACES = Path(__file__).parent / "networks/bundled_head_places.npz"
 """Landmarks on the bundled head, as `calibrate` finds them; made by
 `development/bundled_head.py`."""
-MIN_FACE_FRACTION = 1 / 3  # Of the timesteps, at which a face has to be detected
+MIN_FACE_FRACTION = 1 / 3  # Least fraction of the timesteps at which a face is detected
 FACE_REMEDY = "where the face is too small in the frame, crop the video to head and shoulders"
-MIN_FACE_PIXELS = 1.0  # Extent of the landmarks in an image, below which they are but a point
+MIN_FACE_PIXELS = 1.0  # Extent of the landmarks in an image below which they are one point
 
 
 @dataclass(frozen=True)

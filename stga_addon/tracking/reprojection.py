@@ -11,7 +11,7 @@ OUTLIER_FACTOR = 4.0
 """A camera is at fault whose landmarks miss the fitted head by this many times those of the
 others."""
 MIN_OUTLIER_FRACTION = 0.03
-"""And by this fraction of the face's size."""
+"""Least distance of an outlier, beside OUTLIER_FACTOR, as a fraction of the face's size."""
 MAX_MEDIAN_ERROR = 0.04
 """Median over the cameras, beyond which they do not see one head: up to 0.016 on sound footage; the
 demo's gives 0.06 where no camera is in step with another, and 0.2 mirrored."""
@@ -38,7 +38,7 @@ def reprojection_errors(fit: HeadFit, take: RecordedTake, footage: Footage) -> E
 
 def median_px(errors: Errors) -> float:
     """Median in pixels over all cameras and timesteps."""
-    return float(np.median([pixels for own in errors.values() for pixels, _ in own.values()]))
+    return float(np.median([pixels for error in errors.values() for pixels, _ in error.values()]))
 
 
 def misread_cameras(errors: Errors) -> list[str]:

@@ -34,8 +34,10 @@ from .surface import fit_surface
 from .torso import FollowedTorso, follow_torso
 
 ENOUGH_TURN_DEG = 30.0
-"""Largest angle between two poses of a head, beyond which turning tells little more of a lens."""
-LONG_TAKE = 50  # From which the fit is worth a helping process: threads slow its small matrices
+"""Largest angle between two poses of a head, beyond which turning determines a lens little
+better."""
+LONG_TAKE = 50
+"""Timesteps from which on the fit gets a helping process: threads slow its small matrices."""
 
 Misfits = dict[str, dict[int, float]]
 """Region of the face -> timestep -> how badly images are explained (`Misfit`)."""
@@ -61,7 +63,7 @@ class FittedHead:
     def show(self, workers: Workers, errors: Errors) -> None:
         """Draw the head over the footage, with figures of how well it fits."""
         quality = {"error_px": median_px(errors)}
-        fractions = [fraction for own in self.misfits.values() for fraction in own.values()]
+        fractions = [fraction for misfit in self.misfits.values() for fraction in misfit.values()]
         quality |= {"unexplained": float(np.mean(fractions))} if fractions else {}
         workers.show(partial(picture_of_fit, self.fit, self.recorded.footage), quality)
 
@@ -254,5 +256,5 @@ def _focal_warning(estimate: FocalEstimate) -> str:
     turn = "" if estimate.turn_deg > ENOUGH_TURN_DEG else "a head that turns by 30°, "
     return (
         f"the focal length is an estimate: {estimate.low:.0f} to {estimate.high:.0f} px with a "
-        f"probability of 90 %; {turn}--focal, or a photo with EXIF data tells more"
+        f"probability of 90 %; {turn}--focal, or a photo with EXIF data gives more"
     )

@@ -222,7 +222,7 @@ def in_order(
         covariance = np.linalg.inv(information + np.diag(prior))
         variances.append(np.diag(covariance @ information @ covariance))
     # landmarks move about their mean places
-    weight = np.mean([own.weight for own in observations], axis=0)
+    weight = np.mean([observation.weight for observation in observations], axis=0)
     spread = (weight[:, None] * np.var(missed, axis=0)).sum() / max(3 * weight.sum(), 1e-9)
     noises = spread / LANDMARK_SIGMA_M**2 * np.mean(variances, axis=0)
     jaw = head.model.n_expression + 3 * JOINTS.index("jaw")

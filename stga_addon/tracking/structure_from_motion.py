@@ -181,7 +181,7 @@ class _Search:
         (lens,) = best.cameras.values()
         focal, _, _, *distortion = lens.params.tolist()
         return Structure(
-            np.array([self._names[own.name] for own in images]),
+            np.array([self._names[image.name] for image in images]),
             np.stack([own.cam_from_world().matrix() for own in images]),
             focal,
             distortion[0] if distortion else 0.0,

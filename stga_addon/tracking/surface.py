@@ -38,9 +38,8 @@ IDENTITY_SWEEPS = (
 OUTLINE_SWEEPS = Sweep(0.003, 0.0005, 0.001), Sweep(0.003, 0.0005, 0.001)
 """Sweeps after the others where the masks' outlines are those of the skin."""
 TAKE_SWEEPS = (Sweep(0.004, 0.0005, 0.001), 300), (Sweep(0.0015, 0.0005, 0.001), 1000)
-"""At every timestep, and how many of the points that are usually found are looked for. The first
-starts at the pose of the landmarks, from which patches do not lie on the skin that they are of
-yet."""
+"""Sweeps at every timestep, and the number of mostly found points that they look for. The first
+starts at the pose of the landmarks, where patches do not yet lie on their skin."""
 SURFACE_POINTS = 2000
 """Points over the whole head."""
 SURFACE_TIMESTEPS = 6
@@ -69,7 +68,9 @@ OFFSET_DENSITY = 1.5e10
 SMOOTHING_M = 0.009  # Length over which offsets are smoothed
 OFFSET_SIGMA_M = 0.03  # Prior of an offset: how fast offsets vanish where no surface is seen
 OFFSET_ITERATIONS = 5
-MAX_COTANGENT = 5.0  # Of an angle, 11°: those of needles would outweigh all others
+
+MAX_COTANGENT = 5.0
+"""Largest cotangent of an angle, 11°: needles would outweigh all other triangles."""
 SURFACE_SIGMA_M = 0.0005
 MAX_OUTLINE_CAMERAS = 8  # Cameras whose masks are compared at every timestep
 

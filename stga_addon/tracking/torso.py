@@ -1,12 +1,12 @@
 """The torso's motion: whether the body below the head turns with the head, is still, or moves
 independently.
 
-Landmarks of a face cannot tell the neck's rotation from the head's, so that a tracked head and the
-ring of shoulders that its neck ends in turn as one. Here the root joint, which carries that ring,
-gets the orientation that explains the images below the head best; the neck turns back by as much,
-and the head stays where it was tracked. Skin between both is blended by the model's own weights.
-Where that leaves much unexplained, because shoulders were lifted or a chin was pushed forward, the
-torso is shifted as well; and its cloth bends, where that explains more.
+Landmarks of a face cannot distinguish the neck's rotation from the head's, so that a tracked head
+and the ring of shoulders that its neck ends in turn as one. Here the root joint, which carries that
+ring, gets the orientation that explains the images below the head best; the neck turns back by as
+much, and the head stays where it was tracked. Skin between both is blended by the model's own
+weights. Where that leaves much unexplained, because shoulders were lifted or a chin was pushed
+forward, the torso is shifted as well; and its cloth bends, where that explains more.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -222,7 +222,9 @@ class _Follower:
         states = torso_take.states_along(self._take, way, first, self._next, step)
         at = zip(way, states, strict=True)
         poses = [TorsoPose.of_points(own - self._pivot(timestep)) for timestep, own in at]
-        return {name: np.stack([getattr(own, name) for own in poses]) for name in ("turn", "shift")}
+        return {
+            name: np.stack([getattr(pose, name) for pose in poses]) for name in ("turn", "shift")
+        }
 
     def _next(
         self, before: torso_take.TorsoShot, now: torso_take.TorsoShot, state: np.ndarray

@@ -27,7 +27,7 @@ from .posed_points import head_rotation
 from .torso_take import HELD_OUT, BothWays, Motion, Rows, TorsoShot, TorsoTake, states_along
 
 BLOCK_PX = 12
-"""Side of blocks of pixels; one in HELD_OUT is not fitted, and tells whether to bend."""
+"""Side of blocks of pixels; one in HELD_OUT is held out, and shows whether to bend."""
 ROUGHNESS_M = 0.0005
 """Standard deviation of a vertex from the mean of its neighbors."""
 BEND_SIGMA_M = 0.02
@@ -304,7 +304,7 @@ class _Cloth:
         return [float(own) for own in total / max(count, 1)]
 
     def _numbers(self, shot: TorsoShot) -> list[int]:
-        """Of the cameras that see the sheet at first and now, in images of one size."""
+        """Numbers of the cameras that see the sheet at first and now, in images of one size."""
         return [
             number
             for number, own in self._references.items()

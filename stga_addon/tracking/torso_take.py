@@ -41,7 +41,7 @@ MAX_POINTS = 800
 BLOCK_POINTS = 4
 """Side of a block in points."""
 HELD_OUT = 3
-"""One block of so many is not fitted, and tells which motion is right."""
+"""One block of so many is held out, and shows which motion is right."""
 MASK_MARGIN = 0.01
 """Margin around the mask, whose edge is compared as well, as a fraction of the image's height."""
 DEPTHS_M = tuple(np.linspace(-0.12, 0.06, 19).tolist())
@@ -292,7 +292,8 @@ def states_along(
 
 
 def _distance(start: np.ndarray, end: np.ndarray) -> float:
-    """Of positions (N, 3) from others; but for what is hardly seen, which is anywhere."""
+    """Upper quartile of the distances of positions (N, 3) from others: hardly visible ones may be
+    anywhere."""
     return float(np.quantile(np.linalg.norm(end - start, axis=-1), 0.75))
 
 
@@ -483,7 +484,9 @@ def at_depth(
                 cost[rows] += np.where(shot.shows(other, at[rows]), fraction, UNSEEN_COST)
     costs = {"stereo": stereo, **{name: stereo.copy() for name in motions}}
     carriers = {name: Carrier(take, own[seen.timestep], seen.at) for name, own in motions.items()}
-    known = sorted(set.intersection(*(set(own) for own in motions.values()))) if motions else []
+    known = (
+        sorted(set.intersection(*(set(motion) for motion in motions.values()))) if motions else []
+    )
     for timestep in evenly_spread([t for t in known if t != seen.timestep], DEPTH_TIMESTEPS):
         shot = take.shot(timestep)
         for name, own in motions.items():
@@ -495,7 +498,8 @@ def at_depth(
 
 
 def _moved_in_depth(seen: SeenPoints, cost: np.ndarray) -> SeenPoints:
-    """The points where the cost (DEPTHS_M, N), averaged over neighbors, is least, if it tells."""
+    """The points where the cost (DEPTHS_M, N), averaged over neighbors, is least, if that is
+    significant."""
     from scipy.spatial import cKDTree
 
     moved = seen.at.copy()

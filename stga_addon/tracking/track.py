@@ -79,7 +79,7 @@ def _stranger(opened: OpenedFootage, workers: Workers) -> SeenHead:
 
 def _known(opened: OpenedFootage, person: KnownPerson, workers: Workers) -> SeenHead:
     """The stages of a person who is known. The only camera has the focal length of the person's,
-    where its file does not tell it and the landmarks allow it."""
+    where its file does not have it and the landmarks allow it."""
     recorded = record(opened, workers)
     recorded = in_world(with_focal(recorded, workers, person.camera))
     if opened.options.landmarks is None and person.draw is not None:
@@ -118,7 +118,7 @@ def _write(head: SeenHead, workers: Workers) -> TrackingReport:
     }
     write_json(out / folder.REPORT_FILE, values)
     workers.report(Stage.CONTACT_SHEET, 0, 1)
-    cameras = {own.name: fit.to_capture.camera(own.camera) for own in head.footage.cameras}
+    cameras = {camera.name: fit.to_capture.camera(camera.camera) for camera in head.footage.cameras}
     posed = PosedHead(cameras, torso.mesh, fit.head.model.faces)
     sheet = out / folder.SHEET_FILE
     write_contact_sheet(sheet, head.footage, posed, pixels, head.fitted.misfits)

@@ -240,7 +240,8 @@ class TrainingSettings:
         return bool(self.driven_offsets)
 
     def lattice_order(self, triangles: int) -> int:
-        """Of a mesh of so many triangles: decides how many splats there will be."""
+        """Order of the lattice on a mesh of so many triangles, which decides how many splats there
+        will be."""
         if self.lattice is not None:
             return self.lattice
         return 2 if triangles <= MAX_FINE_TRIANGLES else 1
@@ -252,7 +253,7 @@ class TrainingSettings:
         return self.lattice_order(triangles) - begins_coarse
 
     def check(self) -> None:
-        """Raise StgaError for settings at odds, and rows and names that types do not tell."""
+        """Raise StgaError for settings at odds, and rows and names that types do not show."""
         given = (self.seconds is not None) + (self.iterations is not None)
         if given > 1 or (given == 0 and self.preset is None):
             raise StgaError("the budget must be given either in seconds or in iterations")

@@ -25,7 +25,8 @@ MAX_PLATE_VIEWS = 24
 MAX_PLATE_PIXELS = 500_000
 """Larger images are read smaller."""
 MATTE_MARGIN_FRACTION = 0.008
-"""Around the person, where a matte is uncertain; fraction of the image's height."""
+"""Width of the zone around the person where a matte is uncertain, as a fraction of the image's
+height."""
 PERSON = 256
 """Value above every level of a pixel, so that it is sorted behind them."""
 RADII = 24
@@ -40,7 +41,7 @@ it."""
 SAMPLED_POINTS = 4000
 """Pixels of each plate by which shells are compared."""
 MIN_SHARED = 0.1
-"""Fraction of the sampled pixels that another plate must contain for a shell to tell the world's
+"""Fraction of the sampled pixels that another plate must contain for a shell to show the world's
 distance."""
 MIN_SIMILARITY = 0.3
 """Correlation of what both plates show there at least."""
@@ -90,7 +91,8 @@ class CleanPlate:
 
 
 def clean_plates(capture: Capture, correct: Correction | None = None) -> list[CleanPlate]:
-    """Of each camera with masks, of training views; correct: their exposure. Raises StgaError."""
+    """A clean plate of each camera with masks, from training views; correct: their exposure. Raises
+    StgaError."""
     masked = [view for view in capture.views.get("train", ()) if view.mask is not None]
     plates = []
     for _, views in sorted(views_by_camera(masked).items()):

@@ -34,7 +34,7 @@ SINGLE = dict.fromkeys(
     (THREADS_VARIABLE, "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "OPENCV_FOR_THREADS_NUM"), "1"
 )  # Environment variables of a helper
 REPORT_INTERVAL_S = 0.2
-STEPS_KEY = "steps"  # In the file of a kept result: how many steps it took
+STEPS_KEY = "steps"  # Key, in the file of a kept result, of how many steps it took
 # A helper's message is a pair of this and a value
 STEP = "step"
 RESULT = "result"

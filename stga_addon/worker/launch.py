@@ -35,7 +35,7 @@ NICENESS = 5
 """Added to the nice value of a worker, so that Blender has precedence."""
 BACKGROUND_NICENESS = 15
 """Added to that of what runs in the background, so that workers have."""
-PR_SET_PDEATHSIG = 1  # Of prctl(2)
+PR_SET_PDEATHSIG = 1  # Option of prctl(2)
 # Windows: own process group, so that closing the console does not end the worker; no console
 # window; and BELOW_NORMAL_PRIORITY_CLASS. Elsewhere: an own session.
 _DETACHED: dict[str, Any] = {"start_new_session": True}

@@ -27,7 +27,7 @@ EXPIRY_S = 30.0
 """Seconds without one until another process takes the lease: from a holder that was killed on
 another machine, or stands still (a suspended machine, storage that hangs)."""
 LOOK_INTERVAL_S = 0.2
-OWNER_OFFSET = 1  # Of the process number: Windows locks the first byte, which nobody can read
+OWNER_OFFSET = 1  # Place of the process number: Windows locks the first byte, which nobody can read
 
 
 @contextmanager

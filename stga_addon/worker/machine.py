@@ -25,7 +25,8 @@ def processors(proc: Path = PROC) -> int:
 
 
 def free_memory_gb(proc: Path = PROC) -> float:
-    """Memory that is available, in GB; infinite where the system does not say (Windows, macOS)."""
+    """Memory that is available, in GB; infinite where the system does not report it (Windows,
+    macOS)."""
     lines = _text(proc / "meminfo").splitlines()
     found = (line.split()[1] for line in lines if line.startswith("MemAvailable:"))
     free = [float(next(found, "inf")) * 1024]

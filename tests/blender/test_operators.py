@@ -215,7 +215,7 @@ def test_exports(shown, tmp_path):
     with failure("not tracked with FLAME"):
         ops.export_avatar(filepath=tmp_path / "pair", format="gaussian-avatars")
     one = {"filepath": tmp_path / "one.ply", "format": "ply", "filmed_only": True}
-    with failure("does not say what was filmed"):
+    with failure("does not state what was filmed"):
         ops.export_avatar(**one)
     unseen = np.arange(len(avatar.faces)) % 2 == 0
     path = tmp_path / "avatar.npz"

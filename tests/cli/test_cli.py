@@ -435,7 +435,7 @@ def test_what_no_camera_saw_is_left_out(tmp_path, capsys):
     whole = read_avatar(path)
     out = tmp_path / "a.ply"
     message = refused(capsys, "export", path, "--format ply --filmed-only --out", out)
-    assert "anna.npz: does not say what was filmed" in message
+    assert "anna.npz: does not state what was filmed" in message
     assert not out.exists()
     unseen = np.arange(len(whole.faces)) % 3 == 0
     kept = ~unseen[whole.splats.face]

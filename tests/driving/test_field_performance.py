@@ -182,7 +182,7 @@ def test_a_rate_that_the_file_does_not_tell(tmp_path, capsys, column, code, gues
         assert "recorded-fps" not in given.out + given.err
     timed = write_rows(tmp_path / "timed.csv", "time", lambda n: n / 30)
     assert stga("drive", timed, "--recorded-fps 24 --out", tmp_path / "c.csv") == 2
-    assert f"{timed}: tells its times, so that no rate is taken" in capsys.readouterr().err
+    assert f"{timed}: has times, so that no rate is taken" in capsys.readouterr().err
     assert stga("drive", tmp_path / "b.npz", "--recorded-fps 24 --out", tmp_path / "c.csv") == 2
     assert "--recorded-fps: has no effect" in capsys.readouterr().err
 

@@ -31,8 +31,9 @@ from .person import make_person
 from .studio import Studio
 
 WIDTH = 360
+"""Width of a frame in pixels; it is upright, as a phone is held."""
 HEIGHT = 480
-"""Pixels of a frame, held upright as a phone is."""
+"""Height of a frame in pixels."""
 FOCAL = 1.4
 """Focal length in image widths, about that of a phone's main lens."""
 SAMPLES = 8
@@ -40,23 +41,27 @@ SAMPLES = 8
 SEED = 5
 """Seed of the room, the walk and the turns of the head."""
 WALK_FRAMES = 40
+"""Frames of the walk around the head."""
 WALK_DEG = 330.0
 """Angle that the camera goes around the head, from behind one ear over the face to the other."""
 DISTANCE_M = 0.55
+"""Distance of the camera from the head."""
 BREATHING_M = 0.0008
 """Amplitude by which the head rises and falls during the walk."""
 FRAMES_PER_SECOND = 5.0
+"""Frame rate of both takes."""
 STEPS = 3
 """Frames from one expression of the talk to the next."""
 TURN_DEG = 22.0
+"""Largest turn of the head between expressions."""
 NOD_DEG = 6.0
-"""Largest turns of the head between expressions."""
+"""Largest nod of the head between expressions."""
 ROOM_M = 2.4
 """Half the length of the room's walls."""
 BOXES = 70
-"""Things at the walls, as furniture and pictures are."""
+"""Boxes at the walls, in place of furniture and pictures."""
 GLOW = 0.5
-"""Strength at which walls and things shine, instead of lamps of their own."""
+"""Strength of the light that walls and boxes emit, in place of lamps."""
 
 
 def main(source: Path) -> None:

@@ -78,7 +78,7 @@ def decode_live_link_face(data: bytes) -> FacePacket | None:
 
 Value = int | float | str | bytes | bool | None
 Message = tuple[str, tuple[Value, ...]]
-MAX_DEPTH = 4  # Of bundles in bundles
+MAX_DEPTH = 4  # Largest depth of nested bundles
 _BUNDLE = b"#bundle\0"
 _NUMBERS = {"i": ">i", "f": ">f", "h": ">q", "d": ">d", "t": ">Q", "c": ">i", "r": ">I", "m": ">I"}
 _CONSTANTS: dict[str, Value] = {"T": True, "F": False, "N": None, "I": math.inf}

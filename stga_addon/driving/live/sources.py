@@ -80,7 +80,7 @@ MAX_DATAGRAMS = 256
 """Read at once, more than a socket keeps."""
 MAX_READ_BYTES = 1 << 15
 """Read at once; the rest waits in the socket, so that decoding a flood does not hold Blender up."""
-REQUEST_INTERVAL_S = 1.0  # At which a phone that is silent is asked again
+REQUEST_INTERVAL_S = 1.0  # Interval at which a silent phone is asked again
 
 
 class Receiver:

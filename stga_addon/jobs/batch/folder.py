@@ -1,5 +1,5 @@
 """Folders of a batch, which one process holds, and of a job: what it holds from earlier starts, how
-it is prepared, and the digest that tells whether it has to be done again.
+it is prepared, and the digest that shows whether it has to be done again.
 
 job.json   beside the request: the job's identity, and how long it took
 """

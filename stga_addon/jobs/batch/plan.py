@@ -57,7 +57,7 @@ class Job:
     name      unique in the batch, the same each time that the plan is read
     folder    what the request writes lies in it; the request itself in `request_folder`
     after     names of the jobs that have to be finished before
-    minutes   how long the plan says that it takes
+    minutes   its time as stated in the plan
     """
 
     name: str
@@ -167,7 +167,7 @@ PLAN_KEYS = ("out", "resources", "job")
 TABLE_KEYS = ("request", "after", "resources", "minutes")
 """Keys of a job's table that are not fields of its request."""
 REPLACED = "replaced"  # Folder of the batch that keeps what changed jobs wrote before
-NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,199}", re.ASCII)  # Of a job, whose folder has it
+NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,199}", re.ASCII)  # Name of a job, and of its folder
 
 
 @dataclass(frozen=True)

@@ -77,7 +77,7 @@ class RayEngine(Engine):
         self._adopted[job.name] = job
 
     def running(self) -> Mapping[str, str]:
-        """The jobs that have written a status; Ray does not tell cheaply which tasks wait."""
+        """The jobs that have written a status; Ray has no cheap list of waiting tasks."""
         jobs = [*self._jobs.values(), *self._adopted.values()]
         begun = [job for job in jobs if read_status(job.request_folder) is not None]
         return dict.fromkeys((job.name for job in begun), "")

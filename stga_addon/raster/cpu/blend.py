@@ -230,8 +230,8 @@ def _set_coordinates(s):
 
 @inline_jit
 def _listed(listed, n):
-    """Of the n-th listed block: its splat, its first pixel in the tile, and where its own values
-    begin. The bounds that LLVM sees here tell it that these do not overlap the tile's."""
+    """The n-th listed block: its splat, its first pixel in the tile, and where its values begin.
+    The bounds show LLVM that these do not overlap the tile's."""
     entry = np.uint64(listed[n])
     at = (n % np.uint64(LISTED)) * np.uint64(BLOCK_PIXELS)
     return entry // np.uint64(PIXELS), entry % np.uint64(PIXELS), at

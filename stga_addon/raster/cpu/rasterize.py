@@ -253,7 +253,7 @@ def render_backward(
 
 
 def _no_step(sh: np.ndarray, v_sh: np.ndarray) -> ColorStep:
-    """Of coefficients whose gradients are written."""
+    """A step of no coefficients, whose gradients are written instead."""
     arrays = [array.reshape(len(array), prod(array.shape[1:])) for array in (sh, *[v_sh] * 4)]
     tables = AdamTables._make([*arrays, np.empty(0, np.float32)])
     return ColorStep(np.empty(0, np.int32), tables, AdamOptions(*[np.float32(0)] * 5))

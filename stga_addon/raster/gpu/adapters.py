@@ -20,7 +20,7 @@ BACKENDS = ("Vulkan", "Metal", "DX12")
 
 @cache
 def adapters() -> dict[str, Any]:
-    """The adapters that can run the kernels, by a name that tells equal ones apart: cards first,
+    """The adapters that can run the kernels, by a name that distinguishes equal ones: cards first,
     software last.
 
     A GPU that has Vulkan or Metal is named by that before Direct3D 12, whose compiler is the

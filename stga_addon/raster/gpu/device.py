@@ -257,8 +257,8 @@ class _Dispatch(NamedTuple):
     groups: Groups
 
     def encode(self, compute: Any) -> None:
-        """By the library's own functions: its methods look for an error after each call, which
-        takes longer than the call; what is wrong is reported when the commands are finished."""
+        """Encode by the library's functions: its methods look for an error after each call, which
+        takes longer than the call. Errors are reported when the commands are finished."""
         lib.wgpuComputePassEncoderSetPipeline(compute, self.pipeline._internal)
         lib.wgpuComputePassEncoderSetBindGroup(compute, 0, self.group._internal, 0, ffi.NULL)
         if len(self.groups) == 2:

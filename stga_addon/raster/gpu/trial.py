@@ -94,7 +94,8 @@ def try_device(device: Device) -> Trial:
 
 
 def _seconds_of(once: Callable[[], None], wait: Callable[[], bool], ahead: int) -> float:
-    """Of one image; ahead: how many the host may be ahead of the device, as in training."""
+    """Seconds of one image; ahead: how many images the host may be ahead of the device, as in
+    training."""
     count = 0
     began = perf_counter()
     while not count or perf_counter() - began < SECONDS:

@@ -15,8 +15,8 @@ from . import splat_attributes as stored
 from .node_builder import NodeGroup, Nodes
 
 MAX_AREA_RATIO = 4.0
-"""Of the area of the splats' triangles to the evaluated head's, up to which the head's first
-vertices are theirs; a remeshed head's are anywhere."""
+"""Largest ratio of the area of the splats' triangles to that of the evaluated head, for which the
+head's first vertices are those of the splats; in a remeshed head they are anywhere."""
 
 # Temporary attributes on the head's faces.
 _FRAME_ORIGIN = "stga_frame_origin"

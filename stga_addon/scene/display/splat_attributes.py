@@ -77,7 +77,8 @@ Attributes = dict[str, tuple[str, str, np.ndarray]]
 
 @dataclass(frozen=True)
 class SplatAttributes:
-    """Of vertices of a splat object, and of faces of its neutral mesh; light of the avatar."""
+    """Attributes of vertices of a splat object and of faces of its neutral mesh; light of the
+    avatar."""
 
     splats: Attributes
     neutral: Attributes
@@ -114,8 +115,8 @@ def avatar_attributes(avatar: Avatar) -> SplatAttributes:
 
 
 def linear_attributes(avatar: Avatar) -> Attributes:
-    """Of vertices of a splat object: what the native display draws in place of the trained ones;
-    none where the avatar has none."""
+    """Attributes of vertices of a splat object that the native display draws in place of the
+    trained ones; none where the avatar has none."""
     if avatar.linear_base is None:
         return {}
     opacity = _number(avatar.for_linear_light.splats.opacities())
@@ -123,7 +124,8 @@ def linear_attributes(avatar: Avatar) -> Attributes:
 
 
 def albedo_attribute(avatar: Avatar) -> Attributes:
-    """Of vertices of a splat object: what the scene's light falls on; none without a light."""
+    """Attribute of vertices of a splat object with the albedo that the scene lights; none without a
+    light."""
     if avatar.light is None:
         return {}
     relighter = Relighter(avatar)

@@ -150,7 +150,7 @@ def _gaussian_shader(nodes: Nodes) -> Any:
 
 
 def _squared_distance(nodes: Nodes, point: Any, direction: Any) -> Any:
-    """Of the origin from the line through a point in a unit direction."""
+    """Squared distance of the origin from the line through a point in a unit direction."""
     along = nodes.vector("DOT_PRODUCT", point, direction)
     length2 = nodes.vector("DOT_PRODUCT", point, point)
     return nodes.math("SUBTRACT", length2, nodes.math("MULTIPLY", along, along))

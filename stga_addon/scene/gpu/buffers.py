@@ -26,7 +26,8 @@ def texture(texels: np.ndarray, texel_format: str = EXACT) -> Any:
 def read_pixels(texture: Any, channels: int) -> np.ndarray:
     """(H, W, channels) float32, bottom row first."""
     buffer = texture.read()
-    # Of several axes, a buffer tells numpy wrong strides in some versions; copied while it lives.
+    # Of several axes, a buffer reports wrong strides to numpy in some versions; copied while it
+    # lives.
     buffer.dimensions = (texture.height * texture.width * channels,)
     return np.array(buffer, np.float32).reshape(texture.height, texture.width, channels)
 

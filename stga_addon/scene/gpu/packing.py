@@ -94,7 +94,7 @@ class StaticSplats:
 
 
 def static_key(layers: Sequence[SceneLayer]) -> tuple[tuple[int, int], ...]:
-    """What tells a `StaticSplats` of these layers, as long as their splats are alive."""
+    """The identity of a `StaticSplats` of these layers, as long as their splats are alive."""
     return tuple((id(layer.splats), len(layer.frames.origin)) for layer in layers)
 
 

@@ -15,7 +15,7 @@ from .shaders import MAP_COLUMNS
 
 NEAR_PER_SQUARE = 3e-4
 """Meters from a lamp at which its map begins, which throws nothing nearer, over the head's squared
-distance: float32 then tells depths there 0.2 mm apart."""
+distance: float32 then distinguishes depths 0.2 mm apart."""
 
 
 class RelitTextures:

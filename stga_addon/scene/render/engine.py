@@ -220,8 +220,8 @@ class SplatsEngine(bpy.types.RenderEngine):  # type: ignore[misc]
     def _view(
         self, depsgraph: Any, border: tuple[int, int, int, int], view_name: str, sample: Sample
     ) -> View:
-        """Of the scene's camera, or the eye of it, or the camera, that a view is seen by, from a
-        point of its aperture."""
+        """View of the scene's camera, of one of its eyes, or of the camera of a multiview's view,
+        from a point of its aperture."""
         scene = depsgraph.scene
         eye = None
         camera = view_camera(scene, view_name)

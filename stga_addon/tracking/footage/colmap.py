@@ -53,8 +53,8 @@ LENSES: dict[str, tuple[int, int, int, Callable[..., Lens]]] = {
 of its distortion coefficients, and the lens that these make."""
 
 KNOWN_FOLDERS = (".", "sparse/0", "sparse", "colmap/sparse/0", "colmap/sparse", "colmap")
-POSE_WORDS = 9  # Of an image's line before its name
-POINT_WORDS = 3  # Of a point: x, y and its number
+POSE_WORDS = 9  # Words of an image's line before its name
+POINT_WORDS = 3  # Words of a point: x, y and its number
 
 
 def colmap_models(folder: Path) -> list[Path]:

@@ -51,7 +51,7 @@ SAMPLE_HEAD = 78
 
 
 def photo_focal(path: Path, width: int, height: int) -> float | None:
-    """Focal length in pixels of an image of that size, as its EXIF says; None where it does not."""
+    """Focal length in pixels of an image of that size, from its EXIF; None without."""
     try:
         with Image.open(path, formats=FORMATS) as image:
             tags = image.getexif().get_ifd(EXIF)
@@ -70,8 +70,8 @@ def photo_focal(path: Path, width: int, height: int) -> float | None:
 
 
 def video_focal(path: Path, width: int, height: int) -> float | None:
-    """Focal length in pixels of a video of that size, as its metadata says; None where it does not.
-    Phones write it into the video's track, where FFmpeg does not look."""
+    """Focal length in pixels of a video of that size, from its metadata; None without. Phones write
+    it into the video's track, where FFmpeg does not look."""
     try:
         movie = _movie(path)
         tracks = [movie[first:end] for kind, first, end in _boxes(movie) if kind == b"trak"]

@@ -152,7 +152,7 @@ class Footage:
     focal       where focal lengths are from: "calibration"; of a single camera without one, "given"
                 (in the request), "file" (its EXIF or QuickTime's tags), "usual" (a phone's), or by
                 tracking "estimated" (from landmarks) or "avatar" (that of its camera)
-    keeps_world  whether the calibration says that the capture is to keep its world
+    keeps_world  whether the calibration states that the capture is to keep its world
     warnings    one sentence each
     finds_cameras  whether cameras were found in the very images
     """
@@ -166,8 +166,8 @@ class Footage:
     finds_cameras: bool = False
 
     def keeps(self, world: str) -> bool:
-        """Whether the cameras stay where they are, of "head", "keep" and "auto" (the calibration
-        says)."""
+        """Whether the cameras stay where they are, of "head", "keep" and "auto" (as in the
+        calibration)."""
         return world == "keep" or (world == "auto" and self.keeps_world)
 
     @cached_property

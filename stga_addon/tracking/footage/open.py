@@ -45,7 +45,7 @@ from .video import Video, VideoFrames, first_frames
 ALL_FRAMES = FrameRange()
 
 MAX_MEASURED_MASKS = 6
-"""Masks, evenly spread over cameras and timesteps, that tell what 255 means."""
+"""Masks, evenly spread over cameras and timesteps, that show what 255 means."""
 TYPICAL_VIEW_DEG = 65.0
 """Angle of view of an unknown camera over the image's diagonal: that of a phone."""
 
@@ -124,7 +124,9 @@ def _masks_as_meant(footage: Footage) -> Footage:
             return footage
     except StgaError:  # what needs the file says so
         return footage
-    cameras = tuple(replace(own, frames=_with_inverted(own.frames)) for own in footage.cameras)
+    cameras = tuple(
+        replace(camera, frames=_with_inverted(camera.frames)) for camera in footage.cameras
+    )
     sentence = f"{footage.root}: masks are 255 outside of the head; they are read the other way"
     return replace(footage, cameras=cameras, warnings=(*footage.warnings, sentence))
 
@@ -209,7 +211,7 @@ def _calibrated(
         files = {name: sequence_files(sources, name) for name in found}
         sequences = {name: open_sequence(own) for name, own in files.items()}
         used = [
-            path for own in files.values() for path in ([own] if isinstance(own, Path) else own)
+            path for file in files.values() for path in ([file] if isinstance(file, Path) else file)
         ]
         used += [path for shot in shots for path in calibration_images(sources, shot.label)]
         footage = _rig(sources, found, sequences, frames)
@@ -253,9 +255,11 @@ def _unused(sources: Sources, calibration: Path, used: Iterable[Path]) -> tuple[
 def _unused_masks(sources: Sources, cameras: Iterable[FootageCamera]) -> tuple[str, ...]:
     """Sentences about masks of no image and plates of no camera."""
     frames = [camera.frames for camera in cameras]
-    views = (view for own in frames if isinstance(own, ImageFrames) for view in own.views.values())
+    views = (
+        view for frame in frames if isinstance(frame, ImageFrames) for view in frame.views.values()
+    )
     used = {view.mask for view in views} | {sources.mask_of(path) for path in sources.files}
-    masks = [path for own in sources.masks.values() for path in own if path not in used]
+    masks = [path for mask in sources.masks.values() for path in mask if path not in used]
     known = {camera.name for camera in cameras}
     plates = [path for name, path in sources.plates.items() if name not in known]
     sentences = []
@@ -299,7 +303,7 @@ def _rig(
     frames: FrameRange,
 ) -> Footage:
     sequences = {name: _as_calibrated(own, shots[name]) for name, own in sequences.items()}
-    videos = [own for own in sequences.values() if isinstance(own, Video)]
+    videos = [sequence for sequence in sequences.values() if isinstance(sequence, Video)]
     warnings = [warning for video in videos for warning in video.sentences]
     recorded, fps, sentences = synchronized(sequences, shots, sources, frames)
     cameras, messages = _with_sentences(
@@ -318,7 +322,7 @@ def _as_calibrated(sequence: Sequence, shot: Shot) -> Sequence:
 
 
 def _camera(name: str, shot: Shot, frames: Frames) -> tuple[FootageCamera, tuple[str, ...]]:
-    """The camera, and sentences about what its frames are other than its calibration says. Raises
+    """The camera, and sentences about what its frames are different from its calibration. Raises
     StgaError for frames of another shape."""
     messages: tuple[str, ...] = ()
     if isinstance(frames, ImageFrames) and shot.is_as_stored:
@@ -441,7 +445,7 @@ def _one_a_camera(shots: list[Shot], calibration: Path) -> tuple[list[Shot], tup
 
 def _with_images(shots: list[Shot], sources: Sources) -> tuple[list[Shot], tuple[str, ...]]:
     """Shots with their images: of one moment where each has one, else of the moments that the
-    images' names tell, and a sentence about these."""
+    images' names show, and a sentence about these."""
     if not all(_has_one_image(shot, sources) for shot in shots):
         labels = [stem_of(shot.label).rpartition("/")[2] for shot in shots]
         images = {} if len(set(labels)) < len(labels) else images_by_camera(labels, sources.images)

@@ -40,7 +40,7 @@ OF_CALIBRATIONS = {
     *("qy", "qz", "omega", "phi", "kappa", "r00", "r01", "r02", "r11", "r12", "r13"),
 }
 """Columns of any program's cameras, but for their positions."""
-MIN_COLUMNS = 3  # Of these, by which a table with names is taken for one of cameras
+MIN_COLUMNS = 3  # Least number of these columns with which a table is one of cameras
 NAMESPACE = "{http://www.capturingreality.com/ns/xcr/1.1#}"
 XMP_MODELS = ("perspective", "brown3", "brown4", "brown3t2", "brown4t2")
 Rows = Sequence[tuple[int, list[str]]]

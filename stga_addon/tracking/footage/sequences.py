@@ -84,8 +84,8 @@ def synchronized(
     sources: Sources,
     frames: FrameRange,
 ) -> tuple[dict[str, Frames], float | None, tuple[str, ...]]:
-    """Frames of each camera, those of the videos a second (None where none says a plausible
-    number), and a sentence for each clock that was compared.
+    """Frames of each camera, those of the videos a second (None where none has a plausible number),
+    and a sentence for each clock that was compared.
 
     Timestep t is frame t + offset of a recording. Timesteps of which a video whose rate varies has
     no frame are left out. Raises StgaError where a camera has fewer frames than another, lacks one

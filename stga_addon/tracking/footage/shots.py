@@ -30,12 +30,12 @@ class Shot:
     label     as in the file: the camera's name, or the path of the image it was calibrated with
     camera    pose and intrinsics of the image as recorded; `lens` distorts it
     where     file and entry, with which messages begin
-    image     the image, where the file says that it is a frame of the footage; then with its
+    image     the image, where the file states that it is a frame of the footage; then with its
               timestep
     mask      its foreground mask
     camera_name  what the file calls the camera of several images
     fps       frames per second that the file states, whose numbers the timesteps are
-    keeps_world  whether the file says that its world is that of a scene, which the capture is to
+    keeps_world  whether the file states that its world is that of a scene, which the capture is to
                  keep
     is_as_stored  whether it was calibrated with the pixels as stored, without EXIF's orientation
     """

@@ -142,7 +142,9 @@ def _name_by_folder(sources: Sources) -> None:
     if len(folders) < 2 or "" in folders.values() or len(set(folders.values())) < len(folders):
         return
     images = [sources.folders.get(folder, []) for folder in folders.values()]
-    if any(len(own) > 1 for own in images) or not set(folders.values()).isdisjoint(sources.videos):
+    if any(len(image) > 1 for image in images) or not set(folders.values()).isdisjoint(
+        sources.videos
+    ):
         return
     for folder in folders.values():
         sources.folders.pop(folder, None)

@@ -60,7 +60,7 @@ class Evidence:
 
     @property
     def decibels(self) -> float:
-        """By how much PSNR rises with the model; negative where it adds error."""
+        """Gain of PSNR by the model; negative where it adds error."""
         before, after = (max(error, ROUNDING_LEVELS) for error in (self.before, self.after))
         return 20 * math.log10(before / after)
 

@@ -24,7 +24,7 @@ from .samples import Samples, take_samples
 MAX_TIMESTEPS = 64
 """Timesteps that are posed to measure motion, evenly spread."""
 MIN_WHITE_FRACTION = 0.1
-"""Of the pixels beside the mesh: with a white background, more of them than this are white."""
+"""Least fraction of white pixels beside the mesh with which the background is white."""
 
 
 class CaptureFacts:
@@ -85,9 +85,9 @@ class CaptureFacts:
 
     @cached_property
     def strain_dependence(self) -> dict[str, Evidence]:
-        """Of colors on the strain around their triangle, in the range that the other views would
-        train: in "frames" that are left out, as unseen expressions, and in "cameras" that are, as
-        other views of known expressions; a single camera is not left out."""
+        """Evidence that colors depend on the strain around their triangle, in the range that the
+        other views would train: in left-out "frames", as unseen expressions, and in left-out
+        "cameras", as other views of known expressions. A single camera is not left out."""
         samples = self.samples
         strain = samples.signals["smoothed_strain"]
         folds = {"frames": evidence.consecutive_folds(samples.timestep)}
@@ -116,8 +116,8 @@ class CaptureFacts:
 
     @cached_property
     def backdrop_spread(self) -> float | None:
-        """By how many of 255 levels what lies outside the masks differs within a sampled view and
-        between them; None where views have no mask or nothing lies outside."""
+        """Difference, of 255 levels, of pixels outside the masks within a sampled view and between
+        views; None where views have no mask or nothing lies outside."""
         known = ~np.isnan(self.samples.background_spread)
         if np.isnan(self.samples.foreground).any() or not known.any():
             return None

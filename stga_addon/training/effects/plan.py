@@ -84,7 +84,7 @@ def view_color(facts: CaptureFacts) -> Verdict:
     if facts.cameras == 1:
         return Verdict(False, "a single camera sees everything from one direction", fixed=True)
     if facts.cameras < MIN_CAMERAS_FOR_VIEW_COLOR:
-        reason = f"{facts.cameras} cameras are too few to tell how color depends on the view"
+        reason = f"{facts.cameras} cameras are too few to show how color depends on the view"
         return Verdict(False, reason)
     direction = facts.samples.direction
     folds = scattered_folds(np.arange(len(direction)))
@@ -198,7 +198,7 @@ def strain(facts: CaptureFacts) -> Verdict:
     if facts.signal_change("smoothed_strain") < MIN_SIGNAL_CHANGE:
         return Verdict(False, "the mesh has the same shape in every training frame", fixed=True)
     if facts.timesteps < MIN_TIMESTEPS_FOR_STRAIN:
-        reason = f"{facts.timesteps} frames are too few to tell what follows deformation"
+        reason = f"{facts.timesteps} frames are too few to show what follows deformation"
         return Verdict(False, reason)
     left_out = facts.strain_dependence
     gains = {f"left-out {kind}": found.decibels for kind, found in left_out.items()}

@@ -34,8 +34,8 @@ MASK_EDGE_PIXELS = 3
 TRACKING_ERROR_FRACTION = 0.01
 """Foreground up to this fraction of the image's height beside the mesh counts as tracking error."""
 DEPTH_TOLERANCE_FRACTION = 0.003
-"""How far a visible triangle's center may lie behind the nearest one, as a fraction of its
-depth."""
+"""Depth of a visible triangle's center behind the nearest one, as a fraction of its depth, up to
+which it is visible."""
 
 
 @dataclass(frozen=True)
@@ -96,7 +96,8 @@ def sample_views(views: Sequence[View], seed: int = 0) -> list[View]:
 
 
 def take_samples(capture: Capture, seed: int = 0) -> Samples:
-    """Of a few training views, two images at a time. Raises StgaError where one cannot be read."""
+    """Samples of a few training views, two images at a time. Raises StgaError where one cannot be
+    read."""
     views = sample_views(capture.views["train"], seed)
     rng = np.random.default_rng(seed)
     count = len(capture.faces)

@@ -62,7 +62,8 @@ class Network:
 
 
 def load_network() -> Network | None:
-    """That STGA_LPIPS names; None if it is not set. Raises StgaError as `read_network` does."""
+    """The network that STGA_LPIPS names; None if it is not set. Raises StgaError as `read_network`
+    does."""
     named = os.environ.get(WEIGHTS_VARIABLE)
     return read_network(Path(named)) if named else None
 

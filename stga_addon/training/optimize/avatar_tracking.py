@@ -83,7 +83,7 @@ POINTS = 6000
 MIN_COSINE = 0.15
 """Cosine between normal and direction to the camera below which a point does not count."""
 MESH_IMAGE_SIDE_PX = 160
-"""Larger side of the mesh's images, which tell hidden points, the head's pixels and the light."""
+"""Larger side of the mesh's images, which give hidden points, the head's pixels and the light."""
 EXPRESSION_SIGMA = 0.3
 """Standard deviation of an expression coefficient from its start."""
 JOINT_SIGMA_RAD = 0.2

@@ -26,7 +26,7 @@ WEIGHED_FRACTION = 0.03
 @dataclass(frozen=True)
 class FloaterPruning:
     """Prunes unbound splats by what they do: the largest sum of a splat's blend weights in any one
-    view. Neither opacity nor density tells floaters from the faint rim of hair."""
+    view. Neither opacity nor density distinguishes floaters from the faint rim of hair."""
 
     capture: Capture
     interval: ClassVar[int] = 1  # it goes by the fraction of the budget

@@ -58,7 +58,7 @@ class FrameStore:
     units     (F,) float32: the length that a triangle's limits are multiples of, in local units
     unit_lengths  (F,) meters of the neutral mesh that are a triangle's local unit
     voxel     meters between visual-hull points
-    surface   what training views tell of the triangles
+    surface   what training views show of the triangles
     """
 
     def __init__(

@@ -149,7 +149,8 @@ def fit_lines(
 
 
 def view_exposure(rows: Iterable[Sequence[float]]) -> ViewExposure:
-    """Of `TrainingSettings.exposure`; where it drifts, interpolated between timesteps."""
+    """Exposure of a view from rows of `TrainingSettings.exposure`; where it drifts, interpolated
+    between timesteps."""
     listed: dict[int, list[Sequence[float]]] = {}
     for row in rows:
         listed.setdefault(int(row[0]), []).append(row[1:])

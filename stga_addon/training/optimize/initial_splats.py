@@ -47,7 +47,8 @@ MAX_ASYMMETRY_FRACTION = 0.015
 VOXEL_SIZE_M = 0.004
 """Distance between visual-hull points, on a mesh of a head's size."""
 MIN_VOXEL_SIZE_FRACTION = 1 / 200
-"""Of the mesh's diagonal, so that the grid of a mesh in millimeters fits into memory."""
+"""Least size of a voxel as a fraction of the mesh's diagonal, so that the grid of a mesh in
+millimeters fits into memory."""
 MIN_MESH_DISTANCE_M = 0.006
 """Points nearer to the mesh are covered by the mesh's own splats."""
 GRID_MARGIN_FRACTION = 0.25
@@ -65,8 +66,8 @@ FEW_CAMERAS = 4
 """Largest number of cameras with which a torso's visual hull bulges by centimeters: `TorsoPoints`
 are better."""
 CONTINUED_FRACTION = 0.4
-"""How far a torso is continued beyond the image of a single camera, as a fraction of the image's
-width."""
+"""Length by which a torso is continued beyond the image of a single camera, as a fraction of the
+image's width."""
 CONTINUED_OPACITY = 3.0
 """Logit of these splats' opacity, which may never be trained."""
 SEEN_COPIES = 3

@@ -41,9 +41,9 @@ DEPTH_VOXELS = 0.5
 MAX_DEPTHS = 10
 """Depths that are tried; the first that lies within the masks is taken."""
 MARGIN_FRACTION = 0.015
-"""How far the layer must lie within the masks, as a fraction of their height."""
+"""Least distance of the layer from the masks' edge, as a fraction of their height."""
 BACK_MARGIN_FRACTION = 0.03
-"""The same of a torso's back, whose triangles are large."""
+"""The same for a torso's back, whose triangles are large."""
 SPLAT_REACH = 1.8
 """Three standard deviations of a splat, in sides of a square of two triangles, or in cells where
 these are larger."""

@@ -40,7 +40,8 @@ class Outline:
 
 
 def read_outlines(capture: Capture, seed: int) -> list[Outline]:
-    """Of MAX_OUTLINES training views drawn by `seed`, those with a mask. Raises StgaError."""
+    """Outlines of those of MAX_OUTLINES training views, drawn by `seed`, that have a mask. Raises
+    StgaError."""
     views = capture.views["train"]
     outlines = []
     for n in np.random.default_rng(seed).permutation(len(views))[:MAX_OUTLINES]:

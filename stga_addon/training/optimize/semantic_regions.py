@@ -261,12 +261,12 @@ def lining_of(capture: Capture) -> np.ndarray:
 
 
 def teeth_of(capture: Capture) -> np.ndarray:
-    """(F,) bool: teeth, where the head model says which they are."""
+    """(F,) bool: teeth, where the head model marks them."""
     return _in_masks(capture, TEETH)
 
 
 def eyeballs_of(capture: Capture) -> np.ndarray:
-    """(F,) bool: eyeballs, where the head model says which they are."""
+    """(F,) bool: eyeballs, where the head model marks them."""
     return _in_masks(capture, EYEBALLS)
 
 

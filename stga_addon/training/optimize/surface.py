@@ -53,7 +53,7 @@ OUTLINE_VIEWS = 16
 OUTLINE_COSINE = 0.2
 """Largest cosine between a camera and a triangle in the mesh's outline."""
 OUTSIDE_CAMERAS = 15
-"""Cameras that tell the neutral head's outside from its inside."""
+"""Cameras that distinguish the neutral head's outside from its inside."""
 OUTSIDE_DISTANCE = 4.0
 """Their distance from the head's center, in its radius."""
 OUTSIDE_WIDTH = 2.2

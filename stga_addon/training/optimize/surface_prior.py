@@ -92,16 +92,17 @@ class Prior(Protocol):
     """What is plausible of some splats; made once for the frames of a training."""
 
     def apply(self, splats: BoundSplats) -> None:
-        """Pull or keep what the views do not tell."""
+        """Pull or keep what the views do not determine."""
         ...
 
 
 class SurfacePrior:
     """Pulls bound splats toward a prior; the pull is stronger where views determine less.
 
-    How much views tell is read from Adam's second moments, root mean squares of gradients. Without
-    this, its steps, which are of one length for strong and weak gradients, would let splats that
-    fill a pixel of an outline take any color and size for the cameras that see them from behind.
+    How much views determine is read from Adam's second moments, root mean squares of gradients.
+    Without this, its steps, which are of one length for strong and weak gradients, would let splats
+    that fill a pixel of an outline take any color and size for the cameras that see them from
+    behind.
     """
 
     interval = 20

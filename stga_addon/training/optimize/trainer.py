@@ -43,7 +43,7 @@ NEW = Start()
 
 
 class Strategy:
-    """Decides which triangles each iteration trains, as `TrainingSettings.strategy` says.
+    """Decides which triangles each iteration trains, by `TrainingSettings.strategy`.
 
     region  (F,) bool: the only triangles whose splats a refinement may change; None for all
 

@@ -72,7 +72,7 @@ two thirds at 45°."""
 
 @dataclass(frozen=True)
 class UnseenSides:
-    """What is plausible where views tell little of a head.
+    """Prior of a head where views determine little.
 
     triangles   (F,) bool: no view shows them
     shown       (F,) bool: the views whose colors were looked at show them well; not those that
@@ -253,7 +253,7 @@ class _Sides:
 
     def _in_light(self, rows: np.ndarray, image: np.ndarray) -> np.ndarray:
         """Colors (N, 3) of mirror images, those of the face in the light of the side of `rows`, as
-        the nearest that are shown on both sides tell it."""
+        the nearest that are shown on both sides give it."""
         found = self._color[image]
         both, opposite = self._both
         from_skin = np.linalg.norm(found - self._skin, axis=1)

@@ -65,7 +65,7 @@ class Counts:
 class Checkpoint(Counts):
     """State of training between two iterations.
 
-    tracking_gain  that the next evaluation is to tell, if any; NaN: nothing was left out
+    tracking_gain  that the next evaluation decides on, if any; NaN: nothing was left out
     tracking   (T, P + 3) float64 `RefinedTracking.parameters`; None where they are not refined
     """
 

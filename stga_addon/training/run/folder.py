@@ -106,7 +106,7 @@ class Run:
 
     @property
     def digest(self) -> str:
-        """Of the identity of a run that has begun."""
+        """Digest of the identity of a run that has begun."""
         assert self.identity is not None
         return self.identity.digest
 

@@ -213,7 +213,7 @@ class _Session:
     losses        of the last global iterations
     began         the clock at which the run would have begun, had it never been interrupted
     speed         iterations per second since this process began to train
-    tracking_gain TRACKING_GAIN, of which the next evaluation is to tell; NaN: nothing was left out
+    tracking_gain TRACKING_GAIN, on which the next evaluation decides; NaN: nothing was left out
     interrupts    the first Ctrl-C
     addition      training beyond the budget, if it was asked for
     fitting_s     what is left of fitting unseen heads after a budget in seconds, at most
@@ -352,7 +352,7 @@ class _Session:
 
     def _evaluate_finally(self) -> bool:
         """Evaluate what was trained, also with the heads of unseen timesteps fitted; False where
-        the report says to stop meanwhile."""
+        the report stops the work meanwhile."""
         measured = self._measure(perceptual=True)
         fitted = self._fit_unseen_heads()
         if fitted is None:
@@ -363,7 +363,7 @@ class _Session:
         return fitted is not None
 
     def _write_what_is_missing(self) -> None:
-        """Of the files of a finished run that was resumed."""
+        """Write the missing files of a finished run that was resumed."""
         avatar, residuals = (self.folder / name for name in (AVATAR, folders.RESIDUALS))
         if not avatar.exists():
             text = "it is written anew from the checkpoint, the last state of training"
@@ -393,7 +393,7 @@ class _Session:
         coarse, full = image_scales(settings, capture.views["train"])
 
         def scale(position: int) -> float:
-            """Of the captured size; by the clock, a few images ahead of it."""
+            """Fraction of the captured size; by the clock, a few images ahead of it."""
             total = settings.iterations
             fraction = self._spent().fraction if total is None else (first + position) / total
             return coarse if fraction < settings.coarse_share else full
@@ -443,7 +443,7 @@ class _Session:
     def _fit_unseen_heads(self) -> dict[str, float] | None:
         """Let the kept avatar track timesteps without training views, which changes no splat; its
         quality with heads fitted so, to the images that it is measured by. Empty where none is
-        fitted; None where the report says to stop."""
+        fitted; None when the report stops it."""
         tracking = self.trainer.tracking
         unseen = self._unseen_timesteps()
         if tracking is None or not unseen:
@@ -491,8 +491,8 @@ class _Session:
         tracked: Sequence[int],
         changed: Sequence[int],
     ) -> AvatarTracking | None:
-        """Track timesteps of a capture by the avatar; None where the report says to stop. changed:
-        the same and those between them, which change as their neighbors do."""
+        """Track timesteps of a capture by the avatar; None when the report stops it. changed: the
+        same and those between them, which change as their neighbors do."""
 
         def stops(done: int, total: int) -> bool:
             if seconds is not None and tracking is not self.trainer.tracking:

@@ -150,7 +150,8 @@ def test_demo_of_a_phone(tmp_path):
     run.avatar_from_phone(tmp_path, {"iterations": 300})
     picture = np.asarray(Image.open(tmp_path / "phone.png")).astype(int)
     width = (picture.shape[1] + 6) // (len(run.ANGLES_DEG) + 1)  # with the gap after it
-    front, back = picture[:, width : 2 * width - 6], picture[:, -width + 6 :]
+    front = picture[:, width : 2 * width - 6]
+    back = picture[:, -width + 6 :]
     capture = open_capture(tmp_path / "phone/capture")
     assert len({view.camera_index for view in capture.views["train"]}) > 30
     widths = [(shown.min(axis=2) < 200).any(axis=0).sum() for shown in (front, back)]
