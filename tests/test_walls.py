@@ -22,6 +22,7 @@ BLENDER = {"bpy", "bmesh", "gpu", "mathutils", "bl_ext"}
 BLENDERS = (
     "stga_addon/scene/",
     "stga_addon/development/demo/studio.py",
+    "stga_addon/development/benchmark/hands_on.py",
     "operators/",
     "ui/",
 )

@@ -69,7 +69,7 @@ def read_skinned_splats(path: Path) -> SkinnedSplats:
             raise ValueError(f"it has no {EXTRA}; such files come from the format skinned-gltf")
         if header["version"] != VERSION:
             raise ValueError(f"version {header['version']}; known is {VERSION}")
-        fps = float(header["fps"])
+        fps = _number(header, "fps")
         if not MIN_FPS <= fps <= MAX_FPS:
             raise ValueError(f"fps is {fps:g}; expected from {MIN_FPS:g} to {MAX_FPS:g}")
         start = _whole(header["byteOffset"])
@@ -179,6 +179,13 @@ def _whole(value: object, least: int = 0) -> int:
     return value
 
 
+def _number(values: dict[str, Any], name: str) -> float:
+    """Raises ValueError unless it is a number, as true is not."""
+    if type(values[name]) not in (int, float):
+        raise ValueError(f"{name} is {shorten(values[name])}; expected a number")
+    return float(values[name])
+
+
 def _arrays(entries: dict[str, Any], packed: bytes) -> dict[str, np.ndarray]:
     """Those of KNOWN_ARRAYS by their entries in the header. Raises ValueError where they are not
     whole, or, before they are unpacked, too large."""
@@ -238,7 +245,7 @@ def _array(entry: dict[str, Any], shape: list[int], planes: int, raw: bytes) -> 
         raise ValueError("an array holds numbers of more than 63 bits")
     integers += _whole(entry["low"], -(2**62))
     values = np.moveaxis(integers.reshape([*shape[-1:], *shape[:-1]]), 0, -1)
-    return values * float(entry["step"]) if entry["type"] == "fixed" else values
+    return values * _number(entry, "step") if entry["type"] == "fixed" else values
 
 
 def _joints(document: dict[str, Any]) -> list[int]:
@@ -371,6 +378,8 @@ def _avatar(
     count = len(arrays["xyz"])
     if len(per_face) != len(faces) or per_face.min() < 0 or per_face.sum() != count:
         raise ValueError(f"splats_per_face does not count its {count} splats")
+    if not isinstance(header["antialiased"], bool):
+        raise ValueError(f"antialiased is {shorten(header['antialiased'])}; expected true or false")
     rotation = of_smallest_three(arrays["rotation_largest"], arrays["rotation"])
     opacity = np.clip(arrays["opacity"], 1 - MAX_OPACITY, MAX_OPACITY)
     rest = arrays.get("sh", np.zeros((len(rotation), 0))).reshape(len(rotation), -1, 3)
@@ -394,7 +403,7 @@ def _avatar(
         np.asarray(arrays.get("neutral", rig.base), np.float32),
         faces,
         background=tuple(header["background"]),
-        antialiased=bool(header["antialiased"]),
+        antialiased=header["antialiased"],
         strain_range=strain_range,
         driven_offsets={
             name: each.reshape(-1, 3, 3).astype(np.float32) for name, each in offsets.items()
@@ -413,7 +422,7 @@ def _light(header: dict[str, Any], arrays: dict[str, np.ndarray]) -> AvatarLight
         occlusion=arrays["light_occlusion"].astype(np.float32),
         irradiance=arrays["light_irradiance"].astype(np.float32),
         roughness=arrays["light_roughness"].astype(np.float32),
-        residual=float(own["residual"]),
-        damping=float(own["damping"]),
+        residual=_number(own, "residual"),
+        damping=_number(own, "damping"),
         source=str(own["source"]),
     )

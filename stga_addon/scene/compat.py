@@ -247,7 +247,7 @@ def keep_animation(owner: Any) -> KeptAnimation:
 
 def give_animation(owner: Any, kept: KeptAnimation) -> None:
     """Give an owner kept tracks above those that it has, and the kept action in place of its
-    own, which stays in the file."""
+    own, which stays in the file, once."""
     if not kept.fields:
         return
     animation = owner.animation_data or owner.animation_data_create()
@@ -268,9 +268,26 @@ def give_animation(owner: Any, kept: KeptAnimation) -> None:
         for field, value in track_fields.items():
             setattr(track, field, value)
     if kept.action is not None:
-        if animation.action is not None:
-            animation.action.use_fake_user = True
+        own = animation.action
         assign_action(animation, kept.action, kept.slot)
+        if own is not None:
+            _keep_once(own)
+
+
+def _keep_once(action: Any) -> None:
+    """Keep an import's action that nothing plays in the file, unless an earlier one is equal."""
+    digest = action.get(tags.IMPORTED)
+    others = [each for each in bpy.data.actions if each != action and is_unused_import(each)]
+    if digest is not None and any(each.get(tags.IMPORTED) == digest for each in others):
+        bpy.data.actions.remove(action)
+    else:
+        action.use_fake_user = True
+
+
+def is_unused_import(action: Any) -> bool:
+    """Whether an import made the action, as it is, and nothing plays it."""
+    is_ours = tags.IMPORTED in action or tags.HELD in action
+    return is_ours and action.users == action.use_fake_user and not is_made_by_hand(action)
 
 
 def assign_action(animation: Any, action: Any, slot: str | None) -> None:

@@ -94,8 +94,8 @@ def test_refined_tracking_keeps_the_offsets_of_each_frame(tmp_path, place):
 
 
 def test_importing_again_keeps_the_shot(scene):
-    """Catches camera, size, frame range or performance strips that another import of the same
-    capture takes away, on either owner, once and twice."""
+    """Catches camera, size, frame range, drivers or performance strips that another import of the
+    same capture takes away, on either owner, once and twice, and unused actions that pile up."""
     ops.apply_motion(filepath=scene.file, start=12, place="strip")
     ops.apply_motion(filepath=scene.file, start=30, place="strip", jaw=False)
     shot = bpy.context.scene
@@ -106,6 +106,17 @@ def test_importing_again_keeps_the_shot(scene):
     shot.render.resolution_x = 999
     head = panel().head
     head.data.shape_keys.animation_data.nla_tracks[1].strips[0].influence = 0.5
+    for owner, path, source in (
+        (head.data.shape_keys, 'key_blocks["expr_000"].value', camera),
+        (rig_of(head), 'pose.bones["left_eye"].location', camera),
+        (head, "pass_index", camera),
+    ):
+        curve = owner.driver_add(path, 0) if path.endswith("n") else owner.driver_add(path)
+        variable = curve.driver.variables.new()
+        variable.name = "x"
+        variable.targets[0].id = source
+        variable.targets[0].data_path = "location.x"
+        curve.driver.expression = "x + 0.25"
     times = (0, 1.5, 5, 12, 13.5, 17, 30, 33)
     before = [mesh_at(time) for time in times]
     for _ in range(2):
@@ -116,12 +127,17 @@ def test_importing_again_keeps_the_shot(scene):
             assert_allclose(mesh_at(time), expected, atol=TOLERANCE)
     for owner in (rig_of(panel().head), panel().head.data.shape_keys):
         assert len(owner.animation_data.nla_tracks) == 4  # held, own, and two performances
+    assert (
+        head.animation_data.drivers.find("pass_index").driver.variables[0].targets[0].id == camera
+    )
     ops.apply_motion(filepath=scene.file, start=0)
     before = [mesh_at(time) for time in times]
-    for _ in range(2):
+    actions = sorted(bpy.data.actions.keys())
+    for _ in range(3):
         ops.import_capture(directory=scene.folder, flame=scene.model_file)
         for time, expected in zip(times, before, strict=True):
             assert_allclose(mesh_at(time), expected, atol=TOLERANCE)
+    assert len(bpy.data.actions) <= len(actions) + 2, bpy.data.actions.keys()
 
 
 def test_importing_again_keeps_what_was_made_by_hand(scene):

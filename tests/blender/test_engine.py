@@ -45,7 +45,9 @@ TOLERANCE = 1 / 255
 
 
 @pytest.fixture(autouse=True)
-def _engine(empty_scene):
+def _engine(empty_scene, monkeypatch):
+    # Software graphics draw here, though the rasterizer would be faster.
+    monkeypatch.setattr(engine, "is_rasterizer_faster", lambda: False)
     # The extension that other tests enable has an engine of this name, too: only one can be
     # registered.
     other = bpy.types.RenderEngine.bl_rna_get_subclass_py(engine.ENGINE, None)
@@ -224,6 +226,17 @@ def test_vectors_are_those_of_cycles(device, monkeypatch, tmp_path):
     error = np.abs(ours - theirs)[covered]
     assert (np.median(error, axis=0) < 0.1 * sizes).all()
     assert (np.quantile(error, 0.9, axis=0) < 0.3 * sizes).all()
+
+
+def test_software_graphics_leave_images_to_the_rasterizer(monkeypatch, tmp_path):
+    """Catches images that take three times as long without a graphics card."""
+    monkeypatch.undo()
+    monkeypatch.setattr(engine, "has_gpu_context", lambda: True)
+    monkeypatch.setattr(engine, "is_software", lambda: True)
+    monkeypatch.setattr(engine, "draw_image", lambda *_: pytest.fail("drawn by the CPU's graphics"))
+    avatar = driven()
+    shown, head = show(avatar)
+    assert_renders(tmp_path, avatar, head, expected_camera(camera_at(), shown))
 
 
 def no_context():

@@ -34,8 +34,8 @@ WIDTH = 360
 """Width of a frame in pixels; it is upright, as a phone is held."""
 HEIGHT = 480
 """Height of a frame in pixels."""
-FOCAL = 2.6
-"""Focal length in image widths, about that of a phone's main lens when zoomed to twice."""
+FOCAL = 1.4
+"""Focal length in image widths, about that of a phone's main lens."""
 SAMPLES = 8
 """Paths a pixel, before noise is removed."""
 SEED = 5
@@ -44,7 +44,7 @@ WALK_FRAMES = 40
 """Frames of the walk around the head."""
 WALK_DEG = 330.0
 """Angle that the camera goes around the head, from behind one ear over the face to the other."""
-DISTANCE_M = 0.95
+DISTANCE_M = 0.55
 """Distance of the camera from the head."""
 BREATHING_M = 0.0008
 """Amplitude by which the head rises and falls during the walk."""
@@ -92,7 +92,7 @@ def walk() -> Iterator[tuple[Act, float, Camera]]:
     for number, azimuth in enumerate(np.linspace(-WALK_DEG / 2, WALK_DEG / 2, WALK_FRAMES)):
         elevation = 6 + 9 * np.sin(number / 6)
         shaken = rng.normal(0, 0.6, 2)
-        distance = DISTANCE_M + 0.04 * np.sin(number / 5)
+        distance = DISTANCE_M + 0.02 * np.sin(number / 5)
         camera = phone_at(azimuth + shaken[0], elevation + shaken[1], distance)
         yield Act({}), BREATHING_M * np.sin(1.3 * number), camera
 

@@ -15,9 +15,9 @@ from ...capture.camera import Camera
 from ...errors import StgaError
 from ...raster.posed_splats import ComposedImage, with_holdouts
 from ...raster.splat_shader import MIN_ALPHA
-from ...render.client import RenderClient
+from ...render.client import RenderClient, missing_packages
 from ..cameras import Eye, render_camera
-from ..gpu.context import has_gpu_context
+from ..gpu.context import has_gpu_context, is_software
 from ..gpu.packing import NEAR_M, View, in_range
 from ..gpu.renderer import CompositeTarget, SplatRenderer
 from ..layers import SceneLayer
@@ -148,7 +148,9 @@ class SplatsEngine(bpy.types.RenderEngine):  # type: ignore[misc]
         renderers = list[SplatRenderer]()  # freed here, in the thread of its GPU context
         frame = scene.frame_current + scene.frame_subframe
         offset = 0.0
-        color = fraction = distance = np.zeros(1)
+        color = fraction = distance = np.float32(0)
+        passes = dict[str, np.ndarray]()
+        asks_depth = depsgraph.view_layer.use_pass_z
         samples = lens.samples(scene, view_camera(scene, view_name))
         try:
             for taken, sample in enumerate(samples):
@@ -158,18 +160,18 @@ class SplatsEngine(bpy.types.RenderEngine):  # type: ignore[misc]
                     cache.frame_changed()
                 layers = all_layers(depsgraph, cache)
                 view = self._view(depsgraph, border, view_name, sample)
-                draw = partial(self._image, view=view, renderers=renderers)
+                draw = partial(self._image, view=view, renderers=renderers, with_depth=asks_depth)
                 image = with_holdouts(layers, draw)
                 hidden = np.zeros_like(image.alpha) if image.hidden is None else image.hidden
                 color = color + combined(image.rgb, image.alpha, background, inverse, hidden)
-                seen = image.alpha - hidden
-                fraction = fraction + seen
-                distance = distance + np.where(seen > 0, seen * image.depth, 0)
+                if asks_depth:
+                    seen = image.alpha - hidden
+                    fraction = fraction + seen
+                    distance = distance + np.where(seen > 0, seen * image.depth, 0)
                 self.update_stats("", f"{sum(len(layer.splats) for layer in layers)} splats")
                 self.update_progress((taken + 1) / len(samples))
                 if self.test_break():
                     break
-            passes = dict[str, np.ndarray]()
             if depsgraph.view_layer.use_pass_vector:
                 offset = -1.0
                 place = partial(self._view, depsgraph, border, view_name, lens.SHARP)
@@ -178,10 +180,13 @@ class SplatsEngine(bpy.types.RenderEngine):  # type: ignore[misc]
             if offset:
                 self._go_to(frame)
         count = taken + 1
-        chosen = 0.0 if with_set else depsgraph.view_layer.pass_alpha_threshold
-        covered = fraction / count >= max(chosen, MIN_ALPHA)
-        depth = np.where(covered, distance / np.maximum(fraction, MIN_ALPHA), BACKGROUND_DEPTH)
-        return passes | {"Combined": color / count, "Depth": depth[..., None]}
+        passes["Combined"] = color / count if count > 1 else color
+        if asks_depth:
+            chosen = 0.0 if with_set else depsgraph.view_layer.pass_alpha_threshold
+            covered = fraction / count >= max(chosen, MIN_ALPHA)
+            depth = np.where(covered, distance / np.maximum(fraction, MIN_ALPHA), BACKGROUND_DEPTH)
+            passes["Depth"] = depth[..., None]
+        return passes
 
     def _motion(
         self,
@@ -235,13 +240,19 @@ class SplatsEngine(bpy.types.RenderEngine):  # type: ignore[misc]
         return lens.seen_from(view, evaluated, sample.point)
 
     def _image(
-        self, layers: list[SceneLayer], view: View, renderers: list[SplatRenderer]
+        self,
+        layers: list[SceneLayer],
+        view: View,
+        renderers: list[SplatRenderer],
+        with_depth: bool = False,
     ) -> ComposedImage:
         """renderers: as of `draw_image`."""
-        image = draw_image(layers, view, partial(self.report, {"WARNING"}), renderers)
+        image = None
+        if not is_rasterizer_faster():
+            image = draw_image(layers, view, partial(self.report, {"WARNING"}), renderers)
         if image is None:
             posed = [in_range(layer.posed(view.camera.position), view) for layer in layers]
-            image = _rasterizer.compose(posed, view.camera, with_depth=True)
+            image = _rasterizer.compose(posed, view.camera, with_depth)
             if _rasterizer.failure:
                 self.report({"WARNING"}, _rasterizer.failure)
         return image
@@ -276,6 +287,12 @@ def view_camera(scene: Any, view_name: str) -> Any:
 
 _told: set[str] = set()
 """Why the GPU cannot draw, each sentence once in this process."""
+
+
+def is_rasterizer_faster() -> bool:
+    """Whether Blender's graphics compute on the CPU, where the rasterizer takes a third of their
+    time, and this Python has it."""
+    return has_gpu_context() and is_software() and not missing_packages()
 
 
 def draw_image(
@@ -316,7 +333,13 @@ def register(
 ) -> None:
     """find_python, find_device: as in `RenderClient`."""
     global _rasterizer, _is_wanted
-    _rasterizer = RenderClient(find_python, find_device)
+
+    def device() -> str:
+        chosen = find_device()
+        # to look for another GPU takes longer than an image
+        return "cpu" if chosen == "auto" and is_rasterizer_faster() else chosen
+
+    _rasterizer = RenderClient(find_python, device)
     _is_wanted = True
     after_render(_settle)
     bpy.app.handlers.render_pre.append(_before_render)

@@ -23,7 +23,13 @@ from ...flame.model import JOINTS, FlameModel
 from ...flame.sequence import MIN_JOINT_ANGLE_DEG, FlameSequence, joint_angles
 from .. import arrays, tags
 from ..arrays import Z_UP_TO_Y_UP, add_driver, flat_floats, key_points
-from ..compat import KeptAnimation, give_animation, keep_animation, mark_imported
+from ..compat import (
+    KeptAnimation,
+    give_animation,
+    is_unused_import,
+    keep_animation,
+    mark_imported,
+)
 from ..objects import (
     Warn,
     capture_root,
@@ -35,6 +41,7 @@ from ..objects import (
     reset,
 )
 from . import keyframes
+from .drivers import give_drivers, keep_drivers
 from .keyframes import MAX_SLIDER, key_value_path, location_path, property_path, rotation_path
 
 
@@ -59,20 +66,32 @@ def import_head(capture: Capture, warn: Warn = log_warning, correctives: str = "
         if not arrays.has_triangles(before.data, capture.faces):
             gone = "shape keys, vertex groups and materials of before are gone"
             warn(f"{before.name}: the capture has other triangles, so {gone}")
-    kept_keys = keep_animation(before.data.shape_keys if before is not None else None)
-    kept_bones = keep_animation(next(iter(_rigs(before)), None) if before is not None else None)
+    owners = _animated(before)
+    kept = [keep_animation(each) for each in owners]
+    drivers = [keep_drivers(each) for each in owners]
     others = _other_keys(before, capture)
     head = _place_head(capture)
     if sequence is not None:
         rig = add_rig(head, sequence, frames, warn, correctives)
         mark_imported(rig)
-        _give_back(rig, kept_bones)
     else:
         _add_timesteps(head, capture.timesteps, meshes)
     _add_keys(head, others)
     mark_imported(head.data.shape_keys)
-    _give_back(head.data.shape_keys, kept_keys)
+    for owner, animation, driven in zip(_animated(head), kept, drivers, strict=True):
+        if owner is not None:
+            _give_back(owner, animation)
+            give_drivers(owner, driven, warn)
+    left = {each for each in bpy.data.actions if is_unused_import(each) and not each.users}
+    bpy.data.batch_remove(left)
     return head
+
+
+def _animated(head: Any) -> tuple[Any, Any, Any]:
+    """The data-blocks of a head that may be animated: its shape keys, its rig, and itself."""
+    if head is None:
+        return None, None, None
+    return head.data.shape_keys, next(iter(_rigs(head)), None), head
 
 
 def _give_back(owner: Any, kept: KeptAnimation) -> None:

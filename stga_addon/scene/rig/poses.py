@@ -52,6 +52,12 @@ PRESETS = FACES | {name: dict.fromkeys(SPOKEN, 0.0) | mouth for name, mouth in S
 the left."""
 
 
+PRESET = "preset"
+"""Value of the property `tags.POSE` of a pose that came along."""
+SAVED = "saved"
+"""Its value of a pose that was saved."""
+
+
 class Applied(NamedTuple):
     """What a pose was applied to: shape keys and pose bones; and data paths that the head lacks."""
 
@@ -99,7 +105,7 @@ def save_pose(head: Any, rig: Any, name: str, parts: Collection[str] = PARTS) ->
 
 def _new_pose(name: str, values: Mapping[str, float], turns: Mapping[str, Quaternion]) -> Any:
     action = bpy.data.actions.new(name)
-    action[tags.POSE] = True
+    action[tags.POSE] = SAVED
     if turns:  # first: Blender's own pose library takes the first slot
         curves = new_action_curves(action, "OBJECT", "Bones")
         for path, turn in turns.items():
@@ -151,10 +157,12 @@ def poses() -> list[Any]:
 
 
 def bring_presets(head: Any) -> None:
-    """Bring `PRESETS` into the file of a head with ARKit's sliders, where it has no poses yet."""
-    if poses() or not (EXPRESSION_NAMES in head or has_shapes(head) or shape_key_names(head)):
+    """Bring `PRESETS` into the file of a head with ARKit's sliders, unless it has some."""
+    is_there = any(each.get(tags.POSE) == PRESET for each in bpy.data.actions)
+    has_sliders = EXPRESSION_NAMES in head or has_shapes(head) or shape_key_names(head)
+    if is_there or not has_sliders:
         return
     for name, weights in PRESETS.items():
         both = weights | {mirrored_name(each): weight for each, weight in weights.items()}
         values = {f'key_blocks["{each}"].value': weight for each, weight in both.items()}
-        _new_pose(name, values, {})
+        _new_pose(name, values, {})[tags.POSE] = PRESET

@@ -99,6 +99,35 @@ def test_every_form_comes_at_its_times(tmp_path):
         assert addon.fps == pytest.approx(fps, rel=1e-4), name
 
 
+UNTOLD = {
+    "timecodes within a second": (take([f"10:00:00:{n:02d}" for n in range(20)]), 60.0),
+    "every second frame": (take([f"10:00:0{n // 12}:{n % 12 * 2:02d}" for n in range(30)]), None),
+    "no times": ("\n".join(line[line.index(",") + 1 :] for line in PLAIN.split("\r\n")), 60.0),
+    "seconds": (READABLE["seconds"][0], None),
+}
+"""Text, and the rate that is taken where it does not tell one; None: it tells."""
+
+
+def test_rates_that_no_file_tells_are_asked_for(tmp_path):
+    """Catches a take of 30 frames a second that plays at double speed, without a word."""
+    texts = [text for text, _ in UNTOLD.values()]
+    plain, asked = (
+        read_by_page([given(text) for text in texts], tmp_path)
+        for given in (lambda text: text, lambda text: [text, 30])
+    )
+    for name, page, other in zip(UNTOLD, plain, asked, strict=True):
+        text, rate = UNTOLD[name]
+        (tmp_path / "take.csv").write_text(text)
+        guessed = read_performance(tmp_path / "take.csv").guessed_fps
+        assert page["guessedFps"] == guessed == rate, name
+        if rate is None:
+            assert "tells its times" in other["error"], name
+        else:
+            expected = read_performance(tmp_path / "take.csv", recorded_fps=30.0)
+            assert other["fps"] == pytest.approx(expected.fps), name
+            assert other["weights"] == page["weights"], name
+
+
 REFUSED = {
     "head angles that are no numbers": (PLAIN.replace("-0.2,", "nan,", 1), "HeadPitch"),
     "weights that are no numbers": (PLAIN.replace("0.500000", "half", 1), "half"),

@@ -277,7 +277,9 @@ def test_a_rig_with_some_of_the_joints(tmp_path):
         ({"arrays": {"xyz": {**BYTES, "shape": [1], "planes": 1 << 26}}}, "expected 1 to 8"),
         ({"arrays": {"page": {**BYTES, "shape": [1 << 29]}}}, "larger than any"),
         ({"arrays": {"xyz": {**BYTES, "shape": [1 << 25]}}}, "larger than any"),
-        *(({"fps": fps}, "fps is") for fps in (NAN, 0, 1e300, -10)),
+        *(({"fps": fps}, "fps is") for fps in (NAN, 0, 1e300, -10, True, "25", [25])),
+        ({"fps": 10**400}, "is no file of skinned splats"),
+        ({"antialiased": "no"}, "antialiased is"),
         (
             {"arrays": {f"xyz{end}": {**BYTES, "shape": [9, 1]} for end in ("", "_axes")}},
             "not one row a column",

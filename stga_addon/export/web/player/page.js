@@ -251,8 +251,12 @@ function addFaceShapes() {
   byId('open-performance').addEventListener('click', () => file.click());
   file.addEventListener('change', () => playFile(file.files?.[0]).then(() => (file.value = '')));
   byId('close-performance').addEventListener('click', () => avatar.setPerformance(null));
+  const rate = inputOf('recorded-fps');
+  rate.addEventListener('change', () => playText(performanceText, Number(rate.value)));
   avatar.addEventListener('motionchange', () => {
     byId('close-performance').hidden = !avatar.player?.motion.shapes.performance;
+    byId('performance-rate').hidden = avatar.guessedFps === null;
+    rate.value = String(avatar.fps);
     showLength();
   });
   document.addEventListener('dragover', event => event.preventDefault());
@@ -262,18 +266,35 @@ function addFaceShapes() {
   });
 }
 
+let performanceText = ''; // of the last file
+
 /** @param {File | undefined} file */
 async function playFile(file) {
   if (!file || !avatar.info) return;
-  const problem = byId('performance-problem');
-  problem.hidden = true;
   try {
-    avatar.setPerformance(await file.text());
+    performanceText = await file.text();
+  } catch (error) {
+    return tellProblem(error);
+  }
+  playText(performanceText);
+}
+
+/** @param {unknown} error */
+function tellProblem(error) {
+  const problem = byId('performance-problem');
+  const isKnown = error instanceof DataError;
+  problem.textContent = isKnown ? error.message : `The file cannot be read: ${error}`;
+  problem.hidden = false;
+}
+
+/** @type {(text: string, recordedFps?: number | null) => void} */
+function playText(text, recordedFps = null) {
+  byId('performance-problem').hidden = true;
+  try {
+    avatar.setPerformance(text, recordedFps);
     avatar.play();
   } catch (error) {
-    const isKnown = error instanceof DataError;
-    problem.textContent = isKnown ? error.message : `The file cannot be read: ${error}`;
-    problem.hidden = false;
+    tellProblem(error);
   }
 }
 

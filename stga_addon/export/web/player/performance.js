@@ -12,8 +12,9 @@ const MAX_HEAD_ANGLE = 4 * Math.PI;
 const DEFAULT_FPS = 60;
 const MAX_FPS = 1000; // and at least 1
 const TIMECODE = /^(\d{1,3}):(\d{1,2}):(\d{1,2})([:;.])(\d{1,3})(\.\d{1,6})?$/;
-const TIMECODE_BASES = [24, 25, 30, 48, 50, 60, 100, 120];
-const TYPICAL_BASE = 60; // of a take of less than a second, whose frame numbers do not show it
+const TIMECODE_BASES = [24, 25, 30, 48, 50, 60, 100, 120, 240];
+const TYPICAL_BASE = 60; // of a take whose frame numbers do not tell, as within a second
+const EVEN_TOLERANCE_S = 1e-6; // of unevenness, within which bases explain the numbers equally well
 const DROP_RATIO = 1000 / 1001; // of drop-frame timecodes, with a semicolon: frames come slower
 const DAY_S = 86400;
 const SECONDS = ['timecode', 'time', 'timestamp', 'seconds'];
@@ -21,10 +22,21 @@ const HEAD = ['headyaw', 'headpitch', 'headroll'];
 const OPTIONAL = ['tongueOut']; // shapes that sources of 51 lack; they stay zero
 const MAX_NAMED = 8; // names that an error lists
 
-// The performance in a text, with a column per known shape (-1: it has none). Throws DataError in
-// one sentence.
+// The performance in a text, with a column per known shape (-1: it has none). recordedFps: the rate
+// of a file that does not tell its own. Throws DataError in one sentence.
+/** @type {(text: string, names: string[], recordedFps?: number | null) => Performance} */
+export function readPerformance(text, names, recordedFps = null) {
+  const performance = performanceIn(text, names);
+  if (recordedFps === null) return performance;
+  if (!(recordedFps >= 1 && recordedFps <= MAX_FPS))
+    throw new DataError(`The rate of a performance is 1 to ${MAX_FPS} frames a second.`);
+  if (performance.guessedFps === null)
+    throw new DataError('The performance tells its times, so that no rate is taken.');
+  return { ...performance, fps: (performance.fps * recordedFps) / performance.guessedFps };
+}
+
 /** @type {(text: string, names: string[]) => Performance} */
-export function readPerformance(text, names) {
+function performanceIn(text, names) {
   const [titles = [], ...table] = cellsOf(text.replace(/^\uFEFF/, ''));
   const header = titles.map(title => title.trim());
   const columns = columnsOf(header, names);
@@ -47,9 +59,12 @@ export function readPerformance(text, names) {
     throw new DataError('The performance holds weights that are no numbers from 0 to 1.');
   if (!rows.every(row => angles.every(column => Math.abs(row[column]) <= MAX_HEAD_ANGLE)))
     throw new DataError('The head of the performance turns more than two turns.');
-  const performance = { columns, head, rows, fps: DEFAULT_FPS };
-  if (isCoded) return evenly(performance, secondsOf(cells.map(row => row[code])));
-  if (at < 0) return performance;
+  const performance = { columns, head, rows, fps: DEFAULT_FPS, guessedFps: null };
+  if (isCoded) {
+    const { seconds, guessedFps } = secondsOf(cells.map(row => row[code]));
+    return evenly({ ...performance, guessedFps }, seconds);
+  }
+  if (at < 0) return { ...performance, guessedFps: DEFAULT_FPS };
   const seconds = rows.map(row => row[at]);
   return evenly(performance, seconds);
 }
@@ -102,8 +117,9 @@ function checkNumbers(header, cells, rows, columns) {
   }
 }
 
-// Seconds of timecodes HH:MM:SS:FF.sub, over midnight too. Throws DataError for other text.
-/** @param {string[]} texts */
+// Seconds of timecodes HH:MM:SS:FF.sub, over midnight too, and the rate that FF was taken to count
+// where the numbers do not tell it. Throws DataError for other text.
+/** @type {(texts: string[]) => { seconds: number[], guessedFps: number | null }} */
 function secondsOf(texts) {
   const fields = texts.map((text, row) => {
     const [found, hour, minute, second, separator, frame, part] = TIMECODE.exec(text.trim()) ?? [];
@@ -113,7 +129,7 @@ function secondsOf(texts) {
     const frames = Number(frame) + Number(part ?? 0);
     return { minutes, second: Number(second), frames, isDropping: separator === ';' };
   });
-  const base = baseOf(fields);
+  const { base, isTold } = baseOf(fields);
   const isDropping = fields.some(field => field.isDropping);
   let days = 0;
   const elapsed = fields.map(({ minutes, second, frames }) => {
@@ -122,24 +138,31 @@ function secondsOf(texts) {
     const leftOut = Math.round(base / 15) * (minutes - Math.floor(minutes / 10));
     return (whole * base + frames - leftOut) / (base * DROP_RATIO);
   });
-  return elapsed.map((time, row) => {
+  const seconds = elapsed.map((time, row) => {
     if (row && time - elapsed[row - 1] < -DAY_S / 2) days += DAY_S;
     return time + days;
   });
+  return { seconds, guessedFps: isTold ? null : base };
 }
 
-// Frames a second that timecodes count: with which the rows come most evenly.
+// Frames a second that timecodes count, with which the rows come most evenly; and whether their
+// numbers tell it.
 /** @param {{ minutes: number, second: number, frames: number }[]} fields */
 function baseOf(fields) {
   const largest = fields.reduce((most, { frames }) => Math.max(most, frames), 0);
-  const possible = TIMECODE_BASES.filter(base => base > largest);
-  if (!possible.length) return Math.floor(largest) + 1;
+  let bases = TIMECODE_BASES.filter(base => base > largest);
+  if (!bases.length) bases = [10 ** String(Math.floor(largest)).length];
   const seconds = fields.map(({ minutes, second }) => 60 * minutes + second);
-  if (new Set(seconds).size < 2) return possible.includes(TYPICAL_BASE) ? TYPICAL_BASE : possible[0];
-  const spreads = possible.map(base =>
-    unevenness(seconds.map((second, row) => second + fields[row].frames / base)),
-  );
-  return possible[spreads.indexOf(Math.min(...spreads))];
+  if (new Set(seconds).size > 1) {
+    const spreads = bases.map(base =>
+      unevenness(seconds.map((second, row) => second + fields[row].frames / base)),
+    );
+    const most = Math.min(...spreads) + EVEN_TOLERANCE_S;
+    bases = bases.filter((_, k) => spreads[k] <= most);
+  }
+  const base = bases.includes(TYPICAL_BASE) ? TYPICAL_BASE : bases[0];
+  const isTold = bases.length === 1 || fields.every(({ frames }) => frames === fields[0].frames);
+  return { base, isTold };
 }
 
 /** @param {number[]} times */

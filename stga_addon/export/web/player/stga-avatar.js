@@ -258,18 +258,25 @@ export class StgaAvatar extends HTMLElement {
   }
 
   // Play a performance (the text of a CSV file with a column per shape) instead of the recording;
-  // null: the recording. Throws DataError where it is none.
-  /** @param {string | null} text */
-  setPerformance(text) {
+  // null: the recording. recordedFps: the rate of a file that does not tell its own (`guessedFps`).
+  // Throws DataError where it is none.
+  /** @type {(text: string | null, recordedFps?: number | null) => void} */
+  setPerformance(text, recordedFps = null) {
     const { shapes } = this.#loaded.motion;
     if (text !== null && !shapes.names.length)
       throw new DataError('This avatar has no shapes for a performance.');
-    shapes.performance = text === null ? null : readPerformance(text, shapes.names);
+    const read = text === null ? null : readPerformance(text, shapes.names, recordedFps);
+    shapes.performance = read;
     if (text === null) shapes.weights.fill(0);
     this.#loaded.frame = 0;
     this.#last = 0;
     this.dispatchEvent(new CustomEvent('motionchange'));
     this.#posed();
+  }
+
+  /** Frames per second that a performance was taken to have, which does not tell; else null. */
+  get guessedFps() {
+    return this.#player?.motion.shapes.performance?.guessedFps ?? null;
   }
 
   /** Frames per second of what plays. */

@@ -77,5 +77,14 @@ export type GL = WebGL2RenderingContext;
 export type Uniforms = Record<string, WebGLUniformLocation | null>;
 export type Program = { program: WebGLProgram; uniforms: Uniforms };
 
-/** Rows at even times; columns of shapes, and of the head's yaw, pitch, roll in radians, or -1. */
-export type Performance = { columns: number[]; head: number[]; rows: Float64Array[]; fps: number };
+/**
+ * Rows at even times; columns of shapes, and of the head's yaw, pitch, roll in radians, or -1.
+ * guessedFps: the rate that was taken of a file that does not tell its own; null: it does.
+ */
+export type Performance = {
+  columns: number[];
+  head: number[];
+  rows: Float64Array[];
+  fps: number;
+  guessedFps: number | null;
+};
