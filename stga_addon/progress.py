@@ -55,13 +55,13 @@ Log = Callable[[str], None]  # Called with a line for people
 
 
 def warn(sentence: str) -> None:
-    """What to say a repair with, where nobody else listens."""
+    """Log a repair where nobody else listens."""
     logging.getLogger(__name__).warning("warning: %s", sentence)
 
 
 @dataclass(frozen=True)
 class Written:
-    """What work has written: a file or a folder. lines: what there is to say about it."""
+    """Result of work: a file or a folder. lines: sentences about it."""
 
     path: Path
     lines: tuple[str, ...] = ()

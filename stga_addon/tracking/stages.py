@@ -109,7 +109,8 @@ def unseen(draw: Draw, figures: Mapping[str, float]) -> None:
 
 @dataclass(frozen=True)
 class Workers:
-    """Who works on the stages of a tracking, and who is shown it."""
+    """Helpers that work on the stages of a tracking, and callbacks for its progress and
+    pictures."""
 
     helpers: Helpers
     report: ReportStage = unreported

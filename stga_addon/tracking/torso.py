@@ -65,7 +65,7 @@ Plan = Sequence[tuple[int, int]]
 
 @dataclass(frozen=True)
 class FollowedTorso:
-    """A take's heads on their torso.
+    """A take's heads with their torsos.
 
     fit         the head; a torso that bends is drawn over the surface that cameras see
     parameters  timestep -> (E + 18,)

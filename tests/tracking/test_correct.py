@@ -152,7 +152,7 @@ def unconfident(out):
 
 
 SIZE = TAKE.shape[1]
-MISFIT = "image_misfit: expected shares by region and timestep"
+MISFIT = "image_misfit: expected fractions by region and timestep"
 INTERPOLATED = r"interpolated: expected timesteps"
 PARAMETERS = rf"parameters: expected \(5, {SIZE}\) finite numbers"
 OTHERS = "timesteps: expected those of the capture"

@@ -138,7 +138,7 @@ def test_what_is_gained_outweighs_what_is_lost(frames, cameras, gained, on, on_t
     assert rules.strain(SimpleNamespace(capture=capture, **known)).on == on_tracked
     verdict = rules.strain(SimpleNamespace(signal_change=change, timesteps=3))
     assert (verdict.on, verdict.fixed) == (False, False)
-    assert verdict.reason.startswith("3 frames are too few to tell what")
+    assert verdict.reason.startswith("3 frames are too few to show what")
 
 
 def test_color_that_follows_the_normal():
