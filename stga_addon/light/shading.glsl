@@ -10,7 +10,7 @@ float shadow_bias(float cosine, float texel)
 }
 
 /* Share of nine taps that light reaches, at a place and a depth of the shadow map that begins at a corner. */
-float lit_share(ivec2 corner, vec2 place, float depth)
+float lit_fraction(ivec2 corner, vec2 place, float depth)
 {
   float found = 0.0;
   for (int tap = 0; tap < 9; tap++) {
@@ -65,8 +65,8 @@ vec3 sky_highlight(int first, vec3 normal, vec3 view, float roughness, float occ
 vec3 lit_color(vec4 color, vec3 old, vec3 arriving, vec3 highlight, vec3 recorded, vec4 typical, vec4 kept)
 {
   vec3 base = srgb_to_linear(max(color.rgb, vec3(0.0)));
-  vec3 glossy = (color.a > 0.0 ? WET_HIGHLIGHT_SHARE : HIGHLIGHT_SHARE) / PI * old;
-  vec3 albedo = PI * max(base - glossy, MIN_DIFFUSE_SHARE * base) / max(old, vec3(1e-6));
+  vec3 glossy = (color.a > 0.0 ? WET_HIGHLIGHT_FRACTION : HIGHLIGHT_FRACTION) / PI * old;
+  vec3 albedo = PI * max(base - glossy, MIN_DIFFUSE_FRACTION * base) / max(old, vec3(1e-6));
   if (typical.a > 0.0) {
     albedo = pow(max(albedo, vec3(1e-4)), vec3(1.0 - typical.a)) * pow(typical.rgb, vec3(typical.a));
   }

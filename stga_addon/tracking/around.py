@@ -53,7 +53,9 @@ REMEDY = (
 
 # Recognition
 SAMPLES = 8
-"""Frames in which the head's pose is looked at."""
+"""Number of frames in which the head's pose is looked at."""
+MORE_SAMPLES = 24
+"""Number of such frames where half of SAMPLES show no face."""
 SAMPLE_SIDE_PX = 720
 """Longer side of these frames."""
 MIN_TURN_DEG = 30.0
@@ -72,6 +74,8 @@ MIN_MATCHES = 8
 """Least number of the room's points in both frames that shows whether the room moves."""
 MIN_PAIRS = 3
 """Least number of pairs of frames that show it."""
+MIN_CONTRAST = 0.01
+"""Contrast of a room's features, a quarter of OpenCV's: a papered wall has little."""
 MATCH_RATIO = 0.75
 """Lowe's ratio test."""
 MAX_LIP_CHANGE = 0.08
@@ -324,7 +328,7 @@ def _recognized(footage: Footage, camera: FootageCamera, workers: Workers) -> Re
     found = workers.helpers.run(
         recognize,
         (camera, footage.fps),
-        lambda steps: workers.report(Stage.OPENING, steps, SAMPLES),
+        lambda steps: workers.report(Stage.OPENING, min(steps, SAMPLES), SAMPLES),
     )
     return Recognition(*found["recognition"].tolist())
 
@@ -332,14 +336,19 @@ def _recognized(footage: Footage, camera: FootageCamera, workers: Workers) -> Re
 def recognize(camera: FootageCamera, fps: float | None, step: Step) -> dict[str, np.ndarray]:
     """`Recognition` of a take as (4,)."""
     timesteps = list(camera.timesteps)
-    sampled = evenly_spread(range(len(timesteps)), SAMPLES)
     look = _Look(camera)
-    samples = {}
-    for number in sampled:
-        sample = look.at(timesteps[number])
-        if sample is not None:
-            samples[number] = sample
-        step()
+    samples: dict[int, _Sample] = {}
+    looked_at = set[int]()
+    for count in (SAMPLES, MORE_SAMPLES):  # a camera that goes all around sees few faces
+        for number in evenly_spread(range(len(timesteps)), count):
+            sample = None if number in looked_at else look.at(timesteps[number])
+            looked_at.add(number)
+            if sample is not None:
+                samples[number] = sample
+            step()
+        if len(samples) > SAMPLES / 2:
+            break
+    samples = dict(sorted(samples.items()))
     turn = max(
         (_angle_deg(a.rotation, b.rotation) for a in samples.values() for b in samples.values()),
         default=0.0,
@@ -398,7 +407,7 @@ class _Look:
         self._middle = model.v_template.mean(0)
         self._faces = FaceNetworks()
         self._person = PersonNetwork()
-        self._features = cv2.SIFT.create(1000)
+        self._features = cv2.SIFT.create(1000, contrastThreshold=MIN_CONTRAST)
         self._camera = camera
         self._near: np.ndarray | None = None
 
