@@ -51,8 +51,7 @@ def painted(
         frames = replace(layer.frames, color=NO_COLUMNS)
         settings = replace(layer.settings, show_selection=False, show_unseen=False)
         splats = replace(layer.splats, sh=sh)
-        how = {"splats": splats, "frames": frames, "settings": settings, "relit": None}
-        shown.append(replace(layer, **how))
+        shown.append(replace(layer, splats=splats, frames=frames, settings=settings, relit=None))
     return shown, scale
 
 

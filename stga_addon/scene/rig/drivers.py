@@ -5,6 +5,7 @@ from typing import Any
 
 import bpy
 
+from ...driving.performance import ARKIT_SHAPES
 from ...flame.model import JOINTS
 from ..objects import Warn
 from . import keyframes
@@ -64,7 +65,7 @@ def _is_imported(driver: Any) -> bool:
 
 def _is_there(owner: Any, path: str) -> bool:
     key = KEY_PATH.fullmatch(path)
-    if key is not None and key[1] in keyframes.ARKIT_SHAPES:
+    if key is not None and key[1] in ARKIT_SHAPES:
         return True  # the head gets those sliders back afterwards
     try:
         owner.path_resolve(path)
