@@ -38,6 +38,7 @@ from ...scene.rig.keyframes import Placement
 from ...scene.rig.motion import apply_motion
 
 SIZE_PX = 1920, 1080
+"""Width and height of the images."""
 JITTER_M = 1e-3
 """Standard deviation of a copied splat's place from its original's, in its triangle's units."""
 MAX_IMAGES = 5

@@ -13,7 +13,7 @@ const DEFAULT_FPS = 60;
 const MAX_FPS = 1000; // and at least 1
 const TIMECODE = /^(\d{1,3}):(\d{1,2}):(\d{1,2})([:;.])(\d{1,3})(\.\d{1,6})?$/;
 const TIMECODE_BASES = [24, 25, 30, 48, 50, 60, 100, 120, 240];
-const TYPICAL_BASE = 60; // of a take whose frame numbers do not tell, as within a second
+const TYPICAL_BASE = 60; // of a take whose frame numbers do not show it, as within a second
 const EVEN_TOLERANCE_S = 1e-6; // of unevenness, within which bases explain the numbers equally well
 const DROP_RATIO = 1000 / 1001; // of drop-frame timecodes, with a semicolon: frames come slower
 const DAY_S = 86400;
@@ -23,7 +23,7 @@ const OPTIONAL = ['tongueOut']; // shapes that sources of 51 lack; they stay zer
 const MAX_NAMED = 8; // names that an error lists
 
 // The performance in a text, with a column per known shape (-1: it has none). recordedFps: the rate
-// of a file that does not tell its own. Throws DataError in one sentence.
+// of a file without one. Throws DataError in one sentence.
 /** @type {(text: string, names: string[], recordedFps?: number | null) => Performance} */
 export function readPerformance(text, names, recordedFps = null) {
   const performance = performanceIn(text, names);
@@ -31,7 +31,7 @@ export function readPerformance(text, names, recordedFps = null) {
   if (!(recordedFps >= 1 && recordedFps <= MAX_FPS))
     throw new DataError(`The rate of a performance is 1 to ${MAX_FPS} frames a second.`);
   if (performance.guessedFps === null)
-    throw new DataError('The performance tells its times, so that no rate is taken.');
+    throw new DataError('The performance has times, so that no rate is taken.');
   return { ...performance, fps: (performance.fps * recordedFps) / performance.guessedFps };
 }
 
@@ -118,7 +118,7 @@ function checkNumbers(header, cells, rows, columns) {
 }
 
 // Seconds of timecodes HH:MM:SS:FF.sub, over midnight too, and the rate that FF was taken to count
-// where the numbers do not tell it. Throws DataError for other text.
+// where the numbers do not determine it. Throws DataError for other text.
 /** @type {(texts: string[]) => { seconds: number[], guessedFps: number | null }} */
 function secondsOf(texts) {
   const fields = texts.map((text, row) => {
@@ -146,7 +146,7 @@ function secondsOf(texts) {
 }
 
 // Frames a second that timecodes count, with which the rows come most evenly; and whether their
-// numbers tell it.
+// numbers determine it.
 /** @param {{ minutes: number, second: number, frames: number }[]} fields */
 function baseOf(fields) {
   const largest = fields.reduce((most, { frames }) => Math.max(most, frames), 0);

@@ -258,7 +258,7 @@ export class StgaAvatar extends HTMLElement {
   }
 
   // Play a performance (the text of a CSV file with a column per shape) instead of the recording;
-  // null: the recording. recordedFps: the rate of a file that does not tell its own (`guessedFps`).
+  // null: the recording. recordedFps: the rate of a file without one (`guessedFps`).
   // Throws DataError where it is none.
   /** @type {(text: string | null, recordedFps?: number | null) => void} */
   setPerformance(text, recordedFps = null) {
@@ -274,7 +274,7 @@ export class StgaAvatar extends HTMLElement {
     this.#posed();
   }
 
-  /** Frames per second that a performance was taken to have, which does not tell; else null. */
+  /** Frames per second assumed for a performance without a rate; else null. */
   get guessedFps() {
     return this.#player?.motion.shapes.performance?.guessedFps ?? null;
   }
