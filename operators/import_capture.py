@@ -101,8 +101,7 @@ class HeadImport(Edit):
         capture = open_capture(source, flame=model, principal_point=principal_point)
         show_progress(0.5)
         heads = [thing for thing in scene.objects if is_head(thing)]
-        for each in heads:
-            follow_moved_capture(each, capture, self.inform)
+        follow_moved_capture(heads, capture, self.inform)
         others = [each for each in heads if capture_of(each) != capture.root.resolve()]
         is_new = len(heads) == len(others)
         had_sliders = any(has_shapes(each) for each in heads if each not in others)

@@ -9,7 +9,7 @@ driven to -d, which the vertices follow. All drivers are arithmetic, which Blend
 Python."""
 
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 import bpy
@@ -95,16 +95,20 @@ def _animated(head: Any) -> tuple[Any, Any, Any]:
     return head.data.shape_keys, next(iter(_rigs(head)), None), head
 
 
-def follow_moved_capture(head: Any, capture: Capture, say: Callable[[str], object]) -> None:
+def follow_moved_capture(
+    heads: Iterable[Any], capture: Capture, say: Callable[[str], object]
+) -> None:
     """Let a head, with all that was imported with it, be that of a capture that is its own, moved:
     where the folder of before is gone, and triangles, timesteps and neutral mesh are the same."""
-    before = head.get(tags.CAPTURE)
-    is_gone = head.library is None and not capture_of(head).exists()
-    if not (is_gone and arrays.has_triangles(head.data, capture.faces)):
-        return
-    is_same = list(head.get(tags.TIMESTEPS, ())) == list(capture.timesteps)
-    off = np.abs(arrays.mesh_vertices(head.data) - capture.neutral).max()
-    if is_same and off < MAX_DIFFERENCE_M:
+    for head in heads:
+        is_gone = head.library is None and not capture_of(head).exists()
+        if not (is_gone and arrays.has_triangles(head.data, capture.faces)):
+            continue
+        is_same = list(head.get(tags.TIMESTEPS, ())) == list(capture.timesteps)
+        off = np.abs(arrays.mesh_vertices(head.data) - capture.neutral).max()
+        if not (is_same and off < MAX_DIFFERENCE_M):
+            continue
+        before = head[tags.CAPTURE]
         for each in bpy.data.objects:
             if each.library is None and each.get(tags.CAPTURE) == before:
                 each[tags.CAPTURE] = str(capture.root.resolve())
