@@ -20,7 +20,7 @@ from ..stga_addon.scene.rig.motion import sample_motion
 from ..stga_addon.scene.vertex_groups import training_selection
 from ..stga_addon.training.run.folder import TRACKING
 from ..stga_addon.worker.launch import start_python
-from .common import AtEnd, capture_source, file_path, is_head, scene_frames
+from .common import AtEnd, capture_source, file_path, is_head, scene_frames, stored_source
 from .training_python import training_python
 
 IN_BLENDER = ("select", "export", "demo")
@@ -52,7 +52,7 @@ def _open_head() -> OpenHead | None:
         return None
     avatar = bpy.context.scene.stga.avatar
     return OpenHead(
-        *capture_source(head),
+        *stored_source(head),
         avatar=file_path(avatar, "avatar") if avatar else None,
         fps=frames_per_second(bpy.context.scene),
         selection=lambda: training_selection(head),

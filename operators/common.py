@@ -283,12 +283,21 @@ def rig_or_shapes(head: Any) -> Any:
 
 
 def capture_source(head: Any) -> tuple[Path, Path | None, str]:
+    """`stored_source` of a head. Raises StgaError where the capture is gone."""
+    source = stored_source(head)
+    if not source[0].exists():
+        remedy = "Import Capture from where it is now gives it to this head"
+        raise StgaError(f"{head.name}: its capture is no longer at {source[0]}; {remedy}")
+    return source
+
+
+def stored_source(head: Any) -> tuple[Path, Path | None, str]:
     """The capture that a head was imported from, its FLAME model and its convention of principal
     points, as `open_capture` takes them."""
     model = stored_path(head, tags.FLAME_MODEL)
     point = tags.PRINCIPAL_POINT
-    capture = capture_of(head)
-    return capture, Path(model) if model else None, head.get(point, DEFAULT_PRINCIPAL_POINT)
+    model_file = Path(model) if model else None
+    return capture_of(head), model_file, head.get(point, DEFAULT_PRINCIPAL_POINT)
 
 
 def own_motion(head: Any) -> FlameSequence:

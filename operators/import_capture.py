@@ -52,7 +52,7 @@ from ..stga_addon.scene.objects import (
     show_progress,
 )
 from ..stga_addon.scene.record import capture_of, store_path
-from ..stga_addon.scene.rig.head import import_head
+from ..stga_addon.scene.rig.head import follow_moved_capture, import_head
 from ..stga_addon.scene.rig.keyframes import has_shapes
 from ..stga_addon.scene.rig.poses import bring_presets
 from ..stga_addon.tracking.folder import describe_focal_length, is_tracked
@@ -118,6 +118,7 @@ class HeadImport(Edit):
         capture = open_capture(source, flame=model, principal_point=principal_point)
         show_progress(0.5)
         heads = [thing for thing in scene.objects if is_head(thing)]
+        follow_moved_capture(heads, capture, self.inform)
         others = [each for each in heads if capture_of(each) != capture.root.resolve()]
         is_new = len(heads) == len(others)
         had_sliders = any(has_shapes(each) for each in heads if each not in others)

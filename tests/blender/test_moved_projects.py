@@ -56,6 +56,26 @@ def test_a_project_is_moved_as_a_whole(tmp_path, blend):
     try_all(tmp_path / "new")
 
 
+def test_a_capture_that_was_moved_away_is_found_by_importing_it(tmp_path):
+    """Catches "is not a folder" without a remedy, and a second head beside the one that has lost
+    its capture."""
+    project = make_project(tmp_path / "project")
+    head = panel().head
+    objects = sorted(bpy.data.objects.keys())
+    shutil.move(project / "capture", tmp_path / "archive")
+    with failure("its capture is no longer at .*; Import Capture from where it is now"):
+        ops.measure_range()
+    other, model = write_flame_capture(tmp_path / "other", timesteps=(0, 1))
+    ops.import_capture(directory=tmp_path / "archive", flame=project / "flame.npz")
+    assert panel().head == head
+    assert sorted(bpy.data.objects.keys()) == objects
+    assert places(head) == [tmp_path / "archive", *expected(project)[1:]]
+    ops.measure_range()
+    shutil.move(tmp_path / "archive", project / "capture")
+    ops.import_capture(directory=other, flame=model)
+    assert panel().head != head
+
+
 @pytest.mark.parametrize("how", ["save as", "copy", "alone"])
 def test_a_file_leaves_its_project(tmp_path, how):
     """Catches paths that follow a .blend file where nothing was moved with it."""

@@ -9,7 +9,7 @@ driven to -d, which the vertices follow. All drivers are arithmetic, which Blend
 Python."""
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 import bpy
@@ -40,6 +40,7 @@ from ..objects import (
     remove,
     reset,
 )
+from ..record import capture_of
 from . import keyframes
 from .drivers import give_drivers, keep_drivers
 from .keyframes import MAX_SLIDER, key_value_path, location_path, property_path, rotation_path
@@ -92,6 +93,30 @@ def _animated(head: Any) -> tuple[Any, Any, Any]:
     if head is None:
         return None, None, None
     return head.data.shape_keys, next(iter(_rigs(head)), None), head
+
+
+def follow_moved_capture(
+    heads: Iterable[Any], capture: Capture, say: Callable[[str], object]
+) -> None:
+    """Let a head, with all that was imported with it, be that of a capture that is its own, moved:
+    where the folder of before is gone, and triangles, timesteps and neutral mesh are the same."""
+    for head in heads:
+        is_gone = head.library is None and not capture_of(head).exists()
+        if not (is_gone and arrays.has_triangles(head.data, capture.faces)):
+            continue
+        is_same = list(head.get(tags.TIMESTEPS, ())) == list(capture.timesteps)
+        off = np.abs(arrays.mesh_vertices(head.data) - capture.neutral).max()
+        if not (is_same and off < MAX_DIFFERENCE_M):
+            continue
+        before = head[tags.CAPTURE]
+        for each in bpy.data.objects:
+            if each.library is None and each.get(tags.CAPTURE) == before:
+                each[tags.CAPTURE] = str(capture.root.resolve())
+        say(f"{head.name}: its capture was moved from {before}")
+
+
+MAX_DIFFERENCE_M = 1e-4
+"""Distance of a neutral mesh's vertices, up to which two captures are of one tracking."""
 
 
 def _give_back(owner: Any, kept: KeptAnimation) -> None:
