@@ -32,6 +32,7 @@ from ...scene.gpu import packing
 from ...scene.objects import open_file
 from ...scene.render import engine
 from ...scene.render.scene_splats import SplatCache, all_layers
+from ...scene.render.viewport_display import ENGINE
 from ...scene.rig.head import usable_rig
 from ...scene.rig.keyframes import Placement
 from ...scene.rig.motion import apply_motion
@@ -78,9 +79,8 @@ def _acts(demo: Path, splats: int, repeats: int) -> dict[str, tuple[Callable[[in
     rig = usable_rig(head)
     neck = rig.pose.bones["neck"]
     jaw = head.data.shape_keys.key_blocks["jawOpen"]
-    motion = performed(
-        demo_speech(), open_capture(demo / "capture").flame, head.name, MotionOptions(), fps=24.0
-    )
+    person = open_capture(demo / "capture").flame_motion()
+    motion = performed(demo_speech(), person, head.name, MotionOptions(), fps=24.0)
     apply_motion(head, motion.sequence.frames(), Placement(1, "speech", as_strip=True))
     update = _Viewport(scene)
     still = FRAMES + 200  # past the performance: nothing else moves
@@ -101,7 +101,7 @@ def _acts(demo: Path, splats: int, repeats: int) -> dict[str, tuple[Callable[[in
         scene.frame_set(1 + number)
         bpy.ops.render.render()
 
-    scene.render.engine = engine.ENGINE
+    scene.render.engine = ENGINE
     scene.render.resolution_x, scene.render.resolution_y = SIZE_PX
     scene.render.resolution_percentage = 100
     scene.frame_set(still)
