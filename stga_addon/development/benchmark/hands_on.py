@@ -80,8 +80,7 @@ def _acts(demo: Path, splats: int, repeats: int) -> dict[str, tuple[Callable[[in
     rig = usable_rig(head)
     neck = rig.pose.bones["neck"]
     jaw = head.data.shape_keys.key_blocks["jawOpen"]
-    person = open_capture(demo / "capture").flame
-    assert person is not None  # the demo's capture is of FLAME's parameters
+    person = open_capture(demo / "capture").flame_motion()
     motion = performed(demo_speech(), person, head.name, MotionOptions(), fps=24.0)
     apply_motion(head, motion.sequence.frames(), Placement(1, "speech", as_strip=True))
     update = _Viewport(scene)

@@ -148,9 +148,7 @@ class SplatsEngine(bpy.types.RenderEngine):  # type: ignore[misc]
         renderers = list[SplatRenderer]()  # freed here, in the thread of its GPU context
         frame = scene.frame_current + scene.frame_subframe
         offset = 0.0
-        color: Any = np.float32(0)
-        fraction: Any = np.float32(0)
-        distance: Any = np.float32(0)
+        color = fraction = distance = np.zeros((), np.float32)
         passes = dict[str, np.ndarray]()
         asks_depth = depsgraph.view_layer.use_pass_z
         samples = lens.samples(scene, view_camera(scene, view_name))
