@@ -112,7 +112,6 @@ class HeadImport(Edit):
         it has no head yet; another import of the same keeps the shot. Raises StgaError."""
         warn = self.warn
         scene = context.scene
-        objects = context.view_layer.objects
         has_model = not flame and any((source / name).is_file() for name in OWN_MODELS)
         model = None if has_model else flame_model_path(context, flame)
         capture = open_capture(source, flame=model, principal_point=principal_point)
@@ -141,7 +140,7 @@ class HeadImport(Edit):
             scene.frame_start = capture.timesteps[0]
             scene.frame_end = capture.timesteps[-1]
             scene.frame_set(capture.timesteps[0])
-        _select(head, objects)
+        _select(head, context.view_layer.objects)
         if not heads:  # later on, the user shows it
             hide_default_cube(scene)
         remove(tags.find(tags.TRACKED_HEAD, capture.root))
