@@ -212,13 +212,20 @@ def rig() -> list[Camera]:
     return [camera_at(*angles) for angles in zip(around, elevations, strict=True)]
 
 
-def camera_at(azimuth_deg: float, elevation_deg: float) -> Camera:
-    """A camera that looks at the head, from so far to the person's left and up."""
+def camera_at(
+    azimuth_deg: float,
+    elevation_deg: float,
+    distance_m: float = DISTANCE_M,
+    size: tuple[int, int] = (WIDTH, HEIGHT),
+    focal: float = FOCAL,
+) -> Camera:
+    """A camera that looks at the head, from so far to the person's left and up. size: width and
+    height in pixels; focal: in image widths."""
     azimuth, elevation = np.radians([azimuth_deg, elevation_deg])
     level = np.cos(elevation)
     ahead = np.array([np.sin(azimuth) * level, np.sin(elevation), np.cos(azimuth) * level])
-    eye = (AIM_M + DISTANCE_M * ahead).tolist()
-    return look_at(eye, AIM_M, WIDTH, HEIGHT, FOCAL * WIDTH)
+    eye = (AIM_M + distance_m * ahead).tolist()
+    return look_at(eye, AIM_M, *size, focal * size[0])
 
 
 def _name(timestep: int, camera: int) -> str:

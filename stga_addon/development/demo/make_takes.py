@@ -19,14 +19,14 @@ import numpy as np
 from numpy.random import Generator, default_rng
 from tqdm import tqdm
 
-from ...capture.camera import Camera, look_at
+from ...capture.camera import Camera
 from ...files import read_npz, replacing
 from ...flame.forward import flame_forward
 from ...render.video import video_writer
 from ...scene.arrays import triangle_mesh
 from ...scene.display.node_builder import Nodes, new_material
 from .capture import TAKES
-from .make_capture import AIM_M, TRAIN_ACTS, Act, frame_of_act
+from .make_capture import TRAIN_ACTS, Act, camera_at, frame_of_act
 from .person import make_person
 from .studio import Studio
 
@@ -104,19 +104,15 @@ def talk() -> Iterator[tuple[Act, float, Camera]]:
     for act in TRAIN_ACTS[1:]:
         turn = float(rng.uniform(-TURN_DEG, TURN_DEG)), float(rng.uniform(-NOD_DEG, NOD_DEG))
         keys += [act, Act({}, turn=turn)]
-    camera = phone_at(4, 2, DISTANCE_M)
+    camera = phone_at(4, 2)
     for one, other in pairwise(keys):
         for step in range(STEPS):
             yield _between(one, other, step / STEPS), 0.0, camera
 
 
-def phone_at(azimuth_deg: float, elevation_deg: float, distance_m: float) -> Camera:
-    """A camera that looks at the head, from so far to the person's left and up."""
-    azimuth, elevation = np.radians([azimuth_deg, elevation_deg])
-    level = np.cos(elevation)
-    ahead = np.array([np.sin(azimuth) * level, np.sin(elevation), np.cos(azimuth) * level])
-    eye = (AIM_M + distance_m * ahead).tolist()
-    return look_at(eye, AIM_M, WIDTH, HEIGHT, FOCAL * WIDTH)
+def phone_at(azimuth_deg: float, elevation_deg: float, distance_m: float = DISTANCE_M) -> Camera:
+    """The phone as `camera_at` places a camera."""
+    return camera_at(azimuth_deg, elevation_deg, distance_m, (WIDTH, HEIGHT), FOCAL)
 
 
 def _between(one: Act, other: Act, fraction: float) -> Act:
