@@ -14,7 +14,6 @@ from tempfile import TemporaryDirectory
 from typing import Any
 from zipfile import ZIP_STORED, ZipFile, ZipInfo
 
-import bpy
 import numpy as np
 from numpy.random import Generator, default_rng
 from tqdm import tqdm
@@ -23,8 +22,6 @@ from ...capture.camera import Camera
 from ...files import read_npz, replacing
 from ...flame.forward import flame_forward
 from ...render.video import video_writer
-from ...scene.arrays import triangle_mesh
-from ...scene.display.node_builder import Nodes, new_material
 from .capture import TAKES
 from .make_capture import TRAIN_ACTS, Act, camera_at, frame_of_act
 from .person import make_person
@@ -68,8 +65,7 @@ def main(source: Path) -> None:
     """Make both takes of the person of the ICT-FaceKit arrays in `source`."""
     person = make_person(read_npz(source))
     studio = Studio(person, SAMPLES)
-    studio.scene.render.film_transparent = False
-    _add_room(studio.scene, default_rng(SEED))
+    _add_room(studio, default_rng(SEED))
     names = person.model.expression_names
     with TemporaryDirectory() as name:
         folder = Path(name)
@@ -132,37 +128,16 @@ def _between(one: Act, other: Act, fraction: float) -> Act:
     )
 
 
-def _add_room(scene: Any, rng: Generator) -> None:
+def _add_room(studio: Studio, rng: Generator) -> None:
     """Add a room of papered walls with boxes of many colors at them."""
-    _add_box(scene, np.zeros(3), np.full(3, ROOM_M), (0.55, 0.52, 0.47))
+    studio.add_box(np.zeros(3), np.full(3, ROOM_M), (0.55, 0.52, 0.47))
     for _ in range(BOXES):
         place = rng.uniform(-ROOM_M, ROOM_M, 3)
         axis = rng.integers(3)
         place[axis] = ROOM_M * rng.choice([-1, 1])
         size = rng.uniform(0.08, 0.45, 3)
         size[axis] = rng.uniform(0.01, 0.3)
-        _add_box(scene, place, size, tuple(rng.uniform(0.05, 0.8, 3)))
-
-
-def _add_box(scene: Any, center: np.ndarray, half: np.ndarray, color: tuple[float, ...]) -> None:
-    corners = np.array(np.meshgrid(*[[-1, 1]] * 3, indexing="ij")).reshape(3, 8).T
-    squares = ((0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3))
-    faces = np.array([[a, b, c, a, c, d] for a, b, c, d in squares]).reshape(-1, 3)
-    mesh = triangle_mesh("box", center + corners * half, faces)
-    mesh.polygons.foreach_set("use_smooth", [False] * len(faces))
-    mesh.materials.append(new_material("box", lambda nodes: _paper(nodes, color)))
-    scene.collection.objects.link(bpy.data.objects.new("box", mesh))
-
-
-def _paper(nodes: Nodes, color: tuple[float, ...]) -> Any:
-    """A surface that shines in one color, with stains that images can be matched by."""
-    place = nodes.add("ShaderNodeTexCoord").outputs["Object"]
-    inputs = {"Vector": place, "Scale": 9.0, "Detail": 8.0}
-    stains = nodes.add("ShaderNodeTexNoise", inputs).outputs[0]
-    limits = {"From Min": 0.3, "From Max": 0.7, "To Min": 0.5, "To Max": 1.3}
-    bright = nodes.out("ShaderNodeMapRange", {"Value": stains, **limits})
-    painted = {"Color": nodes.scale(color, bright), "Strength": GLOW}
-    return nodes.out("ShaderNodeEmission", painted)
+        studio.add_box(place, size, tuple(rng.uniform(0.05, 0.8, 3)))
 
 
 if __name__ == "__main__":

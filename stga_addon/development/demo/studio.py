@@ -41,6 +41,12 @@ CLOTH_COLOR = (0.045, 0.12, 0.13)
 
 STRAND_TIP = 0.35
 """Radius of a hair's tip, relative to that of its root."""
+BOX_GLOW = 0.5
+"""Strength at which a room's boxes shine, instead of lamps of its own."""
+BOX_SIDES = ((0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3))
+"""Corners of each side of a box; bits of a corner's number: at which end of x, y, z it is."""
+BOX_FACES = np.array([[a, b, c, a, c, d] for a, b, c, d in BOX_SIDES]).reshape(-1, 3)
+"""Triangles of a box."""
 
 
 class Studio:
@@ -78,6 +84,16 @@ class Studio:
             thing.data.attributes["position"].data.foreach_set("vector", flat_floats(points))
             thing.data.update_tag()
 
+    def add_box(self, center: np.ndarray, half: np.ndarray, color: tuple[float, ...]) -> None:
+        """Add a box of a papered room, which shines in one linear color with stains. center (3,)
+        and half (3,) its size: meters. From then on, pictures show what is behind the person."""
+        self.scene.render.film_transparent = False
+        corners = np.array(np.meshgrid(*[[-1, 1]] * 3, indexing="ij")).reshape(3, 8).T
+        mesh = triangle_mesh("box", center + corners * half, BOX_FACES)
+        mesh.polygons.foreach_set("use_smooth", [False] * len(BOX_FACES))
+        mesh.materials.append(new_material("box", lambda nodes: _paper(nodes, color)))
+        self.scene.collection.objects.link(bpy.data.objects.new("box", mesh))
+
     def pictures(self, cameras: Sequence[Camera]) -> Iterator[Image.Image]:
         """RGBA pictures of the pose, sRGB with straight alpha."""
         with TemporaryDirectory() as folder:
@@ -91,6 +107,14 @@ class Studio:
                     bpy.ops.render.render(write_still=True)
                 with Image.open(path) as image:
                     yield image.convert("RGBA")
+
+
+def _paper(nodes: Nodes, color: tuple[float, ...]) -> Any:
+    """A surface that shines in one color, with stains that images can be matched by."""
+    place = nodes.add("ShaderNodeTexCoord").outputs["Object"]
+    stains = _range(nodes, _noise(nodes, place, 9.0, 8.0), (0.3, 0.7), (0.5, 1.3))
+    inputs = {"Color": nodes.scale(color, stains), "Strength": BOX_GLOW}
+    return nodes.out("ShaderNodeEmission", inputs)
 
 
 @contextmanager
