@@ -141,7 +141,7 @@ def test_a_word_for_the_quality_and_more_training(extension, trained, tmp_path):
 def test_what_is_said_of_an_operator(extension, head):
     """Catches *Not Done* over what was done, and all warnings but the last forgotten."""
     operator = SimpleNamespace(report=lambda kind, sentence: None)
-    notify = extension.operators.common.Action.tell
+    notify = extension.operators.common.Action.notify
     manager = bpy.context.window_manager
     ops.select(threshold=0.0005)
     for kind, sentence, expected in (

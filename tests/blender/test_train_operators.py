@@ -115,7 +115,7 @@ def test_mistakes_of_training_are_sentences(extension, head, tmp_path, monkeypat
     assert not (tmp_path / "new").exists()
     assert ops.train.poll()
     (tmp_path / "capture").rename(tmp_path / "elsewhere")
-    with failure(r"capture: is not a folder"):
+    with failure(r"its capture is no longer at .*capture; Import Capture"):
         ops.train(directory=run)
 
 
