@@ -337,18 +337,16 @@ def recognize(camera: FootageCamera, fps: float | None, step: Step) -> dict[str,
     """`Recognition` of a take as (4,)."""
     timesteps = list(camera.timesteps)
     look = _Look(camera)
+    looks: dict[int, _Sample | None] = {}
     samples: dict[int, _Sample] = {}
-    looked_at = set[int]()
     for count in (SAMPLES, MORE_SAMPLES):  # a camera that goes all around sees few faces
         for number in evenly_spread(range(len(timesteps)), count):
-            sample = None if number in looked_at else look.at(timesteps[number])
-            looked_at.add(number)
-            if sample is not None:
-                samples[number] = sample
+            if number not in looks:
+                looks[number] = look.at(timesteps[number])
             step()
+        samples = {number: found for number, found in sorted(looks.items()) if found is not None}
         if len(samples) > SAMPLES / 2:
             break
-    samples = dict(sorted(samples.items()))
     turn = max(
         (_angle_deg(a.rotation, b.rotation) for a in samples.values() for b in samples.values()),
         default=0.0,

@@ -24,7 +24,7 @@ TOLERANCE_M = 1e-5
 
 @pytest.fixture
 def posed(tmp_path):
-    """The small head, whose mesh in a pose is told; with keyframes only at frame 1."""
+    """The small head, with keyframes only at frame 1; its mesh in a pose is known."""
     person = import_small_head(tmp_path, expr=np.zeros((1, 10)))
     bpy.context.scene.frame_set(1)
     zero = np.zeros(3)
@@ -128,10 +128,10 @@ def test_what_comes_along(posed):
         ops.apply_pose(pose="Smile")
     rest()
     turn("neck", 0.0, 0.3, 0.0)
-    ops.save_pose(name="Aside")
+    ops.save_pose(name="Look Left")
     for _ in range(2):
         ops.add_arkit_controls()
-        assert [action.name for action in poses()] == sorted(["Aside", *PRESETS])
+        assert [action.name for action in poses()] == sorted(["Look Left", *PRESETS])
     keys = rest().data.shape_keys.key_blocks
     for name in ("Blink", "Smile", "Oo", "Ah"):
         ops.apply_pose(pose=name)

@@ -105,11 +105,11 @@ UNTOLD = {
     "no times": ("\n".join(line[line.index(",") + 1 :] for line in PLAIN.split("\r\n")), 60.0),
     "seconds": (READABLE["seconds"][0], None),
 }
-"""Text, and the rate that is taken where it does not tell one; None: it tells."""
+"""Text, and the rate that is assumed where the file has none; None: it has times."""
 
 
 def test_rates_that_no_file_tells_are_asked_for(tmp_path):
-    """Catches a take of 30 frames a second that plays at double speed, without a word."""
+    """Catches a take of 30 frames a second that plays at double speed without a warning."""
     texts = [text for text, _ in UNTOLD.values()]
     plain, asked = (
         read_by_page([given(text) for text in texts], tmp_path)

@@ -274,13 +274,13 @@ async function playFile(file) {
   try {
     performanceText = await file.text();
   } catch (error) {
-    return tellProblem(error);
+    return showProblem(error);
   }
   playText(performanceText);
 }
 
 /** @param {unknown} error */
-function tellProblem(error) {
+function showProblem(error) {
   const problem = byId('performance-problem');
   const isKnown = error instanceof DataError;
   problem.textContent = isKnown ? error.message : `The file cannot be read: ${error}`;
@@ -294,7 +294,7 @@ function playText(text, recordedFps = null) {
     avatar.setPerformance(text, recordedFps);
     avatar.play();
   } catch (error) {
-    tellProblem(error);
+    showProblem(error);
   }
 }
 

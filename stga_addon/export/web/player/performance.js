@@ -129,7 +129,7 @@ function secondsOf(texts) {
     const frames = Number(frame) + Number(part ?? 0);
     return { minutes, second: Number(second), frames, isDropping: separator === ';' };
   });
-  const { base, isTold } = baseOf(fields);
+  const { base, isDetermined } = baseOf(fields);
   const isDropping = fields.some(field => field.isDropping);
   let days = 0;
   const elapsed = fields.map(({ minutes, second, frames }) => {
@@ -142,7 +142,7 @@ function secondsOf(texts) {
     if (row && time - elapsed[row - 1] < -DAY_S / 2) days += DAY_S;
     return time + days;
   });
-  return { seconds, guessedFps: isTold ? null : base };
+  return { seconds, guessedFps: isDetermined ? null : base };
 }
 
 // Frames a second that timecodes count, with which the rows come most evenly; and whether their
@@ -161,8 +161,8 @@ function baseOf(fields) {
     bases = bases.filter((_, k) => spreads[k] <= most);
   }
   const base = bases.includes(TYPICAL_BASE) ? TYPICAL_BASE : bases[0];
-  const isTold = bases.length === 1 || fields.every(({ frames }) => frames === fields[0].frames);
-  return { base, isTold };
+  const isDetermined = bases.length === 1 || fields.every(({ frames }) => frames === fields[0].frames);
+  return { base, isDetermined };
 }
 
 /** @param {number[]} times */
