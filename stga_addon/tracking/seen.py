@@ -32,6 +32,7 @@ from .reprojection import (
 from .stages import Stage, Workers
 from .surface import fit_surface
 from .torso import FollowedTorso, follow_torso
+from .visual_hull import cut_to_visual_hull
 
 ENOUGH_TURN_DEG = 30.0
 """Largest angle between two poses of a head, beyond which turning determines a lens little
@@ -146,6 +147,8 @@ def with_torso(fitted: FittedHead, workers: Workers, bends: bool) -> SeenHead:
         pixels = partial(_head_pixels, fitted.fit, parameters)
         footage, unseen = with_mattes(footage, pixels, opened.out, source, workers)
         warnings += unseen
+        mesh = posed_mesh(fitted.fit, parameters[footage.timesteps[0]])
+        cut_to_visual_hull(footage, fitted.fit.to_capture.camera, mesh)
     torso = follow_torso(fitted.fit, parameters, footage, workers, bends)
     return SeenHead(fitted, errors, footage, torso, warnings)
 
