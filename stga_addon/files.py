@@ -34,6 +34,12 @@ from .errors import StgaError, shorten
 MAX_FILE_BYTES = 1 << 30
 MAX_JSON_BYTES = 256 << 20
 MAX_TOML_BYTES = 16 << 20
+
+MAX_TEXT_VALUES = 12_000_000
+"""Values and lines of a JSON file or a table; one takes up to 100 bytes of memory."""
+SEPARATORS = ",;\t\n\r[{"
+"""Characters that stand before or behind each value."""
+
 PROBED_BYTES = 1 << 10
 DAMAGE_BYTES = 1 << 20
 WEB_PAGE = re.compile(rb"(<\?xml[^>]*>|<!--.*?-->|\s)*<(!doctype html|html|head|body)\b", re.DOTALL)
@@ -478,6 +484,14 @@ def read_text(path: Path, limit: int = MAX_FILE_BYTES) -> str:
         raise StgaError(f"{path}: is not UTF-8 text ({error})") from error
 
 
+def check_values(text: str) -> str:
+    """The text. Raises ValueError where it would be parsed to more values than a large file has."""
+    values = sum(map(text.count, SEPARATORS))
+    if values > MAX_TEXT_VALUES:
+        raise ValueError(f"{values} values, more than the {MAX_TEXT_VALUES} allowed")
+    return text
+
+
 def decoded_text(data: bytes, errors: str = "strict") -> str:
     """Text in UTF-8, or in what its byte order mark says. Raises ValueError, if errors are
     "strict"."""
@@ -494,7 +508,10 @@ def table_rows(where: str, text: str) -> list[tuple[int, list[str]]]:
     """Rows of a CSV file that are not empty: (number of the line, cells). Columns are separated by
     the one of `DELIMITERS` that the row of names has most of; decimal commas become points, as
     spreadsheets write them in many countries. Raises StgaError, beginning with `where`."""
-    lines = text.splitlines()
+    try:
+        lines = check_values(text).splitlines()
+    except ValueError as error:
+        raise StgaError(f"{where}: {error}") from error
     if lines and lines[0].lower().startswith("sep="):  # of spreadsheets, which hide that line
         lines[0] = ""
     heads = lines[:LINES_BEFORE_COLUMNS]
@@ -553,7 +570,7 @@ def _parsed(path: Path, form: str, limit: int, parse: Callable[[bytes], Any]) ->
 def parse_json(data: bytes) -> Any:
     """Parse JSON, as `decoded_text`. Raises ValueError where it is malformed, or holds lone
     surrogates."""
-    text = decoded_text(data)
+    text = check_values(decoded_text(data))
     value = json.loads(text)
     if "\\u" in text:  # the only way to write a lone surrogate
         json.dumps(value, ensure_ascii=False).encode("utf-8")

@@ -23,6 +23,7 @@ from stga_addon.files import (
     check_writable,
     read_json,
     read_npz,
+    read_table,
     replacing,
     replacing_together,
     temporary_folder,
@@ -101,6 +102,21 @@ def test_json(tmp_path, content):
     for read in (read_json, read_npz):
         with refusal(rf"{tmp_path / 'none'}: cannot be read"):
             read(tmp_path / "none")
+
+
+@pytest.mark.parametrize(
+    "text", ["[" + "[]," * 60 + "0]", "[" + '{"":0},' * 60 + "0]", "1,\n" * 60]
+)
+def test_more_values_than_any_file_holds(tmp_path, monkeypatch, text):
+    """Catches gigabytes of lists, dictionaries or rows that a file of some megabytes is parsed
+    to."""
+    path = tmp_path / "a.json"
+    path.write_text(text)
+    read = read_table if "\n" in text else read_json
+    assert read(path)
+    monkeypatch.setattr(files, "MAX_TEXT_VALUES", 100)
+    with refusal(r"a\.json: .*\d+ values, more than the 100 allowed"):
+        read(path)
 
 
 @pytest.mark.parametrize("compressed", [False, True])

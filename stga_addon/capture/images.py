@@ -143,13 +143,17 @@ def is_inside_out(mask: np.ndarray) -> bool:
     """Whether a stored mask (H, W) is inverted. An inverted mask is bright along the top and the
     upper half of the sides of the image, and dark in the middle of its dark region."""
     inside = mask > mask.max(initial=0) // 2
-    upper = inside[: max(1, len(mask) // 2)]
     rows, columns = np.nonzero(~inside)
     if len(rows) < MIN_LEFT_OUT * inside.size:
         return False
-    border = np.concatenate([upper[0], upper[:, 0], upper[:, -1]])
     middle = inside[int(np.median(rows)), int(np.median(columns))]
-    return bool(border.mean() >= MIN_BORDER_INSIDE and not middle)
+    return bool(upper_border(inside).mean() >= MIN_BORDER_INSIDE and not middle)
+
+
+def upper_border(mask: np.ndarray) -> np.ndarray:
+    """The values of a mask (H, W) along the top and the upper half of the sides."""
+    upper = mask[: max(1, len(mask) // 2)]
+    return np.concatenate([upper[0], upper[:, 0], upper[:, -1]])
 
 
 def read_view(

@@ -12,7 +12,7 @@ import numpy as np
 
 from ..errors import StgaError
 from .camera import Camera
-from .images import has_alpha, read_view
+from .images import has_alpha, read_view, upper_border
 from .model import Capture, View, evenly_spread, views_by_camera
 
 COMPARED_HEIGHT_PX = 160
@@ -21,6 +21,13 @@ MIN_COVERAGE_FRACTION = 0.05
 """Fraction of its camera's median coverage, up to which a matte counts as empty: specks stay."""
 MIN_COVERAGE = 1e-3
 """Fraction of the image up to which a matte counts as empty, whatever its camera's others hold."""
+MAX_BORDER_DIFFERENCE = 0.4
+"""Fraction of the upper border by which a matte may cover more of it than its camera's others; full
+and inverted ones, and halves, cover more."""
+MAX_UNCERTAINTY = 0.5
+"""Mean of 4 α (1 − α) over a small mask: 1 where all is half transparent, or averaged noise."""
+MAX_ROUGHNESS = 0.2
+"""Mean difference of neighbors in a row of a small mask, which noise of its size exceeds."""
 MAX_ONE_COLOR_LEVELS = 4
 """Range of each channel, of 255, in a small image, up to which it is of one color; levels up to
 which it is black."""
@@ -41,30 +48,50 @@ NAMED_TIMESTEPS = 12
 """Largest number of timesteps that a message lists."""
 
 
+PROBLEMS = (
+    "have an empty mask",
+    "have a mask of noise",
+    "have a full or inverted mask",
+    "are of one color",
+)
+"""What is wrong with views, in the order in which it is reported."""
+
+
 class _Content(NamedTuple):
-    """Fraction of the image that the mask covers, None without a mask; whether the image has one
-    color, or is black where the mask covers it."""
+    """What is looked at of a view.
+
+    coverage      fraction of the image that the mask covers; None without a mask
+    border        fraction of the image's upper border that it covers
+    is_noise      whether the mask is noise, or half transparent everywhere
+    is_one_color  whether the image has one color, or is black where the mask covers it
+    """
 
     coverage: float | None
+    border: float
+    is_noise: bool
     is_one_color: bool
 
 
 def with_usable_views(capture: Capture) -> tuple[Capture, tuple[str, ...]]:
     """The capture without views that show nobody, and a sentence for each kind of them.
 
-    A mask, or an image's transparency, that is empty beside the others of its camera, and an image
-    of one color. Raises StgaError where a file cannot be read.
+    A mask, or an image's transparency, that is noise, or that is empty, full or inverted beside the
+    others of its camera; and an image of one color. Raises StgaError where a file cannot be read.
     """
     views = capture.all_views
-    empty, plain = _unusable(views)
-    if not (empty or plain):
+    kinds = _unusable(views)
+    failed = set[Path]().union(*kinds)
+    if not failed:
         return capture, ()
     usable = {
-        split: tuple(view for view in own if view.image not in empty | plain)
+        split: tuple(view for view in own if view.image not in failed)
         for split, own in capture.views.items()
     }
     warnings = []
-    for files, why in ((empty, "have an empty mask"), (plain - empty, "are of one color")):
+    named = set[Path]()
+    for found, why in zip(kinds, PROBLEMS, strict=True):
+        files = found - named
+        named |= found
         if files:
             shown = [view for view in views if view.image in files]
             count = f"{len(shown)} of {len(views)} images {why}"
@@ -79,7 +106,8 @@ def with_training_views(capture: Capture) -> tuple[Capture, tuple[str, ...]]:
     if capture.views.get("train") and not usable.views["train"]:
         raise StgaError(
             f"{capture.root}: shows nobody in its training views, so there is nothing to train on: "
-            "each has an empty mask or an image of one color; expected masks of 255 on the person"
+            "each has an empty mask, one of noise, or an image of one color; expected masks of 255 "
+            "on the person"
         )
     return usable, warnings
 
@@ -91,8 +119,8 @@ def _timesteps(views: Iterable[View]) -> str:
     return f"timestep{'s' if len(numbers) > 1 else ''} {listed}{more}"
 
 
-def _unusable(views: Sequence[View]) -> tuple[set[Path], set[Path]]:
-    """Images of views with empty masks, and images of one color."""
+def _unusable(views: Sequence[View]) -> list[set[Path]]:
+    """Images of views with each of PROBLEMS."""
     if len(views) > MAX_VIEWS_READ:
         certain = {view.image for view in evenly_spread(views, SAMPLED_VIEWS)}
         for own in views_by_camera(views).values():
@@ -103,17 +131,23 @@ def _unusable(views: Sequence[View]) -> tuple[set[Path], set[Path]]:
     return _found(views)
 
 
-def _found(views: Sequence[View]) -> tuple[set[Path], set[Path]]:
+def _found(views: Sequence[View]) -> list[set[Path]]:
     with ThreadPoolExecutor(READERS) as pool:
         contents = dict(zip((view.image for view in views), pool.map(_content, views), strict=True))
     empty = set[Path]()
+    full = set[Path]()
     for own in views_by_camera(views).values():
         known = {view.image: contents[view.image].coverage for view in own}
         covered = {path: fraction for path, fraction in known.items() if fraction is not None}
         median = statistics.median([fraction for fraction in covered.values() if fraction] or [0.0])
         least = max(MIN_COVERAGE, MIN_COVERAGE_FRACTION * median)
         empty |= {path for path, fraction in covered.items() if fraction <= least}
-    return empty, {path for path, content in contents.items() if content.is_one_color}
+        border = statistics.median([contents[path].border for path in covered] or [0.0])
+        border += MAX_BORDER_DIFFERENCE
+        full |= {path for path in covered if contents[path].border > border}
+    noise = {path for path, content in contents.items() if content.is_noise}
+    plain = {path for path, content in contents.items() if content.is_one_color}
+    return [empty, noise, full, plain]
 
 
 def _suspects(views: Sequence[View]) -> set[Path]:
@@ -157,6 +191,15 @@ def _content_of(
     coverage = None if covered is None else float(covered.mean()) / 255
     least = OPAQUE_LEVEL if mask is None else INSIDE_LEVEL
     inside = np.ones(pixels.shape[:2], bool) if covered is None else covered >= least
+    alpha = None if covered is None else covered / np.float32(255)
     is_plain = np.ptp(pixels.reshape(-1, 3), axis=0).max() <= MAX_ONE_COLOR_LEVELS
     is_black = inside.any() and pixels[inside].max() <= MAX_ONE_COLOR_LEVELS
-    return _Content(coverage, bool(is_plain or is_black))
+    border = 0.0 if alpha is None else float(upper_border(alpha).mean())
+    is_noise = alpha is not None and _is_noise(alpha)
+    return _Content(coverage, border, is_noise, bool(is_plain or is_black))
+
+
+def _is_noise(alpha: np.ndarray) -> bool:
+    uncertainty = float((4 * alpha * (1 - alpha)).mean())
+    roughness = float(np.abs(np.diff(alpha, axis=1)).mean()) if alpha.shape[1] > 1 else 0.0
+    return uncertainty > MAX_UNCERTAINTY or roughness > MAX_ROUGHNESS

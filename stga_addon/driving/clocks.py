@@ -2,7 +2,7 @@
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from unicodedata import normalize
 
 import numpy as np
@@ -38,6 +38,8 @@ UNITS_S = {
     **dict.fromkeys(("ms", "msec", "millis", "millisecond", "milliseconds"), 1e-3),
     **dict.fromkeys(("us", "μs", "usec", "micros", "microsecond", "microseconds"), 1e-6),
     **dict.fromkeys(("ns", "nsec", "nanos", "nanosecond", "nanoseconds"), 1e-9),
+    **dict.fromkeys(("tick", "ticks"), 1e-7),  # of .NET and Unreal Engine
+    **dict.fromkeys(("min", "mins", "minute", "minutes"), 60.0),
 }
 """Units as NFKC spells them, which makes the micro sign a Greek letter -> seconds."""
 UNIT_NAMES = {1e-3: "milliseconds", 1e-6: "microseconds", 1e-9: "nanoseconds"}
@@ -59,12 +61,21 @@ MIN_DISTINCT = 0.5
 """Fraction of the values of a column of times that differ from all before."""
 MAX_DIFFERENCE = 0.05
 """Relative difference of two columns' durations, above which they disagree."""
-MIN_ROWS_PER_S = 1.5
+MIN_ROWS_PER_S = 5.0
 """Least rows a second that recordings of faces have: of seconds and their thousandths, only one
 gives such a rate."""
 MAX_ROWS_PER_S = 250.0
 """Most rows a second that they have."""
-MAX_FRAME_STEP = 4  # Largest step between rows that are numbered by frames of `DEFAULT_FPS`
+MIN_UNNAMED_ROWS = 10
+"""Rows from which a column that is not called a time, and ascends as one, is taken for times."""
+
+MAX_FRAME_STEP = 4
+"""Largest step between rows that are numbered by frames of `DEFAULT_FPS`."""
+MAX_NUMBER = 1e300
+"""Number of a column from which differences overflow."""
+MAX_SECONDS = 1e12
+"""Largest time: clocks count from 1970, or from the year 1."""
+
 DEFAULT_FPS = 60.0  # Frame rate of files with neither times nor a rate: ARKit's
 RATES = tuple(sorted({rate * ratio for rate in (10, 12, 15, *BASES) for ratio in (1, DROP_RATIO)}))
 
@@ -140,7 +151,9 @@ def find_times(
     if error is not None:
         raise error
     if not left_out and fps is None:
-        left_out = [f"{name} ascends, but is not called a time" for name in _ascending(columns)]
+        used, guess, left_out = _times_by_contents(where, columns)
+    if used is not None:
+        return used, [], guess
     return None, [f"column {'; column '.join(left_out)}"] if left_out else [], None
 
 
@@ -161,17 +174,30 @@ def _time_columns(columns: Mapping[str, Sequence[object]]) -> list[_Column]:
     return sorted(found, key=lambda each: (not each.is_plain, each.unit is None, each.rank))
 
 
-def _ascending(columns: Mapping[str, Sequence[object]]) -> list[str]:
-    """Names of columns of numbers that ascend."""
-    found = []
+def _times_by_contents(
+    where: str, columns: Mapping[str, Sequence[object]]
+) -> tuple[np.ndarray | None, Guess | None, list[str]]:
+    """(T,) seconds of the first column of timecodes, or of numbers that ascend as times do, as
+    names in other languages leave it; and what was guessed. Else a sentence each for columns that
+    ascend otherwise, as numbers of frames do."""
+    left_out = []
     for name, cells in columns.items():
         try:
-            values = numbers("", name, cells)
+            is_of_codes = all(":" in str(cell) for cell in cells)
+            steps = np.zeros(0) if is_of_codes else np.diff(numbers(where, name, cells))
+            times, guess = _seconds(where, _Column(name, None, False, 0), cells, None)
         except StgaError:
             continue
-        if len(values) > 1 and (np.diff(values) > 0).all():
-            found.append(name)
-    return found
+        if not is_of_codes and not (len(steps) and (steps > 0).all()):
+            continue
+        is_rate = guess is not None and guess.fps is not None
+        is_clear = is_of_codes or (len(cells) >= MIN_UNNAMED_ROWS and not is_rate)
+        if is_clear and not _implausible(times):
+            text = guess.text if guess else f"column {name} is taken as seconds"
+            taken = f"{text}, though it is not called a time"
+            return times, replace(guess, text=taken) if guess else Guess(taken), []
+        left_out.append(f"{name} ascends, but is not called a time")
+    return None, None, left_out
 
 
 def _words(name: str) -> list[str]:
@@ -220,6 +246,8 @@ def _implausible(times: np.ndarray) -> str:
     if len(times) < 2:
         return ""
     distinct = np.unique(times)
+    if np.abs(distinct).max() > MAX_SECONDS:
+        return f"reaches {np.abs(distinct).max():.3g} s"
     if len(distinct) <= MIN_DISTINCT * len(times):
         return "repeats its values"
     rate = 1 / float(np.median(np.diff(distinct)))
@@ -237,7 +265,7 @@ def seconds_of_numbers(
 ) -> tuple[np.ndarray, Guess | None]:
     """(T,) seconds of a column of numbers, and a sentence where its unit is guessed: it is the one
     that gives a plausible rate. Small whole numbers are of frames, `fps` a second."""
-    steps = np.diff(np.unique(values[np.isfinite(values)]))
+    steps = np.diff(np.unique(values[np.abs(values) < MAX_NUMBER]))
     if unit is not None or not len(steps):
         return values * (unit or 1.0), None
     step = float(np.median(steps))

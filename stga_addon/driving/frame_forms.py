@@ -2,11 +2,13 @@
 of JSON, Face Cap's text."""
 
 from collections.abc import Sequence
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 from ..errors import StgaError
 from ..files import parse_json
+from .clocks import MAX_FRAME_STEP
 from .performance import arkit_name
 
 FACE_CAP_COLUMNS = ("k", "time_ms", "px", "py", "pz", "rx", "ry", "rz", "lx", "ly", "rx2", "ry2")
@@ -22,6 +24,8 @@ NAME_LISTS = ("Names", "names", "blendShapes")
 """Keys of a list of shapes."""
 WEIGHT_LISTS = ("Weights", "weights", "Values", "values")
 """Keys of the list of their weights."""
+MAX_ROWS = 1 << 20
+"""Rows of a performance."""
 MAX_DEPTH = 4
 """Levels of a frame in which lists of names and weights are looked for."""
 
@@ -31,9 +35,10 @@ def plain_frames(document: Any) -> Any:
     forms of this module; else as it is."""
     if isinstance(document, dict) and len(document) > 1 and all(map(_is_number, document)):
         keys = sorted(document, key=float)
-        is_counted = all(float(key) % 1 == 0 for key in keys)  # then they say no times
+        steps = [float(after) - float(before) for before, after in pairwise(keys)]
+        is_counted = all(float(key) % 1 == 0 for key in keys) and min(steps) <= MAX_FRAME_STEP
         frames = [_with_names(document[key]) for key in keys]
-        if is_counted:
+        if is_counted:  # which says no times
             return frames
         return [
             {"time": float(key), "blendShapes": frame}
@@ -47,6 +52,7 @@ def plain_frames(document: Any) -> Any:
 def read_lines(path: Path, text: str) -> list[Any]:
     """A frame of JSON a line; a last line that is cut off is left out. Raises StgaError."""
     lines = [line for line in text.splitlines() if line.strip()]
+    check_rows(path, len(lines))
     frames = []
     for number, line in enumerate(lines, start=1):
         try:
@@ -55,6 +61,12 @@ def read_lines(path: Path, text: str) -> list[Any]:
             if number < len(lines) or not frames:
                 raise StgaError(f"{path}: line {number}: is not valid JSON ({error})") from error
     return frames
+
+
+def check_rows(path: Path, count: int) -> None:
+    """Raise StgaError for more rows than a performance has."""
+    if count > MAX_ROWS:
+        raise StgaError(f"{path}: has {count} rows, expected at most {MAX_ROWS}")
 
 
 def is_face_cap(text: str) -> bool:
@@ -113,8 +125,11 @@ def _is_row(entry: Any) -> bool:
     if not isinstance(entry, dict):
         return False
     name = _first(entry, NAME_OF_SHAPE)
-    known = isinstance(name, str) and not isinstance(_first(entry, VALUE_OF_SHAPE), (dict, list))
-    return known and _first(entry, TIME_OF_ROW) is not None
+    value = _first(entry, VALUE_OF_SHAPE)
+    time = _first(entry, TIME_OF_ROW)
+    return isinstance(name, str) and all(
+        isinstance(each, (str, float, int)) for each in (value, time)
+    )
 
 
 def _by_time(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:

@@ -14,10 +14,12 @@ AXES = {"yaw": 0, "pitch": 1, "roll": 2, "y": 0, "x": 1, "z": 2, "w": 3}
 part."""
 _ROTATION = "(?:rotation|rot|quaternion|quat|eulerangles?|euler|angles?|orientation|pose)"
 _UNIT = "(?P<unit>deg(?:ree)?s?|rad(?:ian)?s?)?"
-_NAME = re.compile(f"(?:(?:head|{_ROTATION})*(yaw|pitch|roll)|head{_ROTATION}+([xyzw])){_UNIT}")
+_NAME = re.compile(
+    f"(?:(?:head|{_ROTATION})*(yaw|pitch|roll)|head(?:{_ROTATION}+|r|q)([xyzw])){_UNIT}"
+)
 _LIKE_A_ROTATION = re.compile(
     "(?!.*(?:eye|gaze|camera|mouth|jaw|hand))"
-    f"(?:head[xyz]?$|.*(?:{_ROTATION}|matrix|transform|yaw|pitch|roll)|r[xyz]$)"
+    f"(?:head.?.?$|.*(?:{_ROTATION}|matrix|transform|yaw|pitch|roll)|r[xyz]$)"
 )
 
 NECK_RAD = np.radians([100.0, 80.0, 80.0])
@@ -52,7 +54,7 @@ def find_head(
     turn in degrees.
     """
     axes: dict[str, str] = {}
-    units = set()
+    unit_of: dict[str, str] = {}
     others = []
     for name, cells in columns.items():
         parts = name.lower().split(".")
@@ -60,8 +62,9 @@ def find_head(
         tails = [tail for place, tail in enumerate(tails) if not place or tail.startswith("head")]
         found = next(filter(None, map(_NAME.fullmatch, tails)), None)
         if found is not None and not any(cell in (None, "") for cell in cells):
-            axes.setdefault(found[1] or found[2], name)
-            units.add((found["unit"] or "")[:3])
+            axis = found[1] or found[2]
+            axes.setdefault(axis, name)
+            unit_of.setdefault(axis, (found["unit"] or "")[:3])
         elif any(map(_LIKE_A_ROTATION.match, tails)):
             others.append(name)
     named = [axis for axis in ("yaw", "pitch", "roll") if axis in axes]
@@ -72,8 +75,14 @@ def find_head(
     if not used:
         return None, notes
     values = np.zeros((len(columns[axes[used[0]]]), 4))
-    for name in used:
-        values[:, AXES[name]] = numbers(where, axes[name], columns[axes[name]])
+    units = {unit_of[axis] for axis in used}
+    units = units - {""} or units
+    for axis in used:
+        own = numbers(where, axes[axis], columns[axes[axis]])
+        values[:, AXES[axis]] = np.radians(own) if units > {unit_of[axis]} == {"deg"} else own
+    if len(units) > 1:
+        notes.append(f"{', '.join(axes[axis] for axis in used)}: are in different units")
+        units = {"rad"}
     if named:
         return _in_radians(where, values[:, :3], times, (units, notes))
     origin = axes["x"].rpartition(".")[0] or axes["x"]
@@ -85,7 +94,7 @@ def find_head(
 
 
 def _plain(name: str) -> str:
-    return re.sub(r"[^a-z]", "", name.lower())
+    return re.sub(r"[^a-z]", "", name.lower().replace("°", "deg"))
 
 
 def _of_quaternions(values: np.ndarray) -> np.ndarray:

@@ -14,6 +14,8 @@ from ..errors import StgaError, shorten
 from ..files import read_json, read_table, read_text
 from .clocks import DEFAULT_FPS, MAX_FPS, MIN_FPS, OTHER_RATE, Guess, evened, find_times, numbers
 from .frame_forms import (
+    MAX_ROWS,
+    check_rows,
     face_cap_frames,
     is_face_cap,
     plain_frames,
@@ -60,7 +62,6 @@ def parse_packet(data: bytes) -> FacePacket | None:
 
 
 MAX_TEXT_BYTES = 256 << 20
-MAX_ROWS = 1 << 20
 COUNT_COLUMN = "blendshapecount"
 
 MAX_OTHERS = 256
@@ -116,6 +117,7 @@ def _plain(name: str) -> str:
 def packet_performance(path: Path) -> Performance:
     """Performance from lines that are iFacialMocap's packets. Raises StgaError."""
     lines = read_text(path, MAX_TEXT_BYTES).splitlines()
+    check_rows(path, len(lines))
     packets = [parse_packet(line.encode()) for line in lines]
     known = [packet for packet in packets if packet is not None]
     if not known:
@@ -249,6 +251,16 @@ def _first(entry: dict[str, Any], keys: tuple[str, ...], default: Any) -> Any:
     return next((entry[key] for key in keys if key in entry), default)
 
 
+def _constant_rate(columns: Mapping[str, Sequence[object]]) -> float | None:
+    """Rows a second by a column that is called so and holds one plausible number; None without."""
+    for name, cells in columns.items():
+        with suppress(StgaError):
+            if _plain(name) in map(_plain, RATE_KEYS) and len(set(cells)) == 1:
+                rate = float(numbers("", name, cells[:1])[0])
+                return rate if MIN_FPS <= rate <= MAX_FPS else None
+    return None
+
+
 def _number(what: str, value: Any) -> float:
     if not _is_number(value):
         raise StgaError(f"{what} is {shorten(value)}, expected a number")
@@ -274,14 +286,14 @@ def _performance(
     head     yaw, pitch and roll (T, 3) in radians; None: columns hold them, or nothing does
     """
     where = str(path)
-    if len(weights) > MAX_ROWS:
-        raise StgaError(f"{path}: has {len(weights)} rows, expected at most {MAX_ROWS}")
+    check_rows(path, len(weights))
     if MAX_WEIGHT < np.abs(weights).max() <= MAX_PERCENT:
         guesses.append(f"weights reach {np.abs(weights).max():.4g}; they are read as percent")
         weights = weights / 100
     if not (np.abs(weights) <= MAX_WEIGHT).all():
         problem = f"holds weights beyond {MAX_WEIGHT:g}, or not finite; expected 0 to 1"
         raise StgaError(f"{path}: {problem}")
+    fps = _constant_rate(others) if fps is None else fps
     times, notes, guess = find_times(where, others, fps)
     if times is None:
         if fps is None:

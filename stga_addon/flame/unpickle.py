@@ -25,6 +25,7 @@ from ..files import CHANGED_LINE_ENDS, line_ends_changed, read_bytes
 MAX_FILE_BYTES = 2 << 30
 MAX_DENSE_ELEMENTS = 1 << 22  # Elements of a sparse matrix; FLAME's joint regressor has 25,115
 MAX_LISTED = 1 << 18  # Values in lists; FLAME has 29,928 corners of triangles
+MAX_OPCODES = 1 << 20  # FLAME has some 200,000; an opcode of a byte may make an object of 216
 MAX_DEPTH = 32  # Largest depth of nested tuples, and of nested lists
 SPARSE_CLASS = re.compile(
     r"scipy\.sparse(\._?(csc|csr|coo))?\.(?P<format>csc|csr|coo)_(matrix|array)"
@@ -110,10 +111,22 @@ def _load_bytearray(unpickler: Any) -> None:
     unpickler.append(bytearray(unpickler.read(int.from_bytes(unpickler.read(8), "little"))))
 
 
+class _Counted(dict[int, Any]):
+    """Opcodes, of which a limited number is carried out."""
+
+    left = MAX_OPCODES
+
+    def __getitem__(self, opcode: int) -> Any:
+        self.left -= 1
+        if self.left < 0:
+            raise pickle.UnpicklingError(f"more than {MAX_OPCODES} opcodes")
+        return super().__getitem__(opcode)
+
+
 class _RestrictedUnpickler(pickle._Unpickler):
     """The one in Python: that in C allocates memo slots by their numbers, gigabytes of them."""
 
-    dispatch: ClassVar = {
+    dispatch: ClassVar[Any] = {
         **pickle._Unpickler.dispatch,
         **{
             opcode[0]: _bounded(pickle._Unpickler.dispatch[opcode[0]])
@@ -124,6 +137,7 @@ class _RestrictedUnpickler(pickle._Unpickler):
 
     def __init__(self, data: bytes) -> None:
         super().__init__(io.BytesIO(data), encoding="latin1")
+        vars(self)["dispatch"] = _Counted(self.dispatch)
         functions: dict[str, Callable[..., Any]] = {
             "_codecs.encode": self.encode,
             "collections.OrderedDict": OrderedDict,

@@ -1,12 +1,13 @@
 """Light from a file: an environment (.hdr) as harmonics and suns, or lights as text (.toml)."""
 
+import re
 from dataclasses import MISSING, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from ..capture.camera import UP, turn_about
+from ..capture.camera import MAX_IMAGE_PIXELS, UP, is_image_size, turn_about
 from ..errors import StgaError
 from ..files import read_bytes, read_toml
 from ..schema import from_json, setting
@@ -21,6 +22,10 @@ SUN_CONTRAST = 12.0
 """Brightness, relative to the environment's mean, above which a pixel belongs to a sun."""
 SUN_RADIUS = np.radians(12)
 """Angle from the brightest pixel within which bright ones are the same sun."""
+HDR_SIZE = re.compile(rb"\n[-+][XY] +(\d{1,9}) +[-+][XY] +(\d{1,9})\s")
+"""Line of a .hdr picture that says its size."""
+MAX_HDR_HEADER_BYTES = 1 << 16
+"""Bytes in which it is searched."""
 UPRIGHT = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 """Rotation from Blender's axes (z up) to those of a capture that is shown upright (y up, face along
 z)."""
@@ -30,15 +35,21 @@ def read_hdr(path: Path) -> np.ndarray:
     """(H, W, 3) float32 radiance of a .hdr picture, from the top. Raises StgaError."""
     import cv2  # Blender, which reads the pictures of its worlds itself, may have none
 
-    data = np.frombuffer(read_bytes(path), np.uint8)
+    data = read_bytes(path)
+    size = HDR_SIZE.search(data[:MAX_HDR_HEADER_BYTES]) if data.startswith(b"#?") else None
+    if size is not None and not is_image_size(int(size[1]), int(size[2])):
+        raise StgaError(
+            f"{path}: claims {int(size[1])} x {int(size[2])} pixels; at most {MAX_IMAGE_PIXELS} "
+            "are read; scale it down"
+        )
     flags = cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH
     try:
-        found = cv2.imdecode(data, flags)
+        found = None if size is None else cv2.imdecode(np.frombuffer(data, np.uint8), flags)
     except (cv2.error, MemoryError):  # empty, or claims too many pixels
         found = None
     if found is None or found.dtype != np.float32:
         raise StgaError(f"{path}: is not a Radiance picture (.hdr), or its pixels are damaged")
-    return np.ascontiguousarray(found[..., ::-1])
+    return np.asarray(cv2.cvtColor(found, cv2.COLOR_BGR2RGB, found))
 
 
 def pixel_directions(height: int, width: int) -> tuple[np.ndarray, np.ndarray]:

@@ -99,6 +99,34 @@ CLOCKS = {
     "two clocks": ("time,unix_time", lambda n: f"{n / 25},{n / 30}", 25, "unix_time lasts 1.967 s"),
     "durations alone": ("frame_time", lambda n: 0.03, 60, "frame_time repeats its values"),
     "falling": ("delta ms", lambda n: 90 - n * n % 19, 60, "delta ms repeats"),
+    "German": (
+        "Zeit",
+        lambda n: n / 25,
+        25,
+        "column Zeit is taken as seconds, though it is not called",
+    ),
+    "Japanese": (
+        "\u6642\u9593",
+        lambda n: 40 * n,
+        25,
+        "holds milliseconds, by its steps of 40, though",
+    ),
+    "timecodes by another name": (
+        "TC",
+        lambda n: f"01:00:{n // 25:02d}:{n % 25:02d}",
+        25,
+        "column TC is taken as seconds, though",
+    ),
+    "minutes": ("time (min)", lambda n: n / 25 / 60, 25, None),
+    "ticks of 100 ns": ("ticks", lambda n: 638 * 10**15 + n * 400_000, 25, None),
+    "another clock's ticks": (
+        "hostTime",
+        lambda n: 400_000 * n,
+        60,
+        "column hostTime has 2.5e-06 rows a second",
+    ),
+    "a rate beside frame numbers": ("frame,Frame Rate", lambda n: f"{n},24", 24, None),
+    "beyond any clock": ("time", lambda n: (-1) ** n * 1e308, 60, "column time reaches 1e+308 s"),
     "another name": ("frame", lambda n: n, 60, "frame ascends, but is not called a time"),
     "colon before thousandths": (
         "Timecode",
@@ -276,6 +304,14 @@ TURN = Rotation.from_euler("YXZ", ANGLES).as_quat().tolist()
         ({"headRotation": TURN}, "quaternion"),
         ({"headYaw": 0.1, "headPitch": 0.2, "headRoll": 0.3}, None),
         (dict(zip(("yaw_deg", "Pitch (deg)", "roll degrees"), DEGREES, strict=True)), None),
+        (dict(zip(("yaw (°)", "pitch", "roll"), DEGREES, strict=True)), None),
+        (
+            {"yaw_deg": DEGREES[0], "pitch_rad": 0.2, "roll_degrees": DEGREES[2]},
+            "yaw_deg, pitch_rad, roll_degrees: are in different units",
+        ),
+        (dict(zip(("head_ry", "head_rx", "head_rz"), ANGLES, strict=True)), "read as pitch, yaw"),
+        (dict(zip([f"head_q{axis}" for axis in "xyzw"], TURN, strict=True)), "quaternion"),
+        ({"headMatrix": 1.0, "head_m00": 1.0}, "head_m00: not read"),
         ({"blendShapes": {"jawOpen": 0.1, "headRotation": [0.2, 0.1, 0.3]}}, "angles about x"),
         (
             {"a": {"b": {"c": {"d": {"e": {"headRotation": [0.2, 0.1, 0.3]}}}}}},
@@ -320,6 +356,7 @@ def test_eight_shapes(tmp_path, suffix):
         ("timestamp", lambda n: n * 40, {}, 25, "timestamp holds milliseconds"),
         ("timecode", lambda n: f"00:00:{n // 30:02d}:{n % 30:02d}", {}, 30, None),
         ("frame", lambda n: n, {"frame_rate": 30}, 30, None),
+        ("Zeit", lambda n: n / 25, {}, 25, "Zeit is taken as seconds"),
         ("frame", lambda n: n, {}, 60, "says no times"),
         ("frame", lambda n: n, {"timestamps_ms": [n * 40 for n in range(COUNT)]}, 25, None),
     ],
@@ -405,6 +442,9 @@ def live_link(row):
 OTHER_FORMS = {
     "a2f.json": lambda: json.dumps({str(n): live_link(row) for n, row in enumerate(WEIGHTS)}),
     "keyed.json": lambda: json.dumps({f"{n / 30:.4f}": named(w) for n, w in enumerate(WEIGHTS)}),
+    "keyed by ms.json": lambda: json.dumps(
+        {f"{n * 100 / 3:.0f}": named(w) for n, w in enumerate(WEIGHTS)}
+    ),
     "long.json": lambda: json.dumps(long_rows()),
     "long.csv": long_table,
     "lines.jsonl": lambda: "\n".join(

@@ -128,6 +128,8 @@ def test_every_form_of_csv_json_and_text(tmp_path):
         (lambda text: text.splitlines()[0], "has no row with a face"),
         (lambda text: text.replace("0.1", "911.1"), "beyond"),
         (lambda text: "", "is empty"),
+        (lambda text: "time,name,other\n0,jawOpen,1\n", "names none of ARKit's 52"),
+        (lambda text: "time,name,value\n0,jawOpen,1\n1,jawOpen\n", "names none of ARKit's 52"),
         (
             lambda text: re.sub("(?m)^(.*?),(.*)$", r"\2,\1", text).rpartition(",")[0],
             "row 6: Timeco",
@@ -152,6 +154,8 @@ def test_mistakes_are_one_sentence(tmp_path, change, sentence):
         ({"frames": [dict.fromkeys(ARKIT_SHAPES, "x")]}, "expected a number"),
         ({"other": 1}, "has no list of frames"),
         ([3], "expected named weights"),
+        ([{"time": [1], "name": "jawOpen", "value": 0.5}], "names none of ARKit's 52"),
+        ([{"time": 1, "name": "jawOpen"}], "names none of ARKit's 52"),
         ({"fps": 0, "frames": [dict.fromkeys(ARKIT_SHAPES, 0.1)]}, "not usable"),
     ],
 )

@@ -24,6 +24,7 @@ import numpy as np
 import pytest
 from capture import factory
 from flame.conftest import random_arrays
+from refusal import refusal
 from tracking import test_calibrations
 from tracking.scenes import rewrite
 from tracking.test_head_model import glb as head_glb
@@ -37,6 +38,7 @@ from stga_addon.errors import StgaError
 from stga_addon.export.ply import PROPERTIES
 from stga_addon.export.splat_files import read_splats
 from stga_addon.files import read_json, read_npz
+from stga_addon.flame import unpickle
 from stga_addon.flame.model import read_flame
 from stga_addon.flame.unpickle import read_pickled_arrays
 from stga_addon.tracking.head_model import read_head_model
@@ -476,6 +478,16 @@ def test_pickles(tmp_path, name):
     behaves(lambda: read_pickled_arrays(path), tmp_path)
     assert not Path("witness").exists()
     np.testing.assert_array_equal(read_flame(good).v_template, before)
+
+
+@pytest.mark.parametrize("opcode", [b"\x8f", b"]", b"}", b"(", b"N\x94"])
+def test_opcodes_of_pickles_are_counted(tmp_path, monkeypatch, opcode):
+    """Catches gigabytes of empty sets, lists or memo slots, each of which is a byte of the file."""
+    monkeypatch.setattr(unpickle._Counted, "left", 1000)
+    path = tmp_path / "a.pkl"
+    path.write_bytes(b"\x80\x04" + opcode * 2000 + b".")
+    with refusal(r"a\.pkl: .*more than \d+ opcodes"):
+        read_pickled_arrays(path)
 
 
 class Sparse:

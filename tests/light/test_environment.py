@@ -2,6 +2,7 @@
 
 import struct
 
+import cv2
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
@@ -60,9 +61,13 @@ def test_hdr_pixels(tmp_path, packed):
     whole = path.read_bytes()
     damaged = tmp_path / "b.hdr"
     huge = whole.replace(b"-Y 5 +X 200", b"-Y 999999 +X 999999")
-    for data in (whole[:-1], whole[:40], whole[:10], b"", huge):
+    large = whole.replace(b"-Y 5 +X 200", b"-Y 9000 +X 9000")  # 972 MB
+    picture = cv2.imencode(".tiff", np.zeros((9, 9, 3), np.float32))[1].tobytes()
+    for data in (whole[:-1], whole[:40], whole[:10], b"", huge, large, picture):
         damaged.write_bytes(data)
-        with refusal(r"b\.hdr"):
+        with refusal(
+            r"b\.hdr: claims \d+ x \d+ pixels" if data in (huge, large) else r"b\.hdr: is no"
+        ):
             read_hdr(damaged)
 
 

@@ -13,6 +13,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from PIL import Image
 from refusal import refusal
 
+from stga_addon.tracking.footage import video
 from stga_addon.tracking.footage.open import open_footage
 
 from .scenes import encode, rig, write_colmap_text
@@ -454,3 +455,14 @@ def test_without_pictures(tmp_path):
         container.mux(stream.encode())
     with refusal(r"a.mkv: is not a readable video \(it has no video stream\)"):
         open_footage(tmp_path)
+
+
+def test_frames_of_gigapixels(tmp_path, monkeypatch):
+    """Catches gigabytes that a video of some kilobytes decodes to before its size is looked at."""
+    path = tmp_path / "a.mkv"
+    write_numbered(path, "mpeg4", MPEG4, 3)
+    monkeypatch.setattr(video, "MAX_IMAGE_PIXELS", 100)
+    with refusal(rf"a\.mkv: has {COLUMNS * BLOCK} x {ROWS * BLOCK} pixels, more than are read"):
+        video.first_frames(path)
+    with video._open(path) as container, pytest.raises(av.FFmpegError):
+        next(container.decode(video=0))

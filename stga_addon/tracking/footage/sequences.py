@@ -269,15 +269,18 @@ def _loudness(video: Video) -> tuple[np.ndarray, float]:
         stream = container.streams.audio[0]
         pictures = container.streams.video[0]
         resampler = AudioResampler(format="flt", layout="mono", rate=SOUND_RATE_HZ)
-        parts: list[np.ndarray] = [np.zeros(0, np.float32)]
+        energies: list[np.ndarray] = [np.zeros(0)]
+        rest = np.zeros(0)
         begin = None
         for frame in chain(container.decode(stream), [None]):  # which ends the sound
             begin = float(frame.time or 0) if frame and begin is None else begin
-            parts += [np.ravel(each.to_ndarray()) for each in resampler.resample(frame)]
+            parts = [np.ravel(each.to_ndarray()) for each in resampler.resample(frame)]
+            rest = np.concatenate([rest, *parts])
+            blocks = rest[: len(rest) // SOUND_HOP * SOUND_HOP].reshape(-1, SOUND_HOP)
+            energies.append(np.log((blocks**2).mean(axis=1) + 1e-7))
+            rest = rest[blocks.size :]
         first_picture = video.times[0] * float(pictures.time_base) if video.seekable else 0.0
-    sound = np.concatenate(parts).astype(np.float64)
-    blocks = sound[: len(sound) // SOUND_HOP * SOUND_HOP].reshape(-1, SOUND_HOP)
-    energy = np.log((blocks**2).mean(axis=1) + 1e-7)
+    energy = np.concatenate(energies)
     return np.maximum(np.diff(energy, prepend=energy[:1]), 0), (begin or 0.0) - first_picture
 
 

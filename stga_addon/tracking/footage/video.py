@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from ...capture.camera import is_image_size
+from ...capture.camera import MAX_IMAGE_PIXELS, is_image_size
 from ...capture.color import is_srgb, to_srgb
 from ...capture.images import read_mask
 from ...capture.model import View
@@ -308,6 +308,10 @@ def opened_video(path: Path) -> Iterator[Any]:
         with _open(path) as container:
             if not container.streams.video:
                 raise ValueError("it has no video stream")
+            context = container.streams.video[0].codec_context
+            if context.width * context.height > MAX_IMAGE_PIXELS:
+                size = f"{context.width} x {context.height} pixels"
+                raise StgaError(f"{path}: has {size}, more than are read")
             yield container
     except (av.FFmpegError, ValueError) as error:
         raise StgaError(f"{path}: is not a readable video ({_reason(error)})") from error
@@ -431,8 +435,12 @@ def _pixels(frame: Any, aspect: Fraction) -> np.ndarray:
 
 
 def _open(path: Path) -> Any:
-    """A container; raises what PyAV does, and StgaError without it."""
-    return _pyav(path).open(file_address(path))
+    """A container, whose decoders refuse frames larger than images may be; raises what PyAV does,
+    and StgaError without it."""
+    container = _pyav(path).open(file_address(path))
+    for stream in container.streams.video:
+        stream.codec_context.options = {"max_pixels": str(MAX_IMAGE_PIXELS)}
+    return container
 
 
 def _display_matrix(frame: Any) -> np.ndarray | None:
