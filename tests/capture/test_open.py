@@ -4,6 +4,7 @@ import json
 import re
 import shutil
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -382,49 +383,70 @@ def test_summary(tmp_path):
     assert format_ranges([0, 2, 3, 7]) == "4: 0, 2–3, 7 (gaps 1, 4–6)"
 
 
-def remove(name):
-    return lambda root: (root / name).unlink()
+BROKEN_MESH_CAPTURES = r"""
+remove images/00001_01.png → 00001_01\.png: .*train\.json: frames\[3\] .*file_path
+remove fg_masks/00003_02.png → 00003_02\.png: does not exist, .*test\.json: frames\[2\]
+remove meshes/00003.obj → 00003\.obj: does not .*test\.json: frames\[0\] .*mesh_path
+remove meshes/neutral.obj → neutral\.obj: cannot be read
+remove regions.json → regions\.json: cannot be read
+cut transforms_train.json → transforms_train\.json: is not valid JSON
+cut meshes/neutral.obj → neutral\.obj:
+cut regions.json → regions\.json: is not valid JSON
+cut fg_masks/00000_00.png → fg_masks/00000_00\.png: is not a readable image
+in_a_point meshes/neutral.obj → neutral\.obj: all vertices of the mesh lie in one point
+in_a_point meshes/00001.obj → 00001\.obj: all vertices of the mesh lie in one point
+without_mesh 1 → val\.json: frames\[1\]\.mesh_path: is missing
+with_mesh_3 0 → val\.json: frames\[0\]\.mesh_path: is .*00003\.obj, but timestep 0 already
+"""
+BROKEN_FLAME_CAPTURES = r"""
+remove flame_param/00003.npz → 00003\.npz: does not exist, but .*flame_param_path
+cut flame_param/00000.npz → flame_param/00000\.npz: is not a readable npz
+remove model.npz → model\.npz: cannot be read
+"""
+BROKEN_RELEASES = r"""
+remove meshes/mesh_0001.json → mesh_0001\.json: cannot be read
+soup [] → 0000\.json: triangles:
+soup {"triangles": []} → 0000\.json: triangles:
+soup {"triangles": [{"Vertices": [[0, 0], [1, 0], [0, 1]]}]} → 0000\.json: triangles:
+soup {"triangles": [{"Vertices": [[NaN, 0, 0], [1, 0, 0], [0, 1, 0]]}]} → json: vertex 0
+numbers [0, 320] → 0000\.npy: names triangles 0 to 320, but .* 0 to 319
+numbers [-1] → 0000\.npy: names triangles
+numbers [0.5] → 0000\.npy: expected a list of triangle numbers
+numbers [[1]] → 0000\.npy: expected a list of triangle numbers
+"""
+"""What is done to a capture, to which of its files or with what, and what is said of it."""
 
 
-def cut(name):
-    return lambda root: (root / name).write_bytes((root / name).read_bytes()[:40])
+def remove(root, given):
+    (root / given).unlink()
 
 
-def in_a_point(name):
+def cut(root, given):
+    (root / given).write_bytes((root / given).read_bytes()[:40])
+
+
+def in_a_point(root, given):
     vertices, faces = factory.ball()
-    return lambda root: factory.write_mesh(root / name, np.full_like(vertices, 0.1), faces)
+    factory.write_mesh(root / given, np.full_like(vertices, 0.1), faces)
 
 
-def written(name, content):
-    """A file of text, or of an array."""
-    if isinstance(content, str):
-        return lambda root: (root / name).write_text(content) and None
-    return lambda root: np.save(root / name, content)
+def without_mesh(root, given):
+    path = root / "transforms_val.json"
+    factory.edit(path, lambda document: document["frames"][int(given)].pop("mesh_path"))
 
 
-def edited(change):
-    path = "transforms_val.json"
-    return lambda root: factory.edit(root / path, lambda document: change(document["frames"]))
+def with_mesh_3(root, given):
+    changes = {"mesh_path": "meshes/00003.obj"}
+    path = root / "transforms_val.json"
+    factory.edit(path, lambda document: document["frames"][int(given)].update(changes))
 
 
-BROKEN_MESH_CAPTURES = [
-    (remove("images/00001_01.png"), r"00001_01\.png: .*train\.json: frames\[3\] .*file_path"),
-    (remove("fg_masks/00003_02.png"), r"00003_02\.png: does not exist, .*test\.json: frames\[2\]"),
-    (remove("meshes/00003.obj"), r"00003\.obj: does not .*test\.json: frames\[0\] .*mesh_path"),
-    (remove("meshes/neutral.obj"), r"neutral\.obj: cannot be read"),
-    (remove("regions.json"), r"regions\.json: cannot be read"),
-    (cut("transforms_train.json"), r"transforms_train\.json: is not valid JSON"),
-    (cut("meshes/neutral.obj"), r"neutral\.obj: "),
-    (cut("regions.json"), r"regions\.json: is not valid JSON"),
-    (cut("fg_masks/00000_00.png"), r"fg_masks/00000_00\.png: is not a readable image"),
-    (in_a_point("meshes/neutral.obj"), r"neutral\.obj: all vertices of the mesh lie in one point"),
-    (in_a_point("meshes/00001.obj"), r"00001\.obj: all vertices of the mesh lie in one point"),
-    (edited(lambda own: own[1].pop("mesh_path")), r"val\.json: frames\[1\]\.mesh_path: is missing"),
-    (
-        edited(lambda own: own[0].update(mesh_path="meshes/00003.obj")),
-        r"val\.json: frames\[0\]\.mesh_path: is .*00003\.obj, but timestep 0 already",
-    ),
-]
+def soup(root, given):
+    (root / "meshes/mesh_0000.json").write_text(given)
+
+
+def numbers(root, given):
+    np.save(root / "training_faces/0000.npy", json.loads(given))
 
 
 def parameters(change):
@@ -436,43 +458,27 @@ def parameters(change):
     return damage
 
 
-BROKEN_FLAME_CAPTURES = [
-    (remove("flame_param/00003.npz"), r"00003\.npz: does not exist, but .*flame_param_path"),
-    (cut("flame_param/00000.npz"), r"flame_param/00000\.npz: is not a readable npz"),
-    (remove("model.npz"), r"model\.npz: cannot be read"),
-    (parameters({"shape": None}), r"00000\.npz: .*shape"),
-    (parameters({"static_offset": np.zeros((1, 100, 3))}), r"00000\.npz: .*static_offset"),
-    (parameters({"expr": np.array([{}], object)}), r"00000\.npz: "),
-    (parameters({"translation": np.full((1, 3), 9e5)}), "timestep 0: the mesh reaches farther"),
-    (parameters({"expr": np.full((1, 2), 1e300)}), r"00000\.npz: expr holds values"),
-]
-
-
-IDS = "training_faces/0000.npy"
-SOUP = "meshes/mesh_0000.json"
-NO_SOUP = r"0000\.json: triangles: "
-BROKEN_RELEASES = [
-    (written(IDS, np.array([0, 320])), r"0000\.npy: names triangles 0 to 320, but .* 0 to 319"),
-    (written(IDS, np.array([-1])), r"0000\.npy: names triangles"),
-    (written(IDS, np.array([0.5])), r"0000\.npy: expected a list of triangle numbers"),
-    (written(IDS, np.array([[1]])), r"0000\.npy: expected a list of triangle numbers"),
-    (written(IDS, np.array([{}], object)), r"0000\.npy: is not a readable npy"),
-    (written(SOUP, "[]"), NO_SOUP),
-    (written(SOUP, '{"triangles": []}'), NO_SOUP),
-    (written(SOUP, '{"triangles": [{"Vertices": [[0, 0], [1, 0], [0, 1]]}]}'), NO_SOUP),
-    (
-        written(SOUP, '{"triangles": [{"Vertices": [[NaN, 0, 0], [1, 0, 0], [0, 1, 0]]}]}'),
-        "json: vertex 0",
-    ),
-    (remove("meshes/mesh_0001.json"), r"mesh_0001\.json: cannot be read"),
-]
-
-
+KINDS = {
+    kind.__name__: kind
+    for kind in (remove, cut, in_a_point, without_mesh, with_mesh_3, soup, numbers)
+}
 BROKEN_CAPTURES = [
-    *((factory.write_mesh_capture, *row) for row in BROKEN_MESH_CAPTURES),
-    *((factory.write_flame_capture, *row) for row in BROKEN_FLAME_CAPTURES),
-    *((factory.write_release, *row) for row in BROKEN_RELEASES),
+    (factory.write_flame_capture, parameters(change), message)
+    for change, message in (
+        ({"shape": None}, r"00000\.npz: .*shape"),
+        ({"static_offset": np.zeros((1, 100, 3))}, r"00000\.npz: .*static_offset"),
+        ({"expr": np.array([{}], object)}, r"00000\.npz: "),
+        ({"translation": np.full((1, 3), 9e5)}, "timestep 0: the mesh reaches farther"),
+        ({"expr": np.full((1, 2), 1e300)}, r"00000\.npz: expr holds values"),
+    )
 ]
+for write, table in (
+    (factory.write_mesh_capture, BROKEN_MESH_CAPTURES),
+    (factory.write_flame_capture, BROKEN_FLAME_CAPTURES),
+    (factory.write_release, BROKEN_RELEASES),
+):
+    for kind, given, message in re.findall(r"^(\w+) (.*) → (.*)$", table, re.MULTILINE):
+        BROKEN_CAPTURES.append((write, partial(KINDS[kind], given=given), message))
 
 
 @pytest.mark.parametrize(("write", "damage", "message"), BROKEN_CAPTURES)

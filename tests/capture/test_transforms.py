@@ -196,28 +196,34 @@ def test_paths_that_leave_are_refused(tmp_path, path, field):
         read_one(tmp_path, {**factory.frame(0, 0), field: path})
 
 
-SKEWED = np.eye(4)
-SKEWED[0, 1] = 0.01
-MIRRORED = np.diag([1.0, 1.0, -1.0, 1.0])
-MALFORMED = [
-    ("file_path", None), ("file_path", 3), ("timestep_index", -1), ("timestep_index", 1.5),
-    ("timestep_index", True), ("timestep_index", "3"), ("camera_index", [1]), ("fl_x", 0),
-    ("fl_x", float("nan")), ("fl_x", "200"), ("fl_y", -3.0), ("cx", float("inf")), ("cy", {}),
-    ("w", 0), ("w", 10**9), ("mesh_path", ["a.obj"]),
-    ("transform_matrix", None), ("transform_matrix", np.eye(3).tolist()),
-    ("transform_matrix", [[1, 0], [0]]), ("transform_matrix", [["a"] * 4] * 4),
-    ("transform_matrix", np.full((4, 4), np.nan).tolist()),
-    ("transform_matrix", (2 * np.eye(4)).tolist()), ("transform_matrix", SKEWED.tolist()),
-    ("transform_matrix", MIRRORED.tolist()), ("transform_matrix", np.zeros((4, 4)).tolist()),
-]  # fmt: skip
+MALFORMED = """
+file_path null, 3
+timestep_index -1, 1.5, true, "3"
+camera_index [1]
+fl_x 0, NaN, "200"
+fl_y -3.0
+cx Infinity
+cy {}
+w 0, 1000000000
+mesh_path ["a.obj"]
+transform_matrix null, [[1, 0], [0]], [[1, 0, 0], [0, 1, 0], [0, 0, 1]], [["a", 0, 0, 0]]
+transform_matrix [[NaN, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
+transform_matrix [[2, 0, 0, 0], [0, 2, 0, 0], [0, 0, 2, 0], [0, 0, 0, 2]]
+transform_matrix [[1, 0.01, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
+transform_matrix [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, -1, 0], [0, 0, 0, 1]]
+transform_matrix [[0, 0, 0, 0], [0, 0, 0, 0], [0, 0, 0, 0], [0, 0, 0, 0]]
+"""
+"""Field, and values in JSON that it cannot have."""
 
 
-@pytest.mark.parametrize(("field", "value"), MALFORMED)
-def test_malformed_fields(tmp_path, field, value):
+@pytest.mark.parametrize("row", MALFORMED.strip().splitlines())
+def test_malformed_fields(tmp_path, row):
     """Catches a wrong value that passes, or ends in a traceback, instead of an error that names
     file and field."""
-    with refusal(rf"transforms\.json: frames\[0\]\.{field}: "):
-        read_one(tmp_path, {**factory.frame(0, 0), field: value})
+    field, _, values = row.partition(" ")
+    for value in json.loads(f"[{values}]"):
+        with refusal(rf"transforms\.json: frames\[0\]\.{field}: "):
+            read_one(tmp_path, {**factory.frame(0, 0), field: value})
 
 
 @pytest.mark.parametrize("field", ["fl_x", "w", "timestep_index"])

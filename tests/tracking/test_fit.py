@@ -163,20 +163,6 @@ def test_a_take_is_found_in_a_world_of_any_scale_and_orientation(head):
         assert error.mean() < (2e-3 if timestep == 7 else 0.8e-3)
 
 
-def test_jumps_are_not_smoothed(head):
-    """Catches smoothing across cuts: a capture of single expressions would lose all of them."""
-    places = places_on(head, 100)
-    shape = np.zeros(head.model.n_identity)
-    strong = np.resize(np.eye(head.model.n_expression), (6, head.model.n_expression))
-    meshes = [
-        flame_forward(head.model, shape, replace(frame_at(head, 0), expr=expr)) for expr in strong
-    ]
-    fit = fit_head(head, recorded(head, cameras(4), meshes, places))
-    for timestep, mesh in enumerate(meshes):
-        missed = (in_cameras_world(fit, timestep) - mesh)[head.model.masks["face"]]
-        assert norm(missed, axis=1).mean() < 0.8e-3
-
-
 def amounts_and_observations(head, amounts, noise):
     """A person without identity, and what is known of 100 landmarks at each timestep of one moving
     expression."""
