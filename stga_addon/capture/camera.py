@@ -51,6 +51,11 @@ class Camera:
     world_to_camera: np.ndarray
 
     @property
+    def intrinsics(self) -> tuple[int, int, float, float, float, float]:
+        """width, height, fl_x, fl_y, cx, cy."""
+        return self.width, self.height, self.fl_x, self.fl_y, self.cx, self.cy
+
+    @property
     def position(self) -> np.ndarray:
         """Camera center (3,) in world meters."""
         rotation = self.world_to_camera[:3, :3]
