@@ -51,11 +51,24 @@ class Camera:
     world_to_camera: np.ndarray
 
     @property
+    def intrinsics(self) -> tuple[int, int, float, float, float, float]:
+        """width, height, fl_x, fl_y, cx, cy."""
+        return self.width, self.height, self.fl_x, self.fl_y, self.cx, self.cy
+
+    @property
+    def rotation(self) -> np.ndarray:
+        """(3, 3) from the world's axes to the camera's."""
+        return self.world_to_camera[:3, :3]
+
+    @property
+    def translation(self) -> np.ndarray:
+        """(3,) of the world's origin in the camera's axes, meters."""
+        return self.world_to_camera[:3, 3]
+
+    @property
     def position(self) -> np.ndarray:
         """Camera center (3,) in world meters."""
-        rotation = self.world_to_camera[:3, :3]
-        translation = self.world_to_camera[:3, 3]
-        return -rotation.T @ translation
+        return -self.rotation.T @ self.translation
 
     @property
     def camera_to_world_gl(self) -> np.ndarray:
@@ -68,7 +81,7 @@ class Camera:
         count from the top-left corner of the image, pixel centers lie at .5. Depth is the distance
         along the viewing axis, negative behind the camera; positions of such points mean
         nothing."""
-        local = points @ self.world_to_camera[:3, :3].T + self.world_to_camera[:3, 3]
+        local = points @ self.rotation.T + self.translation
         depth = local[:, 2]
         flat = local[:, :2] / np.maximum(depth, MIN_PROJECTION_DEPTH)[:, None]
         return flat * [self.fl_x, self.fl_y] + [self.cx, self.cy], depth
@@ -82,7 +95,7 @@ class Camera:
         returns them."""
         flat = self.at_depth_one(pixels)
         local = np.concatenate([flat, np.ones((len(flat), 1))], axis=1) * depth[:, None]
-        return (local - self.world_to_camera[:3, 3]) @ self.world_to_camera[:3, :3]
+        return (local - self.translation) @ self.rotation
 
     def scaled(self, factor: float) -> "Camera":
         """The camera with an image `factor` times as large (sizes rounded, at least one pixel)."""

@@ -90,7 +90,7 @@ class Undistortion:
         """(H, W) or (H, W, C) uint8, bicubic; gray images are masks and interpolated linearly."""
         import cv2
 
-        maps = _maps(_intrinsics(self.recorded), self.lens, _intrinsics(self.camera))
+        maps = _maps(self.recorded.intrinsics, self.lens, self.camera.intrinsics)
         method = cv2.INTER_CUBIC if image.ndim == 3 else cv2.INTER_LINEAR
         return cv2.remap(image, *maps, method, borderMode=cv2.BORDER_REPLICATE)
 
@@ -110,7 +110,7 @@ def undistortion(recorded: Camera, lens: Lens, where: str) -> Undistortion | Non
         raise StgaError(
             f"{where}: its lens is distorted; undistorting needs opencv-python-headless"
         ) from error
-    zoom = _least_zoom(_intrinsics(recorded), lens)
+    zoom = _least_zoom(recorded.intrinsics, lens)
     if zoom is None:
         raise StgaError(
             f"{where}: the distortion of its lens folds the image; expected coefficients of "
@@ -147,10 +147,6 @@ def _is_inside(recorded: Intrinsics, lens: Lens, zoom: float) -> bool:
     if not np.isfinite(distorted).all() or (found < 0).any() or (found > [width, height]).any():
         return False
     return bool((np.diff(np.linalg.norm(distorted, axis=-1), axis=0) > 0).all())
-
-
-def _intrinsics(camera: Camera) -> Intrinsics:
-    return camera.width, camera.height, camera.fl_x, camera.fl_y, camera.cx, camera.cy
 
 
 @lru_cache(CACHED_MAPS)

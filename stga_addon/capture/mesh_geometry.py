@@ -81,8 +81,8 @@ class Similarity:
     def camera(self, camera: Camera) -> Camera:
         """The camera in the world that `apply` leads to."""
         pose = np.eye(4)
-        pose[:3, :3] = camera.world_to_camera[:3, :3] @ self.rotation.T
-        pose[:3, 3] = self.scale * camera.world_to_camera[:3, 3] - pose[:3, :3] @ self.translation
+        pose[:3, :3] = camera.rotation @ self.rotation.T
+        pose[:3, 3] = self.scale * camera.translation - pose[:3, :3] @ self.translation
         return replace(camera, world_to_camera=pose)
 
 

@@ -161,7 +161,7 @@ def in_image_size(transforms: Transforms) -> tuple[Transforms, str | None]:
 
     alike: dict[tuple[float, ...], list[Frame]] = {}
     for frame in transforms.frames:
-        alike.setdefault(_intrinsics(frame.view.camera), []).append(frame)
+        alike.setdefault(frame.view.camera.intrinsics, []).append(frame)
     sizes = {}
     sentences = []
     for key, frames in alike.items():
@@ -179,7 +179,7 @@ def in_image_size(transforms: Transforms) -> tuple[Transforms, str | None]:
 
     def fitted(frame: Frame) -> Frame:
         camera = frame.view.camera
-        size = sizes.get(_intrinsics(camera))
+        size = sizes.get(camera.intrinsics)
         found = None if size is None else scaled_to(camera, size)
         if found is None:
             return frame
@@ -189,10 +189,6 @@ def in_image_size(transforms: Transforms) -> tuple[Transforms, str | None]:
 
     splits = {name: tuple(map(fitted, own)) for name, own in transforms.splits.items()}
     return replace(transforms, splits=splits), next(iter(sentences), None)
-
-
-def _intrinsics(camera: Camera) -> tuple[float, ...]:
-    return camera.width, camera.height, camera.fl_x, camera.fl_y, camera.cx, camera.cy
 
 
 def _in_images(capture: Capture) -> float:

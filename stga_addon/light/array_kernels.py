@@ -1,5 +1,7 @@
-"""The kernels of `raster.cpu.shade` and `.shadow` in NumPy, for Pythons without Numba. Vectors are
-rows of their own, (3, N): NumPy is slow where the last axis is short."""
+"""What lights add to surface points, and the shadow maps that say where. Vectors are rows of their
+own, (3, N): NumPy is slow where the last axis is short."""
+
+from typing import NamedTuple
 
 import numpy as np
 
@@ -7,14 +9,46 @@ CHUNK_TEXELS = 1 << 17
 """Texels in the boxes around triangles that are drawn at a time, to bound the memory."""
 CHUNK_POINTS = 1 << 13
 """Points that are computed at a time, whose arrays stay in the processor's cache."""
+MIN_FACING = np.float32(0.05)
+"""Least cosine between a highlight's normal and the direction to the eye; smaller ones are
+raised."""
 SUN = 0
 SPOT = 2
 AREA = 3
-MIN_FACING = np.float32(0.05)
+
+# Columns of a table of lights (L, 16) float32.
+KIND = 0
+"""Number in `values.KINDS`."""
+POSITION = slice(1, 4)
+"""Position in meters."""
+DIRECTION = slice(4, 7)
+"""Direction in which the light shines."""
+COLOR = slice(7, 10)
+"""Color: irradiance of a sun, else intensity in W/sr towards what faces the light."""
+CONE = 10
+"""Cosine of half a spot's cone."""
+FADE = 11
+"""How far above CONE the cosine has risen where a spot no longer fades."""
+MAP = 12
+"""Row of the table of visibility; -1: the light is visible from every point."""
+DIFFUSE = 13
+"""Factor of diffuse light."""
+SPECULAR = 14
+"""Factor of specular light."""
+WIDTH = 15
+"""Tangent of half the angle that a sun takes, else half the light's width in meters."""
+
+
+class Surface(NamedTuple):
+    """Points (N, 3) float32 of a surface, their unit normals (N, 3) float32, and roughness (N,)."""
+
+    points: np.ndarray
+    normals: np.ndarray
+    roughness: np.ndarray
 
 
 def add_depths(points: np.ndarray, faces: np.ndarray, depth: np.ndarray) -> None:
-    """As `raster.cpu.shadow.add_depths`."""
+    """As `raster.cpu.shadow.add_depths`, for Pythons without Numba."""
     size = len(depth)
     corners = np.stack([points[faces[:, k]].T for k in range(3)]).astype(np.float64)
     low = np.clip(corners.min(0)[:2], 0, size)
@@ -79,11 +113,16 @@ def _line(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def lit_fractions(
-    depth: np.ndarray, points: np.ndarray, bias: np.ndarray, step: float, lit: np.ndarray
-) -> None:
-    """As `raster.cpu.shadow.lit_fractions`; step: a whole number."""
+    depth: np.ndarray, points: np.ndarray, bias: np.ndarray, reach: int
+) -> np.ndarray:
+    """(N,) float32: fraction 0…1 of the depth map's texels around each point that do not block it.
+
+    points (N, 3) as in `add_depths`. bias (N,): depth by which a texel must be nearer to block.
+    reach: texels between the 3 × 3 places that are looked up bilinearly around a point; 0: one
+    place.
+    """
     size = len(depth)
-    reach = int(step)
+    lit = np.empty(len(points), np.float32)
     border = 2 * reach + 3
     # The map with a border that blocks nothing; farther places are moved onto it.
     padded = np.full((size + 2 * border,) * 2, np.inf, np.float32)
@@ -109,6 +148,7 @@ def lit_fractions(
                 open_ += np.where(z <= flat.take(at + (row * width + column)), fraction, 0)
             found += weight * open_
         lit[part] = found / np.float32(len(taps) ** 2)
+    return lit
 
 
 def _texel_weights(taps: tuple[int, ...], fraction: np.ndarray) -> dict[int, np.ndarray]:
@@ -121,18 +161,17 @@ def _texel_weights(taps: tuple[int, ...], fraction: np.ndarray) -> dict[int, np.
     return weights
 
 
-def add_lights(
-    points: np.ndarray,
-    normals: np.ndarray,
-    eye: np.ndarray,
-    roughness: np.ndarray,
-    reflectance: np.ndarray,
-    lights: np.ndarray,
-    lit: np.ndarray,
-    irradiance: np.ndarray,
-    highlight: np.ndarray,
-) -> None:
-    """As `raster.cpu.shade.add_lights`."""
+def shaded(
+    surface: Surface, eye: np.ndarray, reflectance: float, lights: np.ndarray, lit: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Irradiance and highlight (N, 3) float32 that a table of lights adds, seen from eye (3,).
+
+    lit: rows (N,) of what shadows leave of lights. A highlight is a GGX lobe with Smith's shadowing
+    and Schlick's Fresnel term of the given reflectance, as wide as the light makes it; none where
+    the roughness is 0.
+    """
+    points, normals, roughness = surface
+    irradiance, highlight = np.zeros((2, len(points), 3), np.float32)
     for start in range(0, len(points), CHUNK_POINTS):
         part = slice(start, start + CHUNK_POINTS)
         place, normal = (np.ascontiguousarray(rows[part].T) for rows in (points, normals))
@@ -140,21 +179,20 @@ def add_lights(
         view *= 1 / np.sqrt(np.maximum(_dot(view, view), np.float32(1e-20)))
         toward_eye = np.maximum(_dot(normal, view), MIN_FACING)
         alpha = roughness[part] ** 2
-        fraction = reflectance[part]
         arriving = np.zeros_like(view)
         reflected = np.zeros_like(view)
         for light in lights:
             toward, strength, width = toward_light(light, place)
             facing = np.maximum(_dot(normal, toward), 0)
             strength = strength * facing
-            if light[12] >= 0:
-                strength *= lit[int(light[12]), part]
+            if light[MAP] >= 0:
+                strength *= lit[int(light[MAP]), part]
             if not strength.any():
                 continue
-            arriving += (light[13] * light[7:10])[:, None] * strength
-            if light[14] <= 0:
+            arriving += (light[DIFFUSE] * light[COLOR])[:, None] * strength
+            if light[SPECULAR] <= 0:
                 continue
-            half = toward + view  # as `raster.cpu.shade.ggx`
+            half = toward + view
             half *= 1 / np.sqrt(np.maximum(_dot(half, half), np.float32(1e-12)))
             square = np.minimum(alpha * alpha + width * width / 8, 1)
             half_cosine = np.clip(_dot(normal, half), 0, 1)
@@ -163,13 +201,15 @@ def add_lights(
             shadowing += toward_eye * np.sqrt(facing * facing * (1 - square) + square)
             fade = 1 - np.clip(_dot(view, half), 0, 1)
             fade_square = fade * fade
-            fresnel = fraction + (1 - fraction) * fade_square * fade_square * fade
+            fresnel = np.float32(reflectance)
+            fresnel = fresnel + (1 - fresnel) * fade_square * fade_square * fade
             least = np.float32(1e-12)
             gloss = square * fresnel / np.maximum(2 * np.pi * spread * spread * shadowing, least)
             strength *= np.where(alpha > 0, gloss, 0)
-            reflected += (light[14] * light[7:10])[:, None] * strength
-        irradiance[part] += arriving.T
-        highlight[part] += reflected.T
+            reflected += (light[SPECULAR] * light[COLOR])[:, None] * strength
+        irradiance[part] = arriving.T
+        highlight[part] = reflected.T
+    return irradiance, highlight
 
 
 def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -181,18 +221,18 @@ def toward_light(
     light: np.ndarray, points: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Unit vectors (3, N) to a light's row, factors (N,) of its color, and its width (N,)."""
-    if light[0] == SUN:
+    if light[KIND] == SUN:
         ones = np.ones(points.shape[1], np.float32)
-        return np.broadcast_to(-light[4:7, None], points.shape), ones, light[15] * ones
-    toward = light[1:4, None] - points
+        return np.broadcast_to(-light[DIRECTION, None], points.shape), ones, light[WIDTH] * ones
+    toward = light[POSITION, None] - points
     square = np.maximum(_dot(toward, toward), np.float32(1e-8))
     away = 1 / np.sqrt(square)
     toward *= away
     strength = 1 / square
-    along = -_dot(toward, light[4:7])
-    if light[0] == AREA:
+    along = -_dot(toward, light[DIRECTION])
+    if light[KIND] == AREA:
         strength = strength * np.maximum(along, 0)
-    elif light[0] == SPOT:
-        inside = np.clip((along - light[10]) / light[11], 0, 1)
+    elif light[KIND] == SPOT:
+        inside = np.clip((along - light[CONE]) / light[FADE], 0, 1)
         strength = strength * inside * inside * (3 - 2 * inside)
-    return toward, strength, light[15] * away
+    return toward, strength, light[WIDTH] * away

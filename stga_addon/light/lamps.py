@@ -1,15 +1,15 @@
 """Lights of a scene at a posed head: shadow maps of what they see, and what they add."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from importlib import import_module
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from ..raster.kernel_cache import prefers_numba
 from . import array_kernels
-from .array_kernels import toward_light
+from .array_kernels import COLOR, DIFFUSE, Surface, lit_fractions, shaded, toward_light
 from .harmonics import COUNT, basis
 from .values import KINDS, Caster, Light, Lighting
 
@@ -22,7 +22,7 @@ BIAS_M = 0.001
 taps."""
 MAX_BIAS_M = 0.006
 """Largest bias on a slope."""
-TAP_STEP = 1.0  # Texels between the 3 × 3 places that are looked up: splats soften edges already
+TAP_STEP = 1  # Texels between the 3 × 3 places that are looked up: splats soften edges already
 
 
 @dataclass(frozen=True)
@@ -112,7 +112,8 @@ class ShadowMap:
             # of a plane in perspective, not depth but 1 / depth is linear in texels
             if not is_parallel:
                 points[:, 2] = -1 / points[:, 2]
-            kernels("shadow").add_depths(points, np.ascontiguousarray(mesh.faces, np.int32), depth)
+            add_depths = depth_kernel()
+            add_depths(points, np.ascontiguousarray(mesh.faces, np.int32), depth)
         if not is_parallel:
             depth = np.divide(-1, depth, np.full_like(depth, np.inf), where=depth < 0)
         self.depth = depth
@@ -121,14 +122,13 @@ class ShadowMap:
         self,
         points: np.ndarray,
         bias: float = BIAS_M,
-        step: float = TAP_STEP,
+        step: int = TAP_STEP,
         normals: np.ndarray | None = None,
     ) -> np.ndarray:
         """Fraction of the lamp's light that reaches points: (N,) float32, 0…1.
 
         points: (N, 3), lifted off the surface. normals: (N, 3); on slopes they enlarge `bias`.
         """
-        found = np.empty(len(points), np.float32)
         biases = np.full(len(points), bias, np.float32)
         if normals is not None:
             if self._view.is_parallel:
@@ -142,16 +142,14 @@ class ShadowMap:
             sloped = bias + (step + 1) * self._view.texel_m * slope
             biases = np.asarray(np.minimum(sloped, max(bias, MAX_BIAS_M)), np.float32)
         places = np.nan_to_num(self._view.project(points), nan=-1e6)  # beside the map, and so lit
-        kernels("shadow").lit_fractions(self.depth, places, biases, np.float32(step), found)
-        return found
+        return lit_fractions(self.depth, places, biases, step)
 
 
-def kernels(name: str) -> Any:
-    """`raster.cpu.shade` (`add_lights`) or `.shadow` (`add_depths`, `lit_fractions`), three times
-    as fast, where Numba's kernels are compiled, else NumPy's."""
-    if prefers_numba():
-        return import_module(f"...raster.cpu.{name}", __name__)
-    return array_kernels
+def depth_kernel() -> Callable[[np.ndarray, np.ndarray, np.ndarray], None]:
+    """`add_depths` of `raster.cpu.shadow`, ten times as fast, where Numba's kernels are compiled,
+    else NumPy's."""
+    kernels = import_module("...raster.cpu.shadow", __name__) if prefers_numba() else array_kernels
+    return kernels.add_depths  # type: ignore[no-any-return]
 
 
 FEW = 1
@@ -196,27 +194,16 @@ class Lamps:
         reflectance: float,
     ) -> tuple[np.ndarray, np.ndarray]:
         """Irradiance and highlight (N, 3) at points (N, 3) seen from eye (3,)."""
-        found = np.zeros((len(points), 3), np.float32), np.zeros((len(points), 3), np.float32)
-        if not len(self._table):
-            return found
         lit = np.ones((max(1, len(self._maps)), len(points)), np.float32)
         for row, shadow in zip(lit, self._maps, strict=False):
             row[:] = shadow.lit(points, normals=normals)
-        kernels("shade").add_lights(
-            np.ascontiguousarray(points, np.float32),
-            np.ascontiguousarray(normals, np.float32),
-            np.asarray(eye, np.float32),
-            np.asarray(roughness, np.float32),
-            np.full(len(points), reflectance, np.float32),
-            self._table,
-            lit,
-            *found,
-        )
-        return found
+        surface = Surface(*(np.asarray(rows, np.float32) for rows in (points, normals, roughness)))
+        return shaded(surface, np.asarray(eye, np.float32), reflectance, self._table, lit)
 
 
 def light_rows(light: Light, center: np.ndarray, shadow_map: int) -> np.ndarray:
-    """(points, 16) float32: a light as rows of `raster.cpu.shade`, for a head at `center` (3,)."""
+    """(points, 16) float32: a light as rows of the table of lights in `array_kernels`, for a head
+    at `center` (3,)."""
     places = light.position[None]
     width = light.radius
     if light.kind == "sun":
@@ -247,5 +234,5 @@ def distant_light(light: Light, center: np.ndarray) -> np.ndarray:
     found = np.zeros((COUNT, 3))
     for row in light_rows(light, center, -1):
         toward, strength, _ = toward_light(row, np.asarray(center, np.float32)[:, None])
-        found += basis(toward.T).T * (strength * row[7:10] * row[13])
+        found += basis(toward.T).T * (strength * row[COLOR] * row[DIFFUSE])
     return found

@@ -1,4 +1,4 @@
-/* Relit colors, as in relight.py, lamps.py and raster/cpu/shade.py: for Blender's shaders and for the web page's player.
+/* Relit colors, as in relight.py, lamps.py and array_kernels.py: for Blender's shaders and for the web page's player.
    Needs what shading.py puts before it, and two macros: SHADOW_DEPTH(cell), of a texel of all shadow maps beside each other,
    and WORLD(first, k), radiance of the world by harmonics, times GLOSSY. */
 

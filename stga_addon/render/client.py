@@ -121,8 +121,7 @@ def missing_packages() -> list[str]:
 
 def pack_camera(camera: Camera) -> dict[str, Any]:
     """A camera as named arrays."""
-    intrinsics = [camera.width, camera.height, camera.fl_x, camera.fl_y, camera.cx, camera.cy]
-    return {"camera": np.array(intrinsics), "pose": camera.world_to_camera}
+    return {"camera": np.array(camera.intrinsics), "pose": camera.world_to_camera}
 
 
 def unpack_camera(arrays: Mapping[str, np.ndarray]) -> Camera:

@@ -223,9 +223,8 @@ def inside(camera: Camera, pixels: np.ndarray, depth: np.ndarray) -> np.ndarray:
 
 def projection_derivative(camera: Camera, points: np.ndarray) -> np.ndarray:
     """(N, 2, 3): derivatives of the pixels of points (N, 3) by their positions."""
-    turn = camera.world_to_camera[:3, :3]
-    at = camera.world_to_camera[:3, 3]
-    x, y, z = (points @ turn.T + at).T
+    turn = camera.rotation
+    x, y, z = (points @ turn.T + camera.translation).T
     z = np.maximum(z, 1e-6)
     of_x = (camera.fl_x / z)[:, None] * (turn[0] - (x / z)[:, None] * turn[2])
     of_y = (camera.fl_y / z)[:, None] * (turn[1] - (y / z)[:, None] * turn[2])

@@ -67,7 +67,7 @@ def shaded_image(
     seen = triangle >= 0
     corners = faces[triangle[seen]]
     inside = weights[seen][..., None]
-    axes = camera.world_to_camera[:3, :3]
+    axes = camera.rotation
     smooth = (vertex_normals(vertices, faces)[corners] * inside).sum(1) @ axes.T
     normal = unit(smooth * [1, -1, -1])
     lit = (1 - AMBIENT) * np.clip(normal @ unit(KEY_LIGHT), 0, 1)

@@ -81,7 +81,7 @@ class Triangulation:
 def rays(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Origin (3,) and unit directions (N, 3) in the world of pixels (N, 2)."""
     local = np.column_stack([camera.at_depth_one(points), np.ones(len(points))])
-    return camera.position, unit(local @ camera.world_to_camera[:3, :3])
+    return camera.position, unit(local @ camera.rotation)
 
 
 def triangulate(
@@ -328,7 +328,7 @@ def pose_from_one_camera(camera: Camera, pixels: np.ndarray, points: np.ndarray)
         place = np.array([*rows[:, 3], 1.0]) / size
         stretch = 1 + (points - center) @ rotation[2] / place[2]
     local = (points - center) @ rotation.T + place
-    return (local - camera.world_to_camera[:3, 3]) @ camera.world_to_camera[:3, :3]
+    return (local - camera.translation) @ camera.rotation
 
 
 def triangulated(

@@ -40,7 +40,7 @@ def without_bias(
     right = unit(np.cross(UP, direction))
     down = np.cross(right, direction)
     # the roll between the upright camera's image and this one: the nearest rotation
-    in_image = (camera.world_to_camera[:3, :3] @ turn @ np.stack([right, down], axis=1))[:2]
+    in_image = (camera.rotation @ turn @ np.stack([right, down], axis=1))[:2]
     left, _, other = np.linalg.svd(in_image)
     limits = [(axis[0], axis[-1]) for axis in table.grid]
     at = [np.clip(value, *limit) for value, limit in zip((azimuth, elevation), limits, strict=True)]

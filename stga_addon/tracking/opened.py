@@ -111,9 +111,7 @@ def footage_state(footage: Footage) -> dict[str, Any]:
     for camera in footage.cameras:
         own: list[Any] = [camera.source(camera.timesteps[0]), file_state(camera.frames.files)]
         if camera.undistortion is not None:
-            pinhole = camera.camera
-            intrinsics = pinhole.fl_x, pinhole.fl_y, pinhole.cx, pinhole.cy
-            own += [repr(camera.undistortion.lens), *intrinsics]
+            own += [repr(camera.undistortion.lens), *camera.camera.intrinsics[2:]]
         cameras[camera.name] = own
     timesteps = list(footage.timesteps)
     return {"footage": str(footage.root), "cameras": cameras, "timesteps": timesteps}

@@ -238,7 +238,7 @@ def with_mesh(
     """The mesh over the picture, colored by the direction of its surface."""
     triangle, weights = rasterize(vertices, faces, camera)
     seen = triangle >= 0
-    normals = vertex_normals(vertices, faces) @ camera.world_to_camera[:3, :3].T
+    normals = vertex_normals(vertices, faces) @ camera.rotation.T
     smooth = (normals[faces[triangle[seen]]] * weights[seen][..., None]).sum(axis=1)
     colors = 127.5 * (1 + smooth * [1, -1, -1])
     drawn = picture.astype(np.float64)

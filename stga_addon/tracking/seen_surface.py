@@ -182,8 +182,8 @@ def _patch_levels(
     """Levels (M, D, P) of patches (M, P, 3) moved along their normals by offsets (D,)."""
     import cv2
 
-    turn = camera.world_to_camera[:3, :3]
-    local = (patches @ turn.T + camera.world_to_camera[:3, 3]).astype(np.float32)
+    turn = camera.rotation
+    local = (patches @ turn.T + camera.translation).astype(np.float32)
     moved = offsets[None, :, None] * (normals @ turn.T).astype(np.float32)[:, None, :]  # (M, D, 3)
     x, y, depth = (local[:, None, :, axis] + moved[..., axis : axis + 1] for axis in range(3))
     x = x / depth * np.float32(camera.fl_x) + np.float32(camera.cx - 0.5)

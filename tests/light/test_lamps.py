@@ -1,4 +1,4 @@
-"""Irradiance of lights against closed forms, shadows against cast rays, NumPy against Numba."""
+"""Irradiance of lights against closed forms, shadows against cast rays and single lookups."""
 
 import os
 import subprocess
@@ -14,7 +14,7 @@ from stga_addon.capture.mesh_geometry import vertex_normals
 from stga_addon.light import array_kernels, lamps
 from stga_addon.light.lamps import LIFT_M, Lamps, ShadowMap, head_bounds, light_rows, light_view
 from stga_addon.light.values import Caster, Light, Lighting
-from stga_addon.raster.cpu import shade, shadow
+from stga_addon.raster.cpu import shadow
 from stga_addon.raster.kernel_cache import prefers_numba
 from stga_addon.worker.launch import CACHE_VARIABLE
 
@@ -93,7 +93,7 @@ LIGHTS = (
     Light("point", np.ones(3), (0.3, 0.8, 0.2), radius=0.1, specular=0.5),
     Light(
         "spot",
-        np.ones(3) * 5,
+        np.ones(3) * 50,
         (0.0, 0.9, 0.2),
         direction=(0.1, -1, 0),
         cone=0.3,
@@ -135,31 +135,77 @@ def test_compiled_kernels_are_used(tmp_path, monkeypatch):
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
     monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path / "cache"))
     monkeypatch.setattr(lamps, "prefers_numba", prefers_numba.__wrapped__)
-    assert lamps.kernels("shade") is array_kernels
+    assert lamps.depth_kernel() is array_kernels.add_depths
     (tmp_path / "cpu_0").mkdir()
     (tmp_path / "cpu_0/image_loss.image_loss-10.py311.nbi").touch()
-    assert lamps.kernels("shade") is shade
-    assert lamps.kernels("shadow") is shadow
+    assert lamps.depth_kernel() is shadow.add_depths
     monkeypatch.setattr("stga_addon.raster.kernel_cache.find_spec", lambda name: None)
-    assert lamps.kernels("shade") is array_kernels
+    assert lamps.depth_kernel() is array_kernels.add_depths
 
 
-def test_lights():
-    """Catches a light that Blender's Python computes otherwise than training's."""
+def unit(vector):
+    return vector / np.linalg.norm(vector)
+
+
+def glossy(normal, to_light, to_eye, square):
+    """A GGX lobe times the cosine of the light: Walter et al. 2007, equation 33; Heitz 2014,
+    equation 99."""
+    half = unit(to_light + to_eye)
+    cosine = np.clip(normal @ half, 1e-6, 1)
+    tangent = np.tan(np.arccos(cosine))
+    distribution = square / (np.pi * cosine**4 * (square + tangent**2) ** 2)
+    eye = max(normal @ to_eye, 0.05)
+    cosines = np.array([normal @ to_light, eye])
+    hidden = (np.sqrt(1 + square * (1 / cosines**2 - 1)) - 1) / 2
+    fresnel = 0.04 + 0.96 * (1 - to_eye @ half) ** 5
+    return distribution * fresnel / (1 + hidden.sum()) / (4 * eye)
+
+
+def arriving(light, place, point):
+    """Unit vector to a light, and its strength without shadows; a disk's or square's place."""
+    if light.kind == "sun":
+        return -unit(np.array(light.direction)), 1.0, np.tan(light.angle / 2)
+    away = place - point
+    distance = np.linalg.norm(away)
+    strength = 1 / (np.pi if light.kind == "area" else 4 * np.pi) / distance**2
+    along = -(away / distance) @ unit(np.array(light.direction))
+    if light.kind == "area":
+        strength *= max(along, 0)
+    elif light.kind == "spot":
+        edge = np.cos(light.cone / 2)
+        inside = np.clip((along - edge) / ((1 - edge) * light.blend), 0, 1)
+        strength *= 3 * inside**2 - 2 * inside**3
+    return away / distance, strength, light.radius / distance
+
+
+@pytest.mark.parametrize("light", LIGHTS, ids=[light.kind for light in LIGHTS])
+def test_lights(light):
+    """Catches a cosine, factor or shadow that a light's irradiance or highlight lacks."""
     rng = np.random.default_rng(0)
-    points = rng.normal(0, 0.1, (500, 3)).astype(np.float32)
-    normals = rng.normal(0, 1, points.shape)
-    normals = (normals / np.linalg.norm(normals, axis=1, keepdims=True)).astype(np.float32)
-    rows = [light_rows(light, np.zeros(3), n - 1) for n, light in enumerate(LIGHTS)]
-    table = np.concatenate(rows)
-    lit = rng.random((3, 500), np.float32)
-    roughness = rng.choice(np.float32([0, 0.2, 0.45]), 500)
-    rest = np.float32([0.1, 0.2, 0.7]), roughness, np.full(500, 0.04, np.float32), table, lit
-    found = [np.zeros((4, 500, 3), np.float32)[:2] for _ in range(2)]
-    for arrays, add in zip(found, (shade.add_lights, array_kernels.add_lights), strict=True):
-        add(points, normals, *rest, *arrays)
-    assert found[0].max() > 0.5
-    assert_allclose(found[1], found[0], rtol=2e-3, atol=2e-5)
+    points = rng.normal(0, 0.1, (60, 3))
+    normals = np.stack([unit(row) for row in rng.normal(0, 1, points.shape)])
+    rows = light_rows(light, np.zeros(3), 0)
+    lit = rng.random((1, 60), np.float32)
+    roughness = rng.choice([0, 0.2, 0.45], 60)
+    eye = np.array([0.1, 0.2, 0.7])
+    given = array_kernels.Surface(*(np.float32(each) for each in (points, normals, roughness)))
+    found = array_kernels.shaded(given, np.float32(eye), 0.04, rows, lit)
+    expected = np.zeros((2, 60, 3))
+    for n, (point, normal) in enumerate(zip(points, normals, strict=True)):
+        for row in rows.astype(float):
+            to_light, strength, width = arriving(light, row[1:4], point)
+            width = row[15] / np.linalg.norm(row[1:4] - point) if light.kind == "area" else width
+            facing = max(normal @ to_light, 0)
+            irradiance = light.color / len(rows) * strength * lit[0, n] * facing
+            expected[0, n] += light.diffuse * irradiance
+            if roughness[n] and facing:
+                square = min(roughness[n] ** 4 + width**2 / 8, 1)
+                gloss = glossy(normal, to_light, unit(eye - point), square) / facing
+                expected[1, n] += light.specular * irradiance * gloss
+    assert expected[0].max() > 0.02
+    assert expected[1].max() > 1e-4
+    for each, known in zip(found, expected, strict=True):
+        assert_allclose(each, known, rtol=2e-3, atol=2e-3 * known.max())
 
 
 @pytest.mark.parametrize("light", LIGHTS[:2], ids=["sun", "point"])
@@ -177,9 +223,25 @@ def test_shadow_maps(light):
     outside = np.float32([[-1e6, -1e6, 0.1], [300, 128, 0.1], [0.2, 0.1, 5]])
     places = np.concatenate([points, outside])
     bias = np.random.default_rng(0).uniform(0, 0.006, len(places)).astype(np.float32)
-    for step in (0.0, 1.0, 2.0):
-        lit = [np.empty(len(places), np.float32) for _ in range(2)]
-        for one, kernels in zip(lit, (shadow, array_kernels), strict=True):
-            kernels.lit_fractions(depth[0], places, bias, np.float32(step), one)
-        assert 0.05 < lit[0].mean() < 0.95
-        assert_allclose(lit[1], lit[0], atol=1e-5)
+    for reach in (0, 1, 2):
+        taps = (-reach, 0, reach) if reach else (0,)
+        shifts = [(x, y) for x in taps for y in taps]
+        expected = [looked_up(depth[0], places + np.array([x, y, 0]), bias) for x, y in shifts]
+        lit = array_kernels.lit_fractions(depth[0], places, bias, reach)
+        assert 0.05 < lit.mean() < 0.95
+        assert_allclose(lit, np.mean(expected, axis=0), atol=1e-4)
+
+
+def looked_up(depth, places, bias):
+    """Fraction of four texels around each place that are no nearer, by bilinear weights."""
+    corner = np.floor(places[:, :2] - 0.5)
+    x, y = (places[:, :2] - 0.5 - corner).T
+    found = np.zeros(len(places))
+    for right in (0, 1):
+        for lower in (0, 1):
+            column, row = (corner + np.array([right, lower])).T
+            inside = (column >= 0) & (row >= 0) & (column < len(depth)) & (row < len(depth))
+            texel = [np.where(inside, axis, 0).astype(int) for axis in (row, column)]
+            is_lit = ~inside | (places[:, 2] - bias <= depth[tuple(texel)])
+            found += is_lit * abs(1 - right - x) * abs(1 - lower - y)
+    return found

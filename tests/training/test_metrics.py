@@ -25,7 +25,6 @@ from stga_addon.training.evaluate.metrics import (
     MIN_WEIGHT_PX,
     EvaluationView,
     Residuals,
-    choose_evaluation_views,
     detail_difference,
     evaluate,
     evaluate_avatar,
@@ -36,6 +35,7 @@ from stga_addon.training.evaluate.metrics import (
     visible_pixels,
 )
 from stga_addon.training.optimize.image_preparation import image_preparation
+from stga_addon.training.run.continuation import grouped_evaluation_views
 from stga_addon.training.run.metrics_log import read_metrics
 from stga_addon.training.run.session import train_run
 
@@ -197,15 +197,24 @@ def test_nothing_is_fitted_where_the_exposure_is_known():
     assert other.regions["mask"].psnr > plain.regions["mask"].psnr + 20
 
 
-def test_evaluation_views_are_evenly_spread(toy):
+def test_evaluation_views_are_evenly_spread(toy, monkeypatch):
     """Catches evaluations that cost too much, or look at one end of the sequence."""
+    monkeypatch.setattr(
+        "stga_addon.training.evaluate.metrics.read_evaluation_view",
+        lambda capture, view, *rest: EvaluationView(view, np.zeros(0)),
+    )
+
+    def chosen_of(capture):
+        run = run_of(capture)
+        return [own.view for own in grouped_evaluation_views(run, capture, None)]
+
     view = toy.views["val"][0]
     many = tuple(replace(view, timestep=t) for t in range(100))
-    chosen = [v.timestep for v in choose_evaluation_views(replace(toy, views={"val": many}))]
+    chosen = [v.timestep for v in chosen_of(replace(toy, views={"val": many}))]
     assert len(chosen) == MAX_EVALUATION_VIEWS
     assert (chosen[0], chosen[-1]) == (0, 99)
     assert set(np.diff(chosen)) <= {6, 7}
-    assert list(choose_evaluation_views(toy)) == list(toy.views["val"])
+    assert chosen_of(toy) == list(toy.views["val"])
 
 
 def test_regions_of_a_view(toy, tmp_path):

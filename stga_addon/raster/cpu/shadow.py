@@ -1,11 +1,10 @@
-"""Depth maps of triangles as a light sees them, and which points they leave lit."""
+"""Depth maps of triangles as a light sees them."""
 
 import math
 
 import numpy as np
 
 from . import jit
-from .threads import call_helpers, parallel, pieces
 
 ZERO = np.float32(0.0)
 ONE = np.float32(1.0)
@@ -60,37 +59,3 @@ def add_depths(points, faces, depth):
                 z = az + u * bz + v * cz
                 is_nearer = (u >= ZERO) & (v >= ZERO) & (u + v <= ONE) & (z < row[x])
                 row[x] = z if is_nearer else row[x]
-
-
-@parallel(lambda depth, points, *_: len(points), piece=256)
-def lit_fractions(work, depth, points, bias, step, lit):
-    """Write lit (N,) float32: fraction 0…1 of the depth map's texels around each point that do not
-    block it.
-
-    points (N, 3) as in `add_depths`. bias (N,): depth by which a texel must be nearer to block.
-    step: texels between the 3 × 3 places that are looked up bilinearly around a point; 0: one
-    place.
-    """
-    call_helpers(work)
-    size = len(depth)
-    reach = 1 if step > 0 else 0
-    for begin, end in pieces(work):
-        for n in range(begin, end):
-            found = ZERO
-            z = points[n, 2] - bias[n]
-            for across in range(-reach, reach + 1):
-                for down in range(-reach, reach + 1):
-                    x = points[n, 0] - HALF + np.float32(across) * step
-                    y = points[n, 1] - HALF + np.float32(down) * step
-                    left = math.floor(x)
-                    top = math.floor(y)
-                    right_fraction = x - np.float32(left)
-                    lower_fraction = y - np.float32(top)
-                    for k in range(4):
-                        column = int(left) + (k & 1)
-                        row = int(top) + (k >> 1)
-                        outside = column < 0 or row < 0 or column >= size or row >= size
-                        if outside or z <= depth[row, column]:
-                            weight = right_fraction if k & 1 else ONE - right_fraction
-                            found += weight * (lower_fraction if k >> 1 else ONE - lower_fraction)
-            lit[n] = found / np.float32((2 * reach + 1) ** 2)

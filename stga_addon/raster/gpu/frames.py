@@ -78,11 +78,9 @@ class Embedding:
             parts[:, 3:] = local - parts[:, :3]
             self._device.upload("vertices", parts)
             self._uploaded = vertices
-        turn = camera.world_to_camera[:3, :3]
-        shift = camera.world_to_camera[:3, 3]
         self._device.uniform(
             "Pose",
-            rows=np.c_[turn, turn @ center + shift],
+            rows=np.c_[camera.rotation, camera.rotation @ center + camera.translation],
             triangles=self._count,
             follows=self._follows,
             area_scales=self._area_scales,

@@ -209,7 +209,7 @@ class Rasterizer:
         not the world; first: row of the splats in the tables of projected ones.
         """
         camera = options.camera
-        to_world = camera.world_to_camera[:3, :3].T if to_world is None else to_world
+        to_world = camera.rotation.T if to_world is None else to_world
         columns, rows = tile_grid(camera.width, camera.height)
         return self.device.uniform(
             "View",

@@ -510,9 +510,7 @@ def _listed_cameras(
         raise StgaError(f"{calibration}: none of its frames are in the chosen range")
     groups: dict[object, list[Shot]] = {}
     for shot in shots:
-        camera = shot.camera
-        intrinsics = camera.width, camera.height, camera.fl_x, camera.fl_y, camera.cx, camera.cy
-        identity = shot.camera_name, intrinsics, _pose(shot), shot.lens
+        identity = shot.camera_name, shot.camera.intrinsics, _pose(shot), shot.lens
         groups.setdefault(identity, []).append(shot)
     names = [group[0].camera_name or group[0].label for group in groups.values()]
     cameras: list[tuple[FootageCamera, tuple[str, ...]]] = []

@@ -233,14 +233,12 @@ def world(facts: CaptureFacts) -> Verdict:
     if spread <= MAX_BACKGROUND_SPREAD_LEVELS:
         return Verdict(False, "what lies behind the person is of one color", fixed=True)
     # which have another pose or lens in some view than in their first
-    names = ("width", "height", "fl_x", "fl_y", "cx", "cy", "world_to_camera")
     first: dict[int, Camera] = {}
     moving = set()
     for view in facts.views:
         known = first.setdefault(view.camera_index, view.camera)
-        own = view.camera
-        pairs = [(getattr(known, name), getattr(own, name)) for name in names]
-        if known is not own and not all(np.allclose(*pair, atol=1e-6) for pair in pairs):
+        both = [(*own.intrinsics, *own.world_to_camera.ravel()) for own in (known, view.camera)]
+        if known is not view.camera and not np.allclose(*both, atol=1e-6):
             moving.add(view.camera_index)
     if moving:
         return Verdict(False, f"{len(moving)} of {facts.cameras} cameras move", fixed=True)

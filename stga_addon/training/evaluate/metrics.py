@@ -19,7 +19,7 @@ from ...avatar.splats import SH_C0, Splats
 from ...capture.images import read_image, read_mask, read_view
 from ...capture.loader import Preparation
 from ...capture.mesh_geometry import rasterize
-from ...capture.model import Capture, View, ViewExposure, evenly_spread
+from ...capture.model import Capture, View, ViewExposure
 from ...raster.cpu.layout import Parameters
 from ...raster.cpu.rasterize import BufferPool, frames_in_camera, render_backward, render_forward
 from ...raster.posed_splats import PosedSplats
@@ -69,11 +69,6 @@ class EvaluationView:
     regions: Mapping[str, np.ndarray] = field(default_factory=dict)
     interior: np.ndarray | None = None
     group: str = ""
-
-
-def choose_evaluation_views(capture: Capture) -> Sequence[View]:
-    """At most MAX_EVALUATION_VIEWS of the held-out views, evenly spread: those of a training."""
-    return evenly_spread(capture.views.get("val", ()), MAX_EVALUATION_VIEWS)
 
 
 def read_evaluation_view(

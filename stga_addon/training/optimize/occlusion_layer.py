@@ -9,8 +9,6 @@ from scipy.spatial import cKDTree
 from ...avatar.embedding import face_areas, face_frames
 from ...avatar.lattice import NORMAL_AXIS
 from ...capture.mesh_geometry import vertex_normals
-from ...capture.model import Capture
-from .initial_splats import voxel_size
 from .semantic_regions import (
     CHIN_LEVEL,
     TORSO_HEIGHT,
@@ -82,17 +80,15 @@ def occlusion_layer(surface: Surface, sides: UnseenSides) -> OcclusionLayer:
     not at all, but for ears and the parts of the face: at the least depth that masks allow, in the
     off-axis color. Behind the front of a torso that has no back: a round one in the median color
     of its height."""
-    capture = surface.capture
-    faces = capture.faces
-    neutral = np.asarray(capture.neutral, np.float64)
+    faces = surface.capture.faces
     at = surface.at
     if at is None or not surface.has_few_cameras:
-        return OcclusionLayer(np.zeros(len(faces), bool), neutral, sides.off_axis)
+        return OcclusionLayer(np.zeros(len(faces), bool), surface.neutral, sides.off_axis)
     front, back, median_color = _back(surface, at, sides.color)
-    of_back = np.zeros(len(neutral), bool)
+    of_back = np.zeros(len(back), bool)
     of_back[faces[front]] = True
     grazed, behind = _behind_sides(surface, at, ~of_back[faces].any(1))
-    centers = neutral[faces].mean(1)
+    centers = surface.centers
     color = sides.off_axis.copy()
     color[front] = median_color
     skin = np.flatnonzero(grazed & ~sides.is_hair & ~surface.kinds["body"])
@@ -111,13 +107,12 @@ def _behind_sides(
     not make opaque what a collar or a fold hides from the cameras. And the neutral vertices (V, 3),
     moved inside the head until masks cover them."""
     faces = surface.capture.faces
-    neutral = np.asarray(surface.capture.neutral, np.float64)
-    voxel = voxel_size(neutral)
+    neutral = surface.neutral
     allowed = allowed & surface.outside & skin_of(surface.capture) & ~ears_of(at)
     grazed = allowed & _grazed(surface, at)
     clothes = allowed & surface.kinds["body"] & _is_off_border(surface) & ~grazed
     rows = np.flatnonzero(grazed | clothes)
-    depths = voxel * DEPTH_VOXELS * np.arange(1, MAX_DEPTHS + 1)
+    depths = surface.voxel * DEPTH_VOXELS * np.arange(1, MAX_DEPTHS + 1)
     offsets = np.zeros((len(rows), len(depths), 3))
     offsets[:, :, NORMAL_AXIS["stga"]] = -depths
     fits = ~surface.beside_masks(rows, offsets, -MARGIN_FRACTION)
@@ -126,7 +121,7 @@ def _behind_sides(
     deepest = np.zeros(len(neutral))
     np.maximum.at(deepest, faces[rows], depths[fits.argmax(1), None])
     rows = rows[fits.any(1)]
-    cells = np.floor(neutral[faces[rows]].mean(1) / (CELL_VOXELS * voxel))
+    cells = np.floor(surface.centers[rows] / (CELL_VOXELS * surface.voxel))
     _, first = np.unique(cells, axis=0, return_index=True)
     chosen = np.zeros(len(faces), bool)
     chosen[rows[first]] = True
@@ -136,9 +131,8 @@ def _behind_sides(
 def _reaches_beside(surface: Surface, rows: np.ndarray, offsets: np.ndarray) -> np.ndarray:
     """(N, K) bool: whether a splat at one of the offsets (N, K, 3), as `beside_masks` has them,
     would show beside masks."""
-    neutral = np.asarray(surface.capture.neutral, np.float64)
-    area = face_areas(neutral, surface.capture.faces[rows])
-    size = np.maximum(np.sqrt(2 * area), CELL_VOXELS * voxel_size(neutral))
+    area = face_areas(surface.neutral, surface.capture.faces[rows])
+    size = np.maximum(np.sqrt(2 * area), CELL_VOXELS * surface.voxel)
     plane = np.delete(np.eye(3), NORMAL_AXIS["stga"], axis=0)
     reach = SPLAT_REACH * size[:, None, None] * np.concatenate([plane, -plane])
     ends = [offsets + end[:, None] for end in reach.swapaxes(0, 1)]
@@ -153,19 +147,17 @@ def _grazed(surface: Surface, at: HeadCoordinates) -> np.ndarray:
     if surface.filmed_along is not None:
         limit = ONE_DIRECTION_COSINE
         angle_deg = ONE_DIRECTION_FACE_ANGLE_DEG
-    beside = np.degrees(np.abs(at.azimuth)) > angle_deg
+    beside = at.angle_deg > angle_deg
     beside |= surface.kinds["scalp"] | surface.kinds["body"]
     return np.asarray(beside & (surface.facing < limit) & (at.level > CHIN_LEVEL))
 
 
 def _is_off_border(surface: Surface) -> np.ndarray:
     """(F,) bool: triangles that lie farther than BORDER_CELLS from the mesh's edge."""
-    neutral = np.asarray(surface.capture.neutral, np.float64)
-    centers = neutral[surface.capture.faces].mean(1)
     if not surface.border.any():
-        return np.ones(len(centers), bool)
-    distance, _ = cKDTree(centers[surface.border]).query(centers)
-    return np.asarray(distance > BORDER_CELLS * CELL_VOXELS * voxel_size(neutral))
+        return np.ones(len(surface.border), bool)
+    distance, _ = cKDTree(surface.centers[surface.border]).query(surface.centers)
+    return np.asarray(distance > BORDER_CELLS * CELL_VOXELS * surface.voxel)
 
 
 def _open_front(surface: Surface, at: HeadCoordinates) -> np.ndarray:
@@ -188,11 +180,11 @@ def _back(
     neutral vertices (V, 3), those of the front moved into the back; the back's colors (M, 3) behind
     these triangles. color (F, 3): of the front."""
     faces = surface.capture.faces
-    neutral = np.asarray(surface.capture.neutral, np.float64)
+    neutral = surface.neutral
     front = _open_front(surface, at)
     if not front.any():
         return front, neutral, color[front]
-    places, median_color = _round_back(surface.capture, at, front, color)
+    places, median_color = _round_back(surface, at, front, color)
     rows = np.flatnonzero(front)
     turned = face_frames(neutral, faces, neutral, "stga").rotation[rows]
     there = face_frames(places, faces, places, "stga")
@@ -201,7 +193,7 @@ def _back(
     reach = SPLAT_REACH * size * np.concatenate([plane, -plane], axis=1)
     center = there.origin[rows, None]
     points = np.concatenate([center, center + reach], axis=1)
-    away = points - neutral[faces[rows]].mean(1, keepdims=True)
+    away = points - surface.centers[rows, None]
     offsets = np.einsum("nji,nkj->nki", turned, away)
     fits = ~surface.beside_masks(rows, offsets[:, :1], -BACK_MARGIN_FRACTION)[:, 0]
     fits &= ~surface.beside_masks(rows, offsets[:, 1:]).any(1)
@@ -210,16 +202,16 @@ def _back(
 
 
 def _round_back(
-    capture: Capture, at: HeadCoordinates, front: np.ndarray, color: np.ndarray
+    surface: Surface, at: HeadCoordinates, front: np.ndarray, color: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """The neutral vertices (V, 3), those of the triangles `front` (F,) bool moved into the back of
     an elliptic torso as wide as these; at each of these triangles' heights, the median color (M, 3)
     of the front's sides, of colors (F, 3)."""
     across, up, ahead = at.axes
     reach_m = BACK_LEVELS * at.unit
-    places = np.array(capture.neutral, np.float64)
-    vertices = np.unique(capture.faces[front])
-    triangles = places[capture.faces[front]].mean(1) - at.eyes
+    places = surface.neutral.copy()
+    vertices = np.unique(surface.capture.faces[front])
+    triangles = surface.centers[front] - at.eyes
     width = triangles @ across
     level = triangles @ up
 
@@ -234,7 +226,7 @@ def _round_back(
         _, middle, half = around(y)
         beside = min(abs(x - middle) / half, 1)
         behind[row] = BACK_FRACTION * half * np.sqrt(1 - beside**2)
-    behind += BACK_GAP_VOXELS * voxel_size(places)
+    behind += BACK_GAP_VOXELS * surface.voxel
     places[vertices] -= behind[:, None] * ahead
     median_color = np.empty((len(level), 3))
     for row, y in enumerate(level):

@@ -111,6 +111,11 @@ class HeadCoordinates:
     middle: np.ndarray
     axes: np.ndarray
 
+    @property
+    def angle_deg(self) -> np.ndarray:
+        """(F,) from straight ahead, to either side."""
+        return np.asarray(np.degrees(np.abs(self.azimuth)))
+
 
 def head_coordinates(capture: Capture) -> HeadCoordinates | None:
     """None for a mesh whose eyes and mouth are not known, or not apart."""
@@ -136,14 +141,13 @@ def head_coordinates(capture: Capture) -> HeadCoordinates | None:
 
 def ears_of(at: HeadCoordinates) -> np.ndarray:
     """(F,) bool: triangles of ears."""
-    angle = np.degrees(np.abs(at.azimuth))
-    ear = (at.side > EAR_SIDE) & (abs(angle - EAR_ANGLE_DEG) < EAR_WIDTH_DEG)
+    ear = (at.side > EAR_SIDE) & (abs(at.angle_deg - EAR_ANGLE_DEG) < EAR_WIDTH_DEG)
     return np.asarray(ear & (abs(at.level - EAR_LEVEL) < EAR_HEIGHT))
 
 
 def face_of(at: HeadCoordinates) -> np.ndarray:
     """(F,) bool: triangles between brows and neck, ahead of the ears."""
-    ahead = np.degrees(np.abs(at.azimuth)) < NECK_ANGLE_DEG
+    ahead = at.angle_deg < NECK_ANGLE_DEG
     return np.asarray(ahead & (at.level < BROWS_LEVEL) & (at.level > CHIN_LEVEL))
 
 
@@ -152,7 +156,7 @@ def kinds_of(
 ) -> dict[str, np.ndarray]:
     """Kind -> (F,) bool: "scalp", which includes the back of a neck that long hair hides, and
     "body", neck and shoulders. Unseen parts of each kind look like visible ones of it."""
-    angle = np.degrees(np.abs(at.azimuth))
+    angle = at.angle_deg
     elevation = np.degrees(at.elevation)
     ear = ears_of(at)
     hairline = np.interp(angle, HAIRLINE_DEG, LONG_HAIRLINE if has_long_hair else HAIRLINE)
@@ -167,7 +171,7 @@ def kinds_of(
 def hanging_fraction(at: HeadCoordinates) -> np.ndarray:
     """(F,) fraction of its full distance from the neck that long hair has: 0 at the hairline and
     beside the neck, 1 behind it and further down."""
-    angle = np.degrees(np.abs(at.azimuth))
+    angle = at.angle_deg
     below = np.interp(angle, HAIRLINE_DEG, HAIRLINE) - at.level
     behind = np.interp(angle, HANGING_DEG, (0, 1))
     return np.asarray(behind * np.clip(below / HANGING_RISE, 0, 1))

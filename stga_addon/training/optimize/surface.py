@@ -107,6 +107,9 @@ class Surface:
 
     def __init__(self, capture: Capture) -> None:
         self.capture = capture
+        self.neutral = np.asarray(capture.neutral, np.float64)
+        self.centers = self.neutral[capture.faces].mean(1)
+        self.voxel = voxel_size(self.neutral)
 
     @cached_property
     def at(self) -> HeadCoordinates | None:
@@ -141,7 +144,7 @@ class Surface:
     def seen_from(self, direction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """(F,) bool: triangles of the neutral mesh that a camera in this direction (3,) from its
         middle sees; (F,) cosine of the angle at which they face it."""
-        neutral = np.asarray(self.capture.neutral, np.float64)
+        neutral = self.neutral
         center = neutral.mean(0)
         radius = max(float(np.linalg.norm(neutral - center, axis=1).max()), 1e-9)
         corners = neutral[self.capture.faces]
@@ -283,7 +286,7 @@ class Surface:
         if self.capture.flame is None:
             return found
         model = self.capture.flame.model
-        neutral = np.asarray(self.capture.neutral, np.float64)
+        neutral = self.neutral
         for name in BLINKS:
             if name not in model.expression_names:
                 continue
@@ -331,7 +334,7 @@ class Surface:
         measured = scalp[self._is_measured[scalp]] if len(scalp) else scalp
         if not len(measured):
             return height
-        center = np.asarray(self.capture.neutral, np.float64)[self.capture.faces].mean(1)
+        center = self.centers
         sources = np.concatenate([center[measured], mirrored(center)[measured]])
         near = measured[nearest_rows(sources, center[scalp], AROUND) % len(measured)]
         height[scalp] = np.median(self._measured_height[near], axis=1)
@@ -356,13 +359,11 @@ class Surface:
         and arms that images show there are elsewhere."""
         if self.at is None or not self.has_few_cameras:
             return self.hidden
-        voxel = voxel_size(np.asarray(self.capture.neutral))
         bare = self.outside & ~self._scalp
-        stands = self._is_measured & (self._measured_height > STANDING_VOXELS * voxel)
+        stands = self._is_measured & (self._measured_height > STANDING_VOXELS * self.voxel)
         if stands.any():
-            center = np.asarray(self.capture.neutral, np.float64)[self.capture.faces].mean(1)
-            distance, _ = cKDTree(center[stands]).query(center)
-            bare &= distance > STANDING_REACH_VOXELS * voxel
+            distance, _ = cKDTree(self.centers[stands]).query(self.centers)
+            bare &= distance > STANDING_REACH_VOXELS * self.voxel
         if self.capture.flame is not None:
             torso = torso_faces(self.capture.flame.model)
             sticking = np.count_nonzero(self.sticks_out & torso)
@@ -417,20 +418,19 @@ class Surface:
     def _heights_in(self, view: View, mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Triangles in the outline of one view, and how high its mask reaches above them."""
         capture = self.capture
-        voxel = voxel_size(np.asarray(capture.neutral))
         center, normal = _centers_and_normals(capture, view.timestep)
         cosine = facing(view.camera, center, normal)
         rows = np.flatnonzero(self.outside & (np.abs(cosine) < OUTLINE_COSINE))
         if not len(rows):
             return np.zeros(0, int), np.zeros(0)
-        heights = np.arange(MAX_HEIGHT_VOXELS * STEPS_PER_VOXEL + 1) * voxel / STEPS_PER_VOXEL
+        heights = np.arange(MAX_HEIGHT_VOXELS * STEPS_PER_VOXEL + 1) * self.voxel / STEPS_PER_VOXEL
         points = center[rows, None] + heights[:, None] * normal[rows, None]
         camera = view.camera
         column, row, within = pixels_of(points.reshape(-1, 3), camera)
         shape = len(rows), len(heights)
         covered = silhouette(capture.mesh(view.timestep), capture.faces[cosine > 0], camera)
         beside = (within & ~binary_dilation(covered)[row, column]).reshape(shape)
-        is_outline = beside[:, heights <= OUTLINE_VOXELS * voxel].any(1) & beside[:, -1]
+        is_outline = beside[:, heights <= OUTLINE_VOXELS * self.voxel].any(1) & beside[:, -1]
         is_outline &= within.reshape(shape).all(1)
         is_foreground = (within & (mask > 127)[row, column]).reshape(shape)
         steps = np.maximum(np.cumprod(is_foreground, axis=1).sum(1) - 1, 0)

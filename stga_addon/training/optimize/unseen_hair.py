@@ -154,7 +154,7 @@ class UnseenHair:
     def _surface(self) -> np.ndarray:
         """(V, 3) the neutral mesh, where strands grow moved to the middle of the layer."""
         frames = self._frames
-        neutral = np.asarray(frames.capture.neutral, np.float64)
+        neutral = frames.surface.neutral
         own = frames.capture.faces[self.has_strands]
         uses = np.maximum(np.bincount(own.ravel(), minlength=len(neutral)), 1)
         of_triangles = (frames.layer_height * frames.unit_lengths)[self.has_strands]

@@ -186,8 +186,7 @@ def _hair(
     if not len(rows):
         rows = _fringe(at, surface.outside & has_pixels & (surface.facing > FRINGE_COSINE))
     is_skin = is_source & ~scalp & ~surface.kinds["body"] & (at.level < BROWS_LEVEL)
-    centers = np.asarray(surface.capture.neutral)[surface.capture.faces].mean(1)
-    return hairy_triangles(rows, centers, color, color[is_skin])
+    return hairy_triangles(rows, surface.centers, color, color[is_skin])
 
 
 class _Sides:
@@ -199,7 +198,7 @@ class _Sides:
         capture = surface.capture
         self._capture = capture
         self._color = color
-        self.centers = np.asarray(capture.neutral, np.float64)[capture.faces].mean(1)
+        self.centers = surface.centers
         self.of_face = np.zeros_like(well_shown)
         if surface.at is not None:
             self.of_face = ~surface.kinds["scalp"] & ~surface.kinds["body"]

@@ -119,8 +119,8 @@ def continued_settings(
 def grouped_evaluation_views(
     run: Run, capture: Capture, region: np.ndarray | None
 ) -> list[EvaluationView]:
-    """Evaluation views of a run of several takes or one that continues another, in groups: by take,
-    or frames that are refined and others.
+    """At most MAX_EVALUATION_VIEWS of the held-out views, evenly spread; of a run of several takes,
+    or one that continues another, in groups: by take, or frames that are refined and others.
 
     region (F,) bool: its visible pixels become the views' region "region"; None but for a
     refinement.

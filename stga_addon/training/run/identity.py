@@ -65,7 +65,7 @@ def identity_of(capture: Capture, principal_point: str, settings: TrainingSettin
     ]
     lenses = [view.camera for _, view in views]
     poses = np.array([lens.world_to_camera for lens in lenses], np.float64).reshape(-1, 16)
-    intrinsics = [(lens.fl_x, lens.fl_y, lens.cx, lens.cy) for lens in lenses]
+    intrinsics = [lens.intrinsics[2:] for lens in lenses]
     return RunIdentity(
         principal_point,
         f"{len(cameras)} cameras, {len(timesteps)} timesteps",

@@ -187,10 +187,7 @@ def _fit_rotation(run: Path, root: Path) -> np.ndarray | None:
     trained = cameras_of(open_run(run).capture)
     if set(cameras) != set(trained):
         return None
-    rotations = [
-        trained[index].world_to_camera[:3, :3].T @ camera.world_to_camera[:3, :3]
-        for index, camera in cameras.items()
-    ]
+    rotations = [trained[index].rotation.T @ camera.rotation for index, camera in cameras.items()]
     rotation = Rotation.from_matrix(rotations).mean().as_matrix()
     avatar = read_avatar(run / AVATAR)
     errors = []

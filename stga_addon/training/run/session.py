@@ -760,15 +760,7 @@ def _session(
         report(Progress(stage="Measuring strain"))
     strain_range = checkpoints.strain_range_of(folder, capture, run)
     trainer = Trainer(capture, settings, selection, Start(state, strain_range), run.device)
-    if run.continuation is not None or run.takes:
-        views = grouped_evaluation_views(run, capture, trainer.strategy.region)
-    else:
-        background = settings.background
-        backdrop = settings.backdrop
-        views = [
-            metrics.read_evaluation_view(capture, view, background, backdrop)
-            for view in metrics.choose_evaluation_views(capture)
-        ]
+    views = grouped_evaluation_views(run, capture, trainer.strategy.region)
     rows = settings.exposure  # where images are corrected for it
     exposure = metrics.known_exposure(rows, capture.views["train"]) if rows else None
     evaluator = Evaluator(settings, views, exposure=exposure)
