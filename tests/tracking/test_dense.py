@@ -187,7 +187,7 @@ def test_a_short_take_is_left_to_landmarks_and_surface():
     assert fit_dense(None, take, Workers(Helpers(1))) is None
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_a_jaw_that_landmarks_leave_too_little_open_is_opened():
     """Catches tracking that follows landmarks where they fail: they leave the jaw open by two
     thirds. Three cameras 60 degrees apart, and a surface whose poses are worse."""

@@ -239,7 +239,7 @@ def test_skin_slides_as_dense_tracking_has_it(head, count, share):
     of three cameras follow the surface: the detector has the lower face 6 mm to one side, at each
     timestep another."""
     model = head.model
-    cameras = rig(count, 280)
+    cameras = rig(count, 200)
     places = places_on(head, 150)
     shape = np.zeros(model.n_identity)
     front = model.v_template[:, 2] > 0.04

@@ -17,8 +17,7 @@ from refusal import refusal
 from scipy.spatial.transform import Rotation
 
 from stga_addon.avatar.embedding import face_frames, frame_backward
-from stga_addon.avatar.file import Avatar, read_avatar
-from stga_addon.capture.images import read_view
+from stga_addon.avatar.file import read_avatar
 from stga_addon.capture.mesh_geometry import silhouette
 from stga_addon.capture.open import open_capture
 from stga_addon.files import read_npz, write_npz
@@ -36,7 +35,6 @@ from stga_addon.training.optimize import avatar_tracking
 from stga_addon.training.optimize.avatar_tracking import (
     OtherRecording,
     RefinedTracking,
-    TrainedAvatar,
     track_by_avatar,
     tracked_timesteps,
 )
@@ -47,41 +45,12 @@ from stga_addon.training.run.checkpoint import read_checkpoint, write_checkpoint
 from stga_addon.training.run.folder import read_run, with_refined_tracking
 from stga_addon.training.run.metrics_log import read_metrics
 from stga_addon.training.run.session import train_run
-from stga_addon.training.schedule import view_order
 
 from .heads import TIMESTEPS, parameters_of, tracked_as, write_head
 from .toys import assert_same_run, quick_settings, run_of, stop_at
 
 NAMES = ("origin", "rotation", "scale")
 WHITE = np.ones(3, np.float32)
-
-
-@pytest.fixture(scope="module")
-def lost(tmp_path_factory):
-    """Tracked a few millimeters and degrees off."""
-    return write_head(tmp_path_factory.mktemp("lost"))
-
-
-@pytest.fixture(scope="module")
-def right(tmp_path_factory):
-    return write_head(tmp_path_factory.mktemp("right"), error=0.0)
-
-
-@pytest.fixture(scope="module")
-def person(right):
-    """An avatar whose training saw the right meshes."""
-    capture = right[0]
-    settings = quick_settings("global", iterations=300, lattice=1, sh_degree=0, sh_steps=())
-    trainer = Trainer(capture, settings, {})
-    views = capture.views["train"]
-    ready = {view.name: read_view(view) for view in views}
-    for n, view in zip(range(300), view_order(views, 1, 0), strict=False):
-        small, image, mask = ready[view.name]
-        trainer.step(small, image, n / 300, mask)
-    neutral = capture.neutral.astype(np.float32)
-    splats = trainer.state.splats(averaged=True)
-    avatar = Avatar(splats, settings.convention, neutral, capture.faces)
-    return TrainedAvatar(avatar, settings)
 
 
 def millimeters(capture, true):

@@ -89,7 +89,7 @@ print(json.dumps([sum(kernel.stats.cache_hits.values()), len(kernel.signatures)]
 """
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.skipif((os.cpu_count() or 1) < 2, reason="needs two processors")
 def test_a_second_process_compiles_what_is_missing(tmp_path):
     """Catches a first start that waits for a second process and then compiles everything again, or

@@ -40,7 +40,7 @@ from stga_addon.training.run.recording import (
 from stga_addon.worker.helpers import Helpers
 
 from .heads import TIMESTEPS, parameters_of, tracked_as
-from .test_avatar_tracking import lost, millimeters, person, right  # noqa: F401
+from .test_avatar_tracking import millimeters
 from .toys import one_camera, quick_settings
 
 SCALE = 1.02
@@ -55,7 +55,7 @@ def ignore(done, total):
 
 
 @pytest.fixture
-def recording(tmp_path, lost, person):  # noqa: F811
+def recording(tmp_path, lost, person):
     """A run, and a capture that is darker, lit from a side, and in a world that is too large."""
     avatar, settings = person
     run = tmp_path / "run"
@@ -79,7 +79,8 @@ def recording(tmp_path, lost, person):  # noqa: F811
     return run, root
 
 
-def test_another_recording_is_tracked(recording, lost):  # noqa: F811
+@pytest.mark.nightly
+def test_another_recording_is_tracked(recording, lost):
     """Catches another exposure or light taken for a pose, a lost size, identity or offset."""
     run, root = recording
     before = json.loads((root / "transforms_train.json").read_text())["frames"]
@@ -107,7 +108,7 @@ def test_another_recording_is_tracked(recording, lost):  # noqa: F811
 
 
 @pytest.mark.parametrize(("light_turns", "keeps_world"), [(0, False), (1, False), (0, True)])
-def test_the_world_is_turned_as_the_avatars_was(light_turns, keeps_world, recording, lost, person):  # noqa: F811
+def test_the_world_is_turned_as_the_avatars_was(light_turns, keeps_world, recording, lost, person):
     """Catches colors that are looked up in other directions than training saw them from, a world
     turned though its light was too, or though it is kept, and heads that do not turn with it."""
     run, root = recording
@@ -191,7 +192,7 @@ def test_parts_of_another_avatar_are_not_taken(recording, tmp_path, monkeypatch)
         assert calls == expected
 
 
-def test_a_phone_is_one_camera_in_all_its_takes(lost, person, tmp_path):  # noqa: F811
+def test_a_phone_is_one_camera_in_all_its_takes(lost, person, tmp_path):
     """Catches an avatar of one phone that, extended by a second take, no longer tells the focal
     length of its camera and how the world is turned, and whose depth is left free."""
     first = lost[0]

@@ -1,7 +1,6 @@
 """TrainingSettings survive their trip through JSON and refuse what cannot be."""
 
 import dataclasses
-import math
 
 import pytest
 from refusal import refusal
@@ -31,20 +30,20 @@ def test_impossible_settings(arguments, message):
 
 
 REFUSED = {
-    "seconds": (0.0, math.nan, "5", True),
-    "iterations": (0, 5.0, 1 << 31),
-    **dict.fromkeys(("scale_limit", "growth", "ema_share"), (None, math.inf, 10**7)),
+    "seconds": (0.0,),
+    "iterations": (0, 1 << 31),
+    **dict.fromkeys(("scale_limit", "growth", "ema_share"), (10**7,)),
     "seed": (-1, 1 << 63),
-    "lattice": (17, 2.0),
+    "lattice": (17,),
     "sh_degree": (4, -1),
-    "sh_steps": ([0.1], (-1.0,), 0.5),
+    "sh_steps": ((-1.0,),),
     "density_span": ((0.1,), (0.1, -1.0)),
-    "background": ((1.0, 1.0), (2.0, 0.0, 0.0), "white"),
-    "exposure": (((0.0, 1.0),), ((0.0, 0.0, 1.0, 1.0, 0.0, 0.0, 0.0),), (5,), [[1.0] * 7]),
-    "target_psnr": (0.0, -1.0, 201.0, math.nan, "30"),
-    "effects": (5, {"jaw": "maybe"}, {"chin": "on"}, {1: "on"}),
-    "hull_points": (1, None, "yes"),
-    "rates": (None, 5, Rates(end=-1.0), Rates(xyz=math.inf), Rates(sh="5")),
+    "background": ((2.0, 0.0, 0.0), "white"),
+    "exposure": (((0.0, 1.0),), ((0.0, 0.0, 1.0, 1.0, 0.0, 0.0, 0.0),)),
+    "target_psnr": (0.0, 201.0),
+    "effects": ({"jaw": "maybe"}, {"chin": "on"}),
+    "hull_points": (1,),
+    "rates": (Rates(end=-1.0),),
     "selection": (SelectionOptions(regions=("nose", 5)),),
     "scale": (2.0, 0.01),
     **dict.fromkeys(("convention", "global_unit"), ("x",)),
@@ -53,6 +52,8 @@ REFUSED = {
     **dict.fromkeys(("warm_up_share", "ssim_weight"), (1.5,)),
     "distance_weight": (10**30,),
 }
+"""Values beyond each setting's own limits; what no number, tuple or text is, `tests/test_schema.py`
+has."""
 
 
 @pytest.mark.parametrize(
@@ -66,7 +67,5 @@ def test_one_schema_for_new_and_stored_settings(name, value):
     assert len(str(caught.value)) < 400
     stored = {**to_json(make_settings(iterations=5)), "iterations": budget.get("iterations")}
     plain = dataclasses.asdict(value) if dataclasses.is_dataclass(value) else value
-    if isinstance(value, list):
-        return  # JSON's lists become tuples
     with refusal(name):
         from_json(TrainingSettings, {**stored, name: plain})

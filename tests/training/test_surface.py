@@ -10,7 +10,7 @@ from PIL import Image
 from scipy.ndimage import binary_dilation, binary_erosion
 from scipy.spatial import cKDTree
 
-from stga_addon.avatar.embedding import to_world
+from stga_addon.avatar.embedding import face_frames, to_world
 from stga_addon.avatar.file import UNSEEN_REGION, Avatar
 from stga_addon.avatar.filmed import filmed_sides
 from stga_addon.avatar.lattice import NORMAL_AXIS, lattice_splats
@@ -31,20 +31,17 @@ from stga_addon.training.optimize.hidden_layers import (
 )
 from stga_addon.training.optimize.initial_splats import visual_hull_points, voxel_size
 from stga_addon.training.optimize.state import new_state
-from stga_addon.training.optimize.step_hook import Schedule
 from stga_addon.training.optimize.surface import GRAZING_COSINE, Surface
 from stga_addon.training.optimize.surface_prior import (
     BEHIND_COSINE,
     WELL_SEEN_COSINE,
-    SurfacePrior,
     flattened,
     thickness,
     width,
 )
-from stga_addon.training.optimize.trainer import Trainer
 from stga_addon.training.optimize.unseen_sides import unseen_sides
 
-from .toys import Rows, alpha_of, quick_settings
+from .toys import alpha_of, quick_settings, settle, state_in
 
 HAIR_M = 0.012
 COLLAR_M = 0.01
@@ -73,6 +70,24 @@ def filmed(tmp_path_factory):
     return capture_of(folder, neutral, tuple(views))
 
 
+@pytest.fixture(scope="module", params=["stga", "gaussian_avatars"])
+def of_convention(request, filmed):
+    """Frames of the head by either convention, which tests only read."""
+    return FrameStore(filmed, request.param)
+
+
+@pytest.fixture(scope="module")
+def frames(filmed):
+    """Frames of the head, which tests only read."""
+    return FrameStore(filmed, "stga")
+
+
+@pytest.fixture(scope="module")
+def frontal(filmed):
+    """The head as its middle views alone show it."""
+    return replace(filmed, views={"train": filmed.views["train"][3:6]})
+
+
 def normals(vertices, faces):
     a, b, c = vertices[faces].swapaxes(0, 1)
     total = np.zeros_like(vertices)
@@ -96,10 +111,10 @@ def capture_of(root, neutral, views):
     )
 
 
-def test_hair_is_as_high_as_its_outline(filmed):
+def test_hair_is_as_high_as_its_outline(filmed, frames):
     """Catches hair that is cut to the skull where no camera looks, a neck with hair, and clothes
     that are thought to be thin skin."""
-    surface = Surface(filmed)
+    surface = frames.surface
     center = filmed.neutral[filmed.faces].mean(1)
     crown = surface.outside & (center[:, 1] > 0.11)
     back = surface.outside & (center[:, 2] < -0.08) & (center[:, 1] > 0.04)
@@ -121,6 +136,12 @@ def in_motion(capture, model, closed=(0.0, 0.0)):
     blink = np.array([weights.get(name, 0.0) for name in model.expression_names])
     frames = [SimpleNamespace(expr=blink * (timestep == 4)) for timestep in capture.timesteps]
     return replace(capture, flame=SimpleNamespace(model=model, frame=frames.__getitem__))
+
+
+@pytest.fixture(scope="module")
+def moving(filmed):
+    """Frames of the head in motion, whose eyes stay open, which tests only read."""
+    return FrameStore(in_motion(filmed, flame_model(None)), "stga")
 
 
 def from_the_front(capture, folder, change):
@@ -177,11 +198,10 @@ def test_long_hair_hides_the_neck(sides, hangs, filmed, tmp_path):
     assert not surface.kinds["scalp"][center[:, 1] < -0.16].any()
 
 
-def test_an_end_of_a_bust_is_no_eye(filmed):
+def test_an_end_of_a_bust_is_no_eye(filmed, frames):
     """Catches eyelids and lips, whose edges are open too, that are taken for the mesh's end, large
     splats there and at the rim of a face alone, and a torso beside a mesh that ends at the neck, of
     small ones."""
-    frames = FrameStore(filmed, "stga")
     border = frames.surface.border
     bound, unbound = frames.scale_limits(quick_settings(scale_limit=3.0, unbound_scale_limit=2.0))
     is_seen = frames.surface.facing > GRAZING_COSINE
@@ -196,12 +216,11 @@ def test_an_end_of_a_bust_is_no_eye(filmed):
     assert Surface(replace(filmed, faces=filmed.faces[face], regions=regions)).border.any()
 
 
-@pytest.mark.parametrize("convention", ["stga", "gaussian_avatars"])
-def test_hidden_sides_are_closed(filmed, convention):
+def test_hidden_sides_are_closed(filmed, of_convention):
     """Catches a back of the head through which the inside of the face is seen, at the start or when
     limits have shrunk its hair, one in the air, and tatters where the mesh ends."""
-    frames = FrameStore(filmed, convention)
-    settings = quick_settings(convention=convention, scale_limit=0.6)
+    frames = of_convention
+    settings = quick_settings(convention=frames.convention, scale_limit=0.6)
     splats = hidden_splats(frames, settings)
     hair = frames.surface.hair_height[splats.face] > 0
     largest = np.exp(splats.log_scale[hair].max(1))
@@ -241,16 +260,15 @@ def test_no_tuft_hangs_behind_the_head(filmed):
 
 
 @pytest.mark.parametrize("convention", ["stga", "gaussian_avatars"])
-def test_what_is_behind_keeps_its_width(filmed, convention):
+def test_what_is_behind_keeps_its_width(frontal, convention):
     """Catches a back of the head in whose hair, neck and hem training, which does not see it, makes
     tears."""
-    frontal = replace(filmed, views={"train": filmed.views["train"][3:6]})
     frames = FrameStore(frontal, convention)
     settings = quick_settings(convention=convention)
     layer = hidden_splats(frames, settings)
     state = new_state(joined([layer, splats_behind(frames, settings.sh_degree)]))
     state.parameters.log_scale[: len(layer)] -= 0.7
-    SurfacePrior(frames).apply(Rows(state), Schedule(20, 0.5, len(state)))
+    settle(frames, state)
     surface = frames.surface
     is_behind = (surface.facing < BEHIND_COSINE)[layer.face]
     hair = is_behind & (surface.hair_height > 0)[layer.face]
@@ -264,10 +282,9 @@ def test_what_is_behind_keeps_its_width(filmed, convention):
         assert np.all(wide[part] > 0.7 * before[part])
 
 
-def test_what_hardly_shows_hardly_moves(filmed):
+def test_what_hardly_shows_hardly_moves(frontal):
     """Catches a back that next to no gradients move by whole steps of Adam, until it has holes, and
     a front that no longer learns."""
-    frontal = replace(filmed, views={"train": filmed.views["train"][3:6]})
     frames = FrameStore(frontal, "stga")
     state = new_state(lattice_splats(frontal.neutral, frontal.faces, 0, 0))
     facing = frames.surface.facing[state.face]
@@ -276,7 +293,7 @@ def test_what_hardly_shows_hardly_moves(filmed):
         moments[:] = gradient[:, None] ** 2
     state.second.opacity[:] = gradient**2
     state.second.sh[:] = gradient[:, None, None] ** 2
-    SurfacePrior(frames).apply(Rows(state), Schedule(20, 0.5, len(state)))
+    settle(frames, state)
     behind = facing < BEHIND_COSINE
     assert behind.sum() > 100
     for moments in (state.second.xyz, state.second.rotation, state.second.log_scale):
@@ -311,13 +328,11 @@ def covariances(rotation, log_scale):
     return sides @ sides.swapaxes(1, 2)
 
 
-def test_what_views_tell_is_kept(filmed):
+def test_what_views_tell_is_kept(filmed, frames):
     """Catches splats of which views tell much that are pulled away, ones of which they tell nothing
     that take any color and place, and hair that falls onto the skull."""
-    frames = FrameStore(filmed, "stga")
     surface = frames.surface
-    trainer = Trainer(filmed, quick_settings("global", sh_degree=0, sh_steps=()), {})
-    state = trainer.state
+    state = state_in(frames, quick_settings("global", sh_degree=0, sh_steps=()))
     outer = state.parameters.opacity != OCCLUSION_OPACITY
     rng = np.random.default_rng(0)
     told = rng.random(len(state)) < 0.8
@@ -327,8 +342,7 @@ def test_what_views_tell_is_kept(filmed):
     state.parameters.sh[:] = rng.normal(size=state.parameters.sh.shape)
     state.parameters.xyz[outer] += rng.normal(0, 0.002, (outer.sum(), 3))
     before = {name: value.copy() for name, value in state.parameters._asdict().items()}
-    prior = SurfacePrior(frames)
-    prior.apply(Rows(state), Schedule(20, 0.5, len(state)))
+    settle(frames, state)
     grazing = surface.outside & (surface.facing < GRAZING_COSINE) & (surface.facing > 0)
     of_grazing = grazing[state.face] & ~state.unbound & outer
     kept = of_grazing & told & ~frames.sides.triangles[state.face]
@@ -356,27 +370,27 @@ def test_what_views_tell_is_kept(filmed):
     assert_allclose(height, was + away[rows] ** 2 * (plausible - was), atol=3e-4)
 
 
-def test_lids_close(filmed):
+def test_lids_close(moving):
     """Catches lids that were trained on open eyes and, closed, are shreds with the eye behind."""
-    model = flame_model(None)
-    capture = in_motion(filmed, model)
+    capture = moving.capture
+    model = capture.flame.model
     names = [model.expression_names.index(f"eyeBlink{side}") for side in ("Left", "Right")]
     blink = capture.neutral + model.shapedirs[:, :, model.n_identity :][:, :, names].sum(2)
-    frames = FrameStore(capture, "stga", moved_mesh=lambda timestep: (None, blink)[timestep])
-    state = Trainer(capture, quick_settings(sh_degree=0, sh_steps=()), {}).state
-    lids = frames.surface.lids
+    state = state_in(moving, quick_settings(sh_degree=0, sh_steps=()))
+    lids = moving.surface.lids
     assert 100 < lids.sum() < 1000
     rng = np.random.default_rng(0)
     state.parameters.opacity[:] = -4
     state.parameters.log_scale[:] -= rng.uniform(0, 2, state.parameters.log_scale.shape)
-    SurfacePrior(frames).apply(Rows(state), Schedule(20, 0.5, len(state)))
+    settle(moving, state)
     splats = state.splats()
     splats = splats.rows(lids[splats.face] & ~splats.unbound)
     camera = look_at([0, 0.03, 0.6], [0, 0.03, 0], 320, 200, 900)
     triangle, _ = rasterize(blink, capture.faces, camera)
     closed = binary_erosion((triangle >= 0) & lids[triangle])
     assert closed.sum() > 500
-    assert np.quantile(alpha_of(splats, camera, frames.of(1))[closed], 0.02) > 0.8
+    blinked = face_frames(blink, capture.faces, capture.neutral)
+    assert np.quantile(alpha_of(splats, camera, blinked)[closed], 0.02) > 0.8
 
 
 def test_lids_that_views_show_stay(filmed):
@@ -384,8 +398,7 @@ def test_lids_that_views_show_stay(filmed):
     them a little below the surface."""
     capture = in_motion(filmed, flame_model(None), closed=(1.0, 1.0))
     frames = FrameStore(capture, "stga")
-    prior = SurfacePrior(frames)
-    state = Trainer(capture, quick_settings(sh_degree=0, sh_steps=(), lattice=1), {}).state
+    state = state_in(frames, quick_settings(sh_degree=0, sh_steps=(), lattice=1))
     rng = np.random.default_rng(0)
     lids = frames.surface.lids & ~frames.sides.triangles & ~frames.surface.hidden
     rows = np.flatnonzero(lids[state.face] & ~state.unbound)
@@ -393,7 +406,7 @@ def test_lids_that_views_show_stay(filmed):
     state.parameters.rotation[rows] = rng.normal(size=(len(rows), 4))
     for part in (state.second.sh, state.second.opacity):
         part[:] = 1
-    prior.apply(Rows(state), Schedule(20, 0.5, len(state)))
+    settle(frames, state)
     is_layer = (state.parameters.rotation[rows] == [1, 0, 0, 0]).all(1)
     face, count = np.unique(state.face[rows[is_layer]], return_counts=True)
     assert set(face) == set(state.face[rows])
@@ -424,11 +437,11 @@ def test_lids_that_stay_folded_are_skin(filmed, tmp_path):
     assert_array_equal(frames.surface.folded_lids, folded)
     assert not sides.shown[folded].any()
     assert_allclose(sides.color[folded] * 255, np.tile([150, 100, 80], (folded.sum(), 1)), atol=4)
-    state = Trainer(capture, quick_settings(sh_degree=0, sh_steps=(), lattice=1), {}).state
+    state = state_in(frames, quick_settings(sh_degree=0, sh_steps=(), lattice=1))
     state.parameters.sh[:] = -1
     for part in (state.second.sh, state.second.opacity):
         part[:] = 1
-    SurfacePrior(frames).apply(Rows(state), Schedule(20, 0.5, len(state)))
+    settle(frames, state)
     bound = ~state.unbound
     at = bound & folded[state.face]
     plausible = (sides.color[state.face[at]] - 0.5) / SH_C0
@@ -437,16 +450,16 @@ def test_lids_that_stay_folded_are_skin(filmed, tmp_path):
     assert (state.parameters.sh[shown, 0] == -1).all(1).mean() > 0.6
 
 
-def test_lids_close_over_eyes(filmed):
+def test_lids_close_over_eyes(moving):
     """Catches splats of an iris that stand out so far that they show on closed lids."""
-    model = flame_model(None)
-    capture = in_motion(filmed, model)
+    capture = moving.capture
+    model = capture.flame.model
     eyeballs = np.zeros(len(capture.faces), bool)
     for side in ("left", "right"):
         eyeballs |= faces_within(model.faces, model.masks[f"{side}_eyeball"])
-    for convention in ("stga", "gaussian_avatars"):
-        frames = FrameStore(capture, convention)
-        state = Trainer(capture, quick_settings(convention=convention), {}).state
+    for frames in (moving, FrameStore(capture, "gaussian_avatars")):
+        convention = frames.convention
+        state = state_in(frames, quick_settings(convention=convention))
         axis = NORMAL_AXIS[convention]
         bound = np.flatnonzero(~state.unbound)
         rng = np.random.default_rng(0)
@@ -454,7 +467,7 @@ def test_lids_close_over_eyes(filmed):
         before = rng.normal(0, 1e-3, len(bound)) / meters
         state.parameters.xyz[bound, axis] = before
         state.second.opacity[:] = 1  # as views show them
-        SurfacePrior(frames).apply(Rows(state), Schedule(20, 0.5, len(state)))
+        settle(frames, state)
         height = state.parameters.xyz[bound, axis] * meters
         of_eyes = eyeballs[state.face[bound]]
         facing = (frames.sides.shown & (frames.surface.facing > 0.9))[state.face[bound]]
@@ -485,10 +498,10 @@ def test_teeth_that_views_show_are_theirs(filmed):
     assert unseen[teeth & (pixels == 0)].all()
 
 
-def test_the_sides_that_were_filmed(filmed):
+def test_the_sides_that_were_filmed(filmed, frames):
     """Catches left for right, the surface that is seen for where cameras were, and a turn of the
     mesh."""
-    empty = hidden_splats(FrameStore(filmed, "stga"), quick_settings()).rows([])
+    empty = hidden_splats(frames, quick_settings()).rows([])
 
     def sides_of(turn, angles):
         views = tuple(view for view in filmed.views["train"] if view.timestep in angles)

@@ -45,7 +45,7 @@ from stga_addon.training.optimize.unseen_sides import (
 )
 
 from .heads import PLACES, write_head
-from .toys import Rows, alpha_of, quick_settings
+from .toys import Rows, alpha_of, quick_settings, settle, state_in
 
 CAMERA = 3
 """Sees the ball's +x side and front, from 40° beside the middle."""
@@ -95,7 +95,7 @@ def test_restored_colors_are_those_of_the_avatar(from_one_side):
         part.sh[:] = rng.random(part.sh.shape)
     state.unbound[::7] = True
     before = {name: getattr(state, name).sh.copy() for name in ("average", "first", "second")}
-    SurfacePrior(FrameStore(capture, "stga")).apply(Rows(state), Schedule(0, 0.5, len(state)))
+    settle(FrameStore(capture, "stga"), state, 0)
     far = sides.triangles[state.face] & ~state.unbound
     assert 0 < far.sum() < len(far)
     expected = (sides.color[state.face[far]] - 0.5) / 0.28209479177387814
@@ -141,7 +141,7 @@ EYES = np.array([200, 180, 170], np.uint8)
 TURNS_DEG = (-45, -20, 0, 20, 45)
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def bundled(from_one_side):
     """A capture of the bundled head at rest, without views."""
     model = flame_model(None)
@@ -198,6 +198,26 @@ def filmed(capture, color, angles, height, folder, away=1.0):
         Image.fromarray(np.uint8(255 * (triangle >= 0))).save(mask)
         views.append(View(0, 0, camera, path.name, path, mask))
     return replace(capture, views={"train": tuple(views)})
+
+
+@pytest.fixture(scope="module")
+def turning(bundled, tmp_path_factory):
+    """Frames of the head as it turns, which tests only read."""
+    folder = tmp_path_factory.mktemp("turning")
+    return FrameStore(filmed(bundled, painted(bundled), TURNS_DEG, 0.0, folder), "stga")
+
+
+@pytest.fixture(scope="module")
+def frontal(bundled, tmp_path_factory):
+    """Frames of the head that one camera sees in front, which tests only read."""
+    folder = tmp_path_factory.mktemp("frontal")
+    return FrameStore(filmed(bundled, painted(bundled), (0,), 0.0, folder), "stga")
+
+
+@pytest.fixture(scope="module")
+def outside(bundled):
+    """(F,) bool: triangles of the head that are seen from around it."""
+    return Surface(bundled).outside
 
 
 @pytest.mark.parametrize(
@@ -284,18 +304,14 @@ def test_unseen_hair_grows_in_locks(convention, bundled, tmp_path):
     assert_array_equal(off_axis.sh[strands, 0], splats.sh[strands, 0])
 
 
-def test_the_less_hair_is_unseen_the_fewer_strands(bundled, tmp_path):
+def test_the_less_hair_is_unseen_the_fewer_strands(bundled, turning, tmp_path):
     """Catches as many strands behind a head that cameras show nearly all around."""
+    around = filmed(bundled, painted(bundled), (*TURNS_DEG, -100, 150), 0.0, tmp_path)
     count = []
-    for number, angles in enumerate((TURNS_DEG, (*TURNS_DEG, -100, 100), (*TURNS_DEG, -100, 150))):
-        folder = tmp_path / str(number)
-        folder.mkdir()
-        capture = filmed(bundled, painted(bundled), angles, 0.0, folder)
-        layer = hidden_splats(FrameStore(capture, "stga"), quick_settings())
+    for frames in (turning, FrameStore(around, "stga")):
+        layer = hidden_splats(frames, quick_settings())
         count.append(np.sum(np.exp(np.diff(np.sort(layer.log_scale, axis=1))[:, 1]) > 3))
-    most, fewer, fewest = count
-    assert fewer < 0.8 * most
-    assert fewest < 0.3 * most
+    assert count[1] < 0.3 * count[0]
 
 
 def nearest(places):
@@ -319,11 +335,10 @@ def test_a_beard_goes_on_beside_the_jaw(bundled, tmp_path):
     assert np.mean(np.abs(255 * sides.color[rows] - HAIR).max(1) < 30) > 0.7
 
 
-def test_hair_ends_at_the_ears(bundled, tmp_path):
+def test_hair_ends_at_the_ears(bundled, frontal, outside):
     """Catches skin around ears where hair is, and hair on them: their shells stand out."""
-    sides = sides_of(filmed(bundled, painted(bundled), (0,), 0.0, tmp_path))
+    sides = frontal.sides
     centers, level = middles(bundled)
-    outside = Surface(bundled).outside
     beside = outside & (abs(centers[:, 0]) > 0.062) & (level > -1)
     shells = beside & (abs(centers[:, 0]) > 0.08)
     above = beside & (level > 0.35) & (centers[:, 2] < -0.01)
@@ -354,12 +369,12 @@ def test_a_lit_and_a_shaded_side_meet_behind_a_neck(bundled, tmp_path):
     assert np.quantile(jump[is_skin & ~is_cloth[near].any(1)], 0.9) < 10
 
 
-def test_what_lips_and_lids_hide(bundled, tmp_path):
+def test_what_lips_and_lids_hide(bundled, turning, outside):
     """Catches a closed mouth that is skin inside, or at the throat's end, teeth that are too white
     or train with a slit between lips, lips with a dark rim, an eye that is skin where it looks
     off-axis, and folds of ears, or eyes' sockets, that count as the mouth's inside."""
-    sides = sides_of(filmed(bundled, painted(bundled), TURNS_DEG, 0.0, tmp_path))
-    hidden = sides.triangles & ~Surface(bundled).outside
+    sides = turning.sides
+    hidden = sides.triangles & ~outside
     behind_lids = eyeballs_of(bundled) & hidden
     assert behind_lids.sum() > 20
     off = np.abs(255 * sides.color[behind_lids] - EYES)
@@ -367,7 +382,7 @@ def test_what_lips_and_lids_hide(bundled, tmp_path):
     centers, level = middles(bundled)
     model = bundled.flame.model
     teeth = faces_within(bundled.faces, model.masks["teeth"])
-    folds = ~Surface(bundled).outside & (np.abs(centers[:, 0]) > 0.06)
+    folds = ~outside & (np.abs(centers[:, 0]) > 0.06)
     assert folds.sum() > 20
     assert not sides.triangles[folds].any()
     assert sides.triangles[teeth].all()
@@ -382,7 +397,7 @@ def test_what_lips_and_lids_hide(bundled, tmp_path):
     for rows in (throat & (part == part[0]), throat & (part != part[0]), end):
         assert rows.sum() > 20
         assert sides.color[rows].max(1).mean() < 0.3
-    sockets = (part == part[0]) & ~Surface(bundled).outside & (away < 0.09) & (level > -0.3)
+    sockets = (part == part[0]) & ~outside & (away < 0.09) & (level > -0.3)
     sockets &= ~sides.shown & (np.abs(centers[:, 0]) < 0.06)
     assert sockets.sum() > 20
     assert (sides.color[sockets].max(1) > 0.3).mean() > 0.95
@@ -390,21 +405,20 @@ def test_what_lips_and_lids_hide(bundled, tmp_path):
     assert (np.median(sides.color[lips], 0) > 0.4 * SKIN / 255).all()
 
 
-def test_splats_behind_closed_lips_stay_small(bundled, tmp_path):
+def test_splats_behind_closed_lips_stay_small(frontal):
     """Catches splats of the lips' inner side that hang before teeth and tongue once they part."""
-    capture = filmed(bundled, painted(bundled), (0,), 0.0, tmp_path)
-    frames = FrameStore(capture, "stga", False)
-    state = Trainer(capture, quick_settings(iterations=1), {}).state
+    capture = frontal.capture
+    state = state_in(frontal, quick_settings(iterations=1))
     state.parameters.log_scale[:] += 1
     before = state.parameters.log_scale.copy()
-    SurfacePrior(frames).apply(Rows(state), Schedule(20, 0.5, len(state)))
-    sides = frames.sides
-    outside = frames.surface.outside
+    settle(frontal, state)
+    sides = frontal.sides
+    outside = frontal.surface.outside
     lips = capture.regions["mouth"] & (outside | ~sides.triangles)
     inner = lips & ~outside & ~sides.shown
     of_inner = inner[state.face] & ~state.unbound
     assert of_inner.sum() > 20
-    side = np.sqrt(2 * face_areas(capture.neutral, capture.faces)) / frames.unit_lengths
+    side = np.sqrt(2 * face_areas(capture.neutral, capture.faces)) / frontal.unit_lengths
     width = np.exp(state.parameters.log_scale).max(1)
     assert (width[of_inner] < 0.4 * side[state.face[of_inner]]).all()
     of_outer = (lips & outside & sides.shown)[state.face] & ~state.unbound
@@ -423,22 +437,21 @@ def test_what_sticks_out_of_masks_is_not_closed(bundled, tmp_path):
         mask[:, :edge] = 0
         Image.fromarray(mask).save(view.mask)
         cut = np.minimum(cut, view.camera.project(centers)[0][:, 0] - edge)
-    surface = Surface(capture)
+    trainer = Trainer(capture, quick_settings(iterations=1), {})
+    surface = trainer.frames.surface
     assert surface.sticks_out[cut < -4].all()
     assert not surface.sticks_out[cut > 12].any()
     beyond = surface.hidden & surface.sticks_out
     assert beyond.sum() > 20
-    layer = hidden_splats(FrameStore(capture, "stga", False), quick_settings(iterations=1))
+    layer = hidden_splats(trainer.frames, trainer.settings)
     assert not beyond[layer.face].any()
     assert_array_equal(
         np.unique(layer.face[surface.hidden[layer.face]]), np.flatnonzero(surface.closed)
     )
-    state = Trainer(capture, quick_settings(iterations=1), {}).state
+    state = trainer.state
     bound = ~state.unbound & (state.parameters.opacity != OCCLUSION_OPACITY)
     state.parameters.opacity[:] = -5
-    SurfacePrior(FrameStore(capture, "stga", False)).apply(
-        Rows(state), Schedule(20, 0.5, len(state))
-    )
+    settle(trainer.frames, state)
     assert (state.parameters.opacity[bound & beyond[state.face]] == -5).all()
     assert (
         state.parameters.opacity[bound & (surface.closed & (surface.facing < -0.1))[state.face]] > 2
@@ -456,18 +469,18 @@ def test_a_chest_below_the_images(bundled, tmp_path):
         Image.fromarray(np.asarray(Image.open(path))[:end]).save(path)
     view = replace(view, camera=replace(view.camera, height=end))
     capture = replace(capture, views={"train": (view,)})
-    surface = Surface(capture)
+    trainer = Trainer(capture, quick_settings(iterations=1), {})
+    frames = trainer.frames
     row = view.camera.project(middles(capture)[0])[0][:, 1]
-    seen, cosine = surface.seen_from(np.array([0.0, 0.0, 1.0]))
+    seen, cosine = frames.surface.seen_from(np.array([0.0, 0.0, 1.0]))
     faces_camera = seen & (cosine > 0.5)
     below = faces_camera & (row > end + 5)
     assert below.sum() > 100
-    state = Trainer(capture, quick_settings(iterations=1), {}).state
+    state = trainer.state
     state.second.opacity[(row < end)[state.face]] = 1e-3
     before = state.parameters.opacity.copy()
     state.average.sh[:, 0] = 9
-    frames = FrameStore(capture, "stga", False)
-    SurfacePrior(frames).apply(Rows(state), Schedule(20, 0.5, len(state)))
+    settle(frames, state)
     of_chest = below[state.face]
     assert state.parameters.opacity[of_chest].min() > 2
     colors = 0.5 + SH_C0 * state.average.sh[of_chest, 0]
@@ -524,7 +537,7 @@ def test_hair_off_axis(bundled, tmp_path):
     towards = centers - view.camera.position
     assert_allclose(along, towards / np.linalg.norm(towards, axis=1)[:, None], atol=1e-5)
     off_axis = sh_color(splats.sh, np.array([[1.0, 0, 0]]))
-    facing = Surface(capture).facing[splats.face]
+    facing = trainer.frames.surface.facing[splats.face]
     shown = ~splats.unbound & (facing > 0.6)
     hair = ~splats.unbound & (facing > 0.2) & (level[splats.face] > 1.2)
     assert hair.sum() > 20
@@ -578,8 +591,9 @@ def test_a_torso_that_is_elsewhere_is_not_flat(bundled, tmp_path):
     capture = filmed(bundled, painted(bundled), (0,), 0.0, tmp_path)
     (view,) = capture.views["train"]
     torso = torso_faces(bundled.flame.model)
-    shown = torso & ~Surface(capture).hidden
-    assert Surface(capture).is_flat[shown].mean() > 0.5
+    surface = Surface(capture)
+    shown = torso & ~surface.hidden
+    assert surface.is_flat[shown].mean() > 0.5
     mask = np.asarray(Image.open(view.mask)).copy()
     mask[int(view.camera.project(middles(capture)[0][shown])[0][:, 1].min()) :] = 0
     Image.fromarray(mask).save(view.mask)
@@ -592,9 +606,8 @@ BASE = np.array([0, -0.11, 0.0])
 TIE = np.array([200, 20, 20], np.uint8)
 
 
-def behind(capture):
+def behind(frames):
     """The layer behind what views graze, and the frames that it is drawn in."""
-    frames = FrameStore(capture, "stga")
     layer = splats_behind(frames, 0)
     return layer.rows(frames.occlusion_layer.triangles[layer.face]), frames.of(0)
 
@@ -615,7 +628,7 @@ def test_nobody_looks_through_a_side(bundled, tmp_path):
     for view in capture.views["train"]:
         narrow = silhouette(capture.neutral * [NARROWER, 1, 1], capture.faces, view.camera)
         Image.fromarray(np.uint8(255 * narrow)).save(view.mask)
-    layer, frames = behind(capture)
+    layer, frames = behind(FrameStore(capture, "stga"))
     assert beside_masks(capture, layer, frames) < 0.1
     centers, level = middles(capture)
     camera = look_at([1, 0, 0], [0, -0.02, 0], 160, 200, 480)
@@ -627,10 +640,9 @@ def test_nobody_looks_through_a_side(bundled, tmp_path):
         assert alpha_of(layer, camera, frames)[own].min() > 0.9
 
 
-def test_the_end_behind_a_bust_stays(bundled, tmp_path):
+def test_the_end_behind_a_bust_stays(turning):
     """Catches a hem behind a bust that training frays."""
-    capture = filmed(bundled, painted(bundled), TURNS_DEG, 0.0, tmp_path)
-    trainer = Trainer(capture, quick_settings("global", lattice=None), {})
+    trainer = Trainer(turning.capture, quick_settings("global", lattice=None), {})
     surface = trainer.frames.surface
     state = trainer.state
     rows = (surface.border & surface.closed)[state.face] & ~state.unbound
@@ -644,16 +656,16 @@ def test_the_end_behind_a_bust_stays(bundled, tmp_path):
         assert_allclose(array[rows], kept, atol=1e-6)
 
 
-def test_nobody_looks_through_what_a_collar_hides(bundled, tmp_path):
+def test_nobody_looks_through_what_a_collar_hides(turning):
     """Catches a neck and clothes that are opaque for the cameras only, which see a collar before
     them, so that off-axis the background shows through; and a layer that reaches beyond the end
     of the mesh."""
-    capture = filmed(bundled, painted(bundled), TURNS_DEG, 0.0, tmp_path)
-    layer, frames = behind(capture)
+    capture = turning.capture
+    layer, frames = behind(turning)
     _, level = middles(capture)
     camera = look_at([0.85, -0.08, 0.5], [0, -0.08, 0], 160, 200, 480)
     triangle, _ = rasterize(capture.neutral, capture.faces, camera)
-    dressed = (level < -1.6) & (level > -2.5) & (Surface(capture).facing > GRAZED_COSINE)
+    dressed = (level < -1.6) & (level > -2.5) & (turning.surface.facing > GRAZED_COSINE)
     own = binary_erosion((triangle >= 0) & dressed[triangle], iterations=5)
     alpha = alpha_of(layer, camera, frames)
     assert own.sum() > 100
@@ -661,15 +673,14 @@ def test_nobody_looks_through_what_a_collar_hides(bundled, tmp_path):
     assert alpha[~binary_dilation(triangle >= 0, iterations=2)].max() < 0.25
 
 
-@pytest.mark.parametrize(("angles", "has_layer"), [((0,), True), (TURNS_DEG, False)])
-def test_nobody_looks_into_the_mouth_past_a_cheek(angles, has_layer, bundled, tmp_path):
+def test_nobody_looks_into_the_mouth_past_a_cheek(bundled, frontal, turning):
     """Catches cheeks of a head that never turned, whose splats lie along the views, without a layer
     behind them, and one where turns have shown that there are no gaps."""
-    capture = filmed(bundled, painted(bundled), angles, 0.0, tmp_path)
-    centers, level = middles(capture)
+    centers, level = middles(bundled)
     angle = np.degrees(np.arctan2(abs(centers[:, 0]), centers[:, 2] + 0.009))
     cheek = (abs(level + 0.5) < 0.5) & (abs(angle - 37) < 5)
-    assert FrameStore(capture, "stga").occlusion_layer.triangles[cheek].any() == has_layer
+    assert frontal.occlusion_layer.triangles[cheek].any()
+    assert not turning.occlusion_layer.triangles[cheek].any()
 
 
 def test_what_is_beside_the_jaw_lies_behind_the_face(bundled, tmp_path):
@@ -722,7 +733,8 @@ def test_a_torso_has_a_back(bundled, tmp_path):
     color = painted(capture)
     color[(np.abs(centers[:, 0]) < 0.145) & (level < -2.2)] = TIE
     capture = filmed(capture, color, (-20, 0, 20), 0.0, tmp_path, away=2.5)
-    layer, frames = behind(capture)
+    trainer = Trainer(capture, quick_settings(iterations=1), {})
+    layer, frames = behind(trainer.frames)
     assert beside_masks(capture, layer, frames) < 0.05
     camera = look_at([0, -0.2, -2], [0, -0.2, 0], 160, 200, 480)
     triangle, _ = rasterize(capture.neutral, capture.faces, camera)
@@ -734,23 +746,22 @@ def test_a_torso_has_a_back(bundled, tmp_path):
     assert np.abs(shown - CLOTH[:, None]).max() < 30
     away = centers[layer.face] - points_to_world(layer.xyz, frames, layer.face)
     assert away[inner[layer.face], 2].max() > 0.05
-    avatar = Trainer(capture, quick_settings(iterations=1), {}).avatar("center", None)
+    avatar = trainer.avatar("center", None)
     shown = render_avatar(avatar, capture.neutral, camera, (1, 1, 1))[:, own]
     assert_allclose(255 * shown, CLOTH[:, None].repeat(own.sum(), 1), atol=40)
     bust = filmed(bundled, painted(bundled), (-20, 0, 20), 0.0, tmp_path)
-    assert Surface(bust).border.any()
-    layer, frames = behind(bust)
+    of_bust = FrameStore(bust, "stga")
+    assert of_bust.surface.border.any()
+    layer, frames = behind(of_bust)
     away = middles(bust)[0][layer.face] - points_to_world(layer.xyz, frames, layer.face)
     assert norm(away, axis=1).max() < 0.025
 
 
-def test_a_head_is_outside_with_any_torso(bundled):
+def test_a_head_is_outside_with_any_torso(bundled, outside):
     """Catches triangles too small for the cameras that look for the outside, where a torso makes
     the mesh large: they would be taken for the mouth's inside and ears' folds."""
-    alone, beside = (
-        Surface(capture).outside for capture in (bundled, with_torso(bundled, 0.5, 0.8))
-    )
+    beside = Surface(with_torso(bundled, 0.5, 0.8)).outside
     _, level = middles(bundled)
-    head = alone & (level > -1.5)
+    head = outside & (level > -1.5)
     assert head.sum() > 5000
     assert beside[head].mean() > 0.9

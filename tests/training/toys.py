@@ -12,6 +12,9 @@ from stga_addon.files import read_npz
 from stga_addon.render.render import render
 from stga_addon.training.optimize.cpu_backend import CpuBackend
 from stga_addon.training.optimize.state import arrays_of, new_state
+from stga_addon.training.optimize.step_hook import Schedule
+from stga_addon.training.optimize.surface_prior import SurfacePrior
+from stga_addon.training.optimize.trainer import _placed_splats
 from stga_addon.training.run.folder import CHECKPOINT, RUN, Run
 from stga_addon.training.run.metrics_log import METRICS, read_metrics
 from stga_addon.training.settings import make_settings
@@ -128,6 +131,16 @@ class Rows(CpuBackend):
         for array in found.values():
             array.setflags(write=False)
         return found
+
+
+def state_in(frames, settings):
+    """As a training of the capture begins."""
+    return _placed_splats(frames, settings)[0]
+
+
+def settle(frames, state, iteration=20):
+    """What nothing shows becomes plausible, as a training does it now and then."""
+    SurfacePrior(frames).apply(Rows(state), Schedule(iteration, 0.5, len(state)))
 
 
 def hidden_layer_size(frames):

@@ -85,7 +85,7 @@ def test_timesteps_that_are_left_out_look_like_the_recording(drifting, tmp_path)
     """Catches drift averaged into the avatar, or not given to renderings of other timesteps."""
     psnr = {}
     for choice in ("on", "off"):
-        settings, _ = planned(drifting, iterations=100, exposure=choice)
+        settings, _ = planned(drifting, iterations=60, exposure=choice)
         run = Run(drifting.root, None, "vhap", replace(settings, effects=None))
         avatar = train_run(drifting, tmp_path / choice, run).path
         quality = evaluate_avatar(read_avatar(avatar), drifting, "val")
