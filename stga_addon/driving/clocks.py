@@ -15,6 +15,8 @@ TIMECODE = re.compile(
     re.ASCII,
 )
 """Also behind a date, as in ISO 8601; hours may be missing."""
+Columns = Mapping[str, Sequence[object]]
+"""Columns of a table by their names."""
 BASES = (24, 25, 30, 48, 50, 60, 100, 120, 240)
 """Frames per second that timecodes count."""
 TYPICAL_BASE = 60
@@ -101,7 +103,7 @@ class Guess:
 
 
 def find_times(
-    where: str, columns: Mapping[str, Sequence[object]], fps: float | None = None
+    where: str, columns: Columns, fps: float | None
 ) -> tuple[np.ndarray | None, list[str], Guess | None]:
     """(T,) seconds of rows, None where nothing says them; a sentence each for columns of times that
     are not used; and what was guessed of the used one.
@@ -144,7 +146,7 @@ def find_times(
     return None, [f"column {'; column '.join(left_out)}"] if left_out else [], None
 
 
-def _time_columns(columns: Mapping[str, Sequence[object]]) -> list[_Column]:
+def _time_columns(columns: Columns) -> list[_Column]:
     """Those that are called a time and are not empty, the likeliest first."""
     found = []
     for name, cells in columns.items():
@@ -161,7 +163,7 @@ def _time_columns(columns: Mapping[str, Sequence[object]]) -> list[_Column]:
     return sorted(found, key=lambda each: (not each.is_plain, each.unit is None, each.rank))
 
 
-def _ascending(columns: Mapping[str, Sequence[object]]) -> list[str]:
+def _ascending(columns: Columns) -> list[str]:
     """Names of columns of numbers that ascend."""
     found = []
     for name, cells in columns.items():
@@ -233,7 +235,7 @@ def _implausible(times: np.ndarray) -> str:
 
 
 def seconds_of_numbers(
-    column: str, values: np.ndarray, unit: float | None, fps: float | None = None
+    column: str, values: np.ndarray, unit: float | None, fps: float | None
 ) -> tuple[np.ndarray, Guess | None]:
     """(T,) seconds of a column of numbers, and a sentence where its unit is guessed: it is the one
     that gives a plausible rate. Small whole numbers are of frames, `fps` a second."""
@@ -252,9 +254,7 @@ def seconds_of_numbers(
     return values, None
 
 
-def seconds_of(
-    where: str, texts: list[str], fps: float | None = None
-) -> tuple[np.ndarray, float | None]:
+def seconds_of(where: str, texts: list[str], fps: float | None) -> tuple[np.ndarray, float | None]:
     """(T,) seconds from the first of timecodes `HH:MM:SS:FF.sub`, over midnight too; the rate of FF
     is found from the numbers, and returned where these do not determine it and `fps` is not given.
     A fraction behind a point is of the second where it has three digits or more, or where that of
