@@ -1,9 +1,7 @@
 """A newcomer's first hour: messages that can be read, a .blend file that knows its run."""
 
-import shutil
 from contextlib import nullcontext
 from dataclasses import replace
-from pathlib import Path
 from types import SimpleNamespace
 
 import bpy
@@ -77,38 +75,6 @@ def test_next_step_tells_what_is_so_now(extension, head, monkeypatch, tmp_path):
     texts = draw(extension, "next_step")
     assert any("Training: the splats follow" in text for text in texts)
     assert not any("Orbit" in text for text in texts)
-
-
-def test_the_file_knows_its_run(extension, head, tmp_path):
-    """Catches a run lost when an avatar is shown, or the file moved with it or saved elsewhere."""
-    settings = panel()
-    folder = tmp_path / "work"
-    ops.show_avatar(filepath=write_ball_run(folder / "run") / "avatar.npz")
-    assert settings.run_folder == str(folder / "run")
-    save(folder / "head.blend")
-    assert (settings.run_folder, settings.avatar) == ("//run", "//run/avatar.npz")
-    save(tmp_path / "copy.blend", copy=True)
-    assert settings.run_folder == "//run"
-    settings.holds_run = False
-    bpy.ops.wm.save_mainfile()
-    shutil.move(folder, tmp_path / "moved")
-    open_file(tmp_path / "moved/head.blend")
-    settings = panel()
-    assert Path(bpy.path.abspath(settings.run_folder)) == tmp_path / "moved/run"
-    assert settings.holds_run, "as in a file that an older version saved"
-    (tmp_path / "elsewhere").mkdir()
-    save(tmp_path / "elsewhere/head.blend")
-    assert settings.run_folder == str(tmp_path / "moved/run")
-
-
-def test_a_run_made_after_its_head(extension, head, tmp_path):
-    """Catches no Train More after Avatar from Video, whose head is there before its run."""
-    settings = panel()
-    settings.run_folder = str(write_ball_run(tmp_path / "run"))
-    results = extension.operators.results
-    making = extension.operators.monitor.RequestState(results.Kind.AVATAR, tmp_path, tmp_path)
-    results.store_avatar(bpy.context.scene, making, tmp_path / "run/avatar.npz")
-    assert settings.holds_run
 
 
 def test_a_file_made_without_the_panel(extension, head, tmp_path):
