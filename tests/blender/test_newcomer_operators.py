@@ -77,6 +77,16 @@ def test_next_step_tells_what_is_so_now(extension, head, monkeypatch, tmp_path):
     assert not any("Orbit" in text for text in texts)
 
 
+def test_a_run_made_after_its_head(extension, head, tmp_path):
+    """Catches no Train More after Avatar from Video, whose head is there before its run."""
+    settings = panel()
+    settings.run_folder = str(write_ball_run(tmp_path / "run"))
+    results = extension.operators.results
+    making = extension.operators.monitor.RequestState(results.Kind.AVATAR, tmp_path, tmp_path)
+    results.store_avatar(bpy.context.scene, making, tmp_path / "run/avatar.npz")
+    assert settings.holds_run
+
+
 def test_a_file_made_without_the_panel(extension, head, tmp_path):
     """Catches demo.blend with an empty panel, and a chosen head replaced at loading."""
     ops.show_avatar(filepath=write_ball_run(tmp_path / "run") / "avatar.npz")
