@@ -1,5 +1,6 @@
 """Operators, one module for each step of the panel."""
 
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import bpy
@@ -75,22 +76,23 @@ EXPORTS = (
 )
 
 
-def _import_menu(menu: Any, context: Any) -> None:
-    for operator, text in IMPORTS:
-        menu.layout.operator(operator, text=text)
+def _menu(entries: Iterable[tuple[str, str]]) -> Callable[[Any, Any], None]:
+    """What draws a menu's entries."""
 
+    def draw(menu: Any, context: Any) -> None:
+        for operator, text in entries:
+            menu.layout.operator(operator, text=text)
 
-def _export_menu(menu: Any, context: Any) -> None:
-    for operator, text in EXPORTS:
-        menu.layout.operator(operator, text=text)
+    return draw
 
 
 def register(at_end: AtEnd) -> None:
     register_classes(CLASSES, at_end)
-    for menu, draw in (
-        (bpy.types.TOPBAR_MT_file_import, _import_menu),
-        (bpy.types.TOPBAR_MT_file_export, _export_menu),
+    for menu, entries in (
+        (bpy.types.TOPBAR_MT_file_import, IMPORTS),
+        (bpy.types.TOPBAR_MT_file_export, EXPORTS),
     ):
+        draw = _menu(entries)
         menu.append(draw)
         at_end(menu.remove, draw)
     keys = bpy.context.window_manager.keyconfigs.addon

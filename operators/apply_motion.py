@@ -17,6 +17,7 @@ from ..stga_addon.errors import StgaError
 from ..stga_addon.flame.forward import FlameFrame
 from ..stga_addon.flame.sequence import PARTS, FlameSequence, retimed
 from ..stga_addon.scene import tags
+from ..stga_addon.scene.objects import frames_per_second
 from ..stga_addon.scene.record import stored_path
 from ..stga_addon.scene.rig import motion as rig_motion
 from ..stga_addon.scene.rig.keyframes import (
@@ -25,8 +26,9 @@ from ..stga_addon.scene.rig.keyframes import (
     checked_shape_keys,
     has_shapes,
 )
+from ..stga_addon.scene.tags import is_head
 from . import common, options
-from .common import Edit, FileImport, file_path, head_of, is_head, own_motion
+from .common import Edit, FileImport, file_path, head_of, own_motion
 from .options import ONCE
 
 LAST_FRAME = 1_048_574
@@ -282,7 +284,7 @@ class ApplyMotion(Edit, bpy.types.Operator, FileImport, MotionProperties):
         performance = read_performance(path, recorded_fps=self.fps or None)
         options = self._options()
         name = path.stem
-        rate = context.scene.render.fps / context.scene.render.fps_base / self.speed
+        rate = frames_per_second(context.scene) / self.speed
         self._check_end(int(performance.times[-1] * rate) + 1)
         for sentence in performance.warnings:
             self.warn(sentence)

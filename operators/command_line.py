@@ -17,10 +17,11 @@ from ..stga_addon.scene import tags
 from ..stga_addon.scene.arrays import evaluated_vertices
 from ..stga_addon.scene.objects import frames_per_second, iterate_frames
 from ..stga_addon.scene.rig.motion import sample_motion
+from ..stga_addon.scene.tags import is_head
 from ..stga_addon.scene.vertex_groups import training_selection
 from ..stga_addon.training.run.folder import TRACKING
 from ..stga_addon.worker.launch import start_python
-from .common import AtEnd, capture_source, file_path, is_head, scene_frames, stored_source
+from .common import AtEnd, capture_source, file_path, scene_frames, stored_source
 from .training_python import training_python
 
 IN_BLENDER = ("select", "export", "demo")

@@ -21,9 +21,11 @@ from ..stga_addon.progress import Cancelled
 from ..stga_addon.scene import tags
 from ..stga_addon.scene.objects import mover_of
 from ..stga_addon.scene.record import capture_of, stored_path
-from ..stga_addon.scene.rig.head import LINKED, check_own, find_rig, usable_rig
+from ..stga_addon.scene.rig.head import check_local, check_own, find_rig, usable_rig
 from ..stga_addon.scene.rig.keyframes import shape_key_names
+from ..stga_addon.scene.tags import is_head
 from ..stga_addon.schema import alternatives, type_hints
+from ..stga_addon.training.run.folder import has_run
 from . import options
 from .options import ONCE
 
@@ -245,17 +247,17 @@ def scene_frames(scene: Any) -> range:
 # The head
 
 
-def is_head(thing: Any) -> bool:
-    """Whether an object (or None) is a head that was imported from a capture."""
-    return thing is not None and thing.get(tags.KIND) == tags.HEAD
-
-
 def head_of(context: Any) -> Any:
     """The scene's head. Raises StgaError where it has none."""
     head = context.scene.stga.head
     if not is_head(head):
         raise StgaError("No head in the scene; import a capture first")
     return head
+
+
+def is_run(folder: str) -> bool:
+    """Whether a path, which may begin with "//", is the folder of a run."""
+    return bool(folder) and has_run(Path(bpy.path.abspath(folder)))
 
 
 def rig_or_none(head: Any) -> Any:
@@ -324,38 +326,25 @@ def need(is_met: Callable[[Any], Any], message: str) -> Poll:
 needs_head = need(lambda context: is_head(context.scene.stga.head), "Import a capture first")
 
 
-def needs_own_head(operator: Any, context: Any) -> bool:
-    """Poll: whether there is a head that can be changed here."""
-    return _needs(operator, context, check_own)
-
-
-def needs_local_head(operator: Any, context: Any) -> bool:
-    """Poll: whether there is a head that is not linked, but may be overridden."""
-    if not needs_head(operator, context):
-        return False
-    head = context.scene.stga.head
-    return polled(operator, head.library is None, f"{head.name}: {LINKED}")
-
-
-def needs_rig(operator: Any, context: Any) -> bool:
-    """Poll: whether there is a head with a FLAME rig that can be animated."""
-    return _needs(operator, context, usable_rig)
-
-
-def needs_bones(operator: Any, context: Any) -> bool:
-    """Poll: whether there is a head whose bones can be posed."""
-    return _needs(operator, context, partial(usable_rig, with_sliders=False))
-
-
-def _needs(operator: Any, context: Any, check: Callable[[Any], Any]) -> bool:
+def _head_that(check: Callable[[Any], object]) -> Poll:
     """Poll: whether there is a head on which `check` raises no StgaError."""
-    if not needs_head(operator, context):
-        return False
-    try:
-        check(context.scene.stga.head)
-    except StgaError as error:
-        return polled(operator, False, str(error))
-    return True
+
+    def poll(operator: Any, context: Any) -> bool:
+        if not needs_head(operator, context):
+            return False
+        try:
+            check(context.scene.stga.head)
+        except StgaError as error:
+            return polled(operator, False, str(error))
+        return True
+
+    return poll
+
+
+needs_own_head = _head_that(check_own)  # that can be changed here
+needs_local_head = _head_that(check_local)  # that may be overridden
+needs_rig = _head_that(usable_rig)  # with a FLAME rig that can be animated
+needs_bones = _head_that(partial(usable_rig, with_sliders=False))  # that can be posed
 
 
 def needs_rig_or_shapes(operator: Any, context: Any) -> bool:

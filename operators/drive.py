@@ -26,11 +26,12 @@ from ..stga_addon.files import naming
 from ..stga_addon.jobs.convert_motion import SHAPES_SUFFIX, ConvertMotion
 from ..stga_addon.jobs.table import Kind
 from ..stga_addon.scene import tags
-from ..stga_addon.scene.objects import Identity, show_progress
+from ..stga_addon.scene.avatar_scene import shown_screens, viewports
+from ..stga_addon.scene.objects import Identity, frames_per_second, show_progress
 from ..stga_addon.scene.record import capture_of, stored_path
 from ..stga_addon.scene.rig.keyframes import check_sliders
 from ..stga_addon.scene.rig.motion import LivePose, stored_range
-from ..stga_addon.training.run.folder import has_run, read_run
+from ..stga_addon.training.run.folder import read_run
 from . import common, options, timers
 from .apply_motion import TAKEN_OVER, MotionProperties, own_range
 from .common import Action, Edit, FileImport, file_path, head_of, need, own_motion, rig_or_none
@@ -178,10 +179,8 @@ class LiveSession:
             frames = self._map.frames(self._shown)
             frames, _ = open_motion.finished(frames, options, self._trained)
             self._pose.set_frame(frames[0])
-        for window in bpy.context.window_manager.windows:
-            for area in window.screen.areas:
-                if area.type == "VIEW_3D":
-                    area.tag_redraw()
+        for area in viewports(shown_screens()):
+            area.tag_redraw()
 
     def options(self) -> MotionOptions:
         """The panel's; the resting face is taken off where it is calibrated."""
@@ -440,10 +439,8 @@ def takes_folder(scene: Any) -> tuple[Path, str]:
         warning = f"{path}: is emptied when Blender ends; {remedy}"
     else:
         path = file_path(folder, "takes")
-    try:
+    with naming(path, "made"):
         path.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise StgaError(f"{path}: cannot be made ({error.strerror or error})") from error
     return path, warning
 
 
@@ -464,7 +461,7 @@ class DriveVideo(Action, bpy.types.Operator, FileImport):
 
     def invoke(self, context: Any, event: Any) -> set[str]:
         run = context.scene.stga.run_folder
-        if not self.avatar and run and has_run(Path(bpy.path.abspath(run))):
+        if not self.avatar and common.is_run(run):
             self.avatar = run
         return super().invoke(context, event)
 
@@ -486,8 +483,7 @@ class DriveVideo(Action, bpy.types.Operator, FileImport):
         ):
             # exact, a timestep for each frame
             suffix = ".npz"
-            render = context.scene.render
-            given["fps"] = render.fps / render.fps_base
+            given["fps"] = frames_per_second(context.scene)
         names = (video.stem, *(f"{video.stem}_{number}" for number in count(2)))
         output = next(path for name in names if not (path := folder / f"{name}{suffix}").exists())
         start(context.scene, ConvertMotion(video, output, **given), training_python(context))

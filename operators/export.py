@@ -24,8 +24,10 @@ from ..stga_addon.driving.head_map import page_controls
 from ..stga_addon.driving.inverse import captured_performance, write_performance
 from ..stga_addon.errors import StgaError
 from ..stga_addon.export import formats
-from ..stga_addon.export.formats import FORMATS, SPLAT_FORMATS, Content, Meshes, WorldContent
+from ..stga_addon.export.formats import FORMATS, SPLAT_FORMATS, Content, WorldContent
 from ..stga_addon.export.playback import Playback
+from ..stga_addon.export.ply import SplatFrames
+from ..stga_addon.export.rig import Meshes
 from ..stga_addon.export.usd import find_usd
 from ..stga_addon.files import confirming
 from ..stga_addon.flame.sequence import FlameSequence
@@ -291,7 +293,7 @@ class ExportSplats(SplatExport, bpy.types.Operator):
         format = SPLAT_FORMATS[self.format]
         count = len(scene_frames(context.scene))
         for shown in context.scene.objects:
-            is_own = shown.get(tags.KIND) == tags.SPLATS and not shown.hide_render
+            is_own = tags.is_splats(shown) and not shown.hide_render
             if is_own and display_mode(shown) != NATIVE and later_modifiers(shown):
                 names = ", ".join(each.name for each in later_modifiers(shown))
                 self.warn(f"{shown.name}: exported without {names}; {NATIVE} are exported with it")
@@ -308,7 +310,7 @@ class ExportSplats(SplatExport, bpy.types.Operator):
 
         python = _usd_python(context, self.format)
 
-        def write(frames: Iterable[tuple[int, Splats]]) -> None:
+        def write(frames: SplatFrames) -> None:
             formats.write_content(path, self.format, WorldContent(frames, playback, python))
 
         return self.write_frames(context, path, read, write, things)

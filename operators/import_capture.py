@@ -55,6 +55,7 @@ from ..stga_addon.scene.record import capture_of, store_path
 from ..stga_addon.scene.rig.head import follow_moved_capture, import_head
 from ..stga_addon.scene.rig.keyframes import has_shapes
 from ..stga_addon.scene.rig.poses import bring_presets
+from ..stga_addon.scene.tags import is_head
 from ..stga_addon.tracking.folder import describe_focal_length, is_tracked
 from ..stga_addon.training.run.folder import has_run, next_folder
 from . import options
@@ -65,7 +66,6 @@ from .common import (
     file_path,
     flame_model_path,
     head_of,
-    is_head,
     need,
     needs_rig,
     own_motion,
@@ -116,7 +116,7 @@ class HeadImport(Edit):
         model = None if has_model else flame_model_path(context, flame)
         capture = open_capture(source, flame=model, principal_point=principal_point)
         show_progress(0.5)
-        heads = [thing for thing in scene.objects if is_head(thing)]
+        heads = tags.heads_of(scene)
         follow_moved_capture(heads, capture, self.inform)
         others = [each for each in heads if capture_of(each) != capture.root.resolve()]
         is_new = len(heads) == len(others)
@@ -293,7 +293,7 @@ class ImportAvatar(HeadImport, bpy.types.Operator, FileImport):
     def run(self, context: Any) -> set[str]:
         path = file_path(self.filepath, "avatar")
         folder, found = _unpacked(path)
-        is_first = not any(is_head(thing) for thing in context.scene.objects)
+        is_first = not tags.heads_of(context.scene)
         self.bring_in(context, folder / MOTION_FILE, str(folder / MODEL_FILE))
         if is_first:
             set_frames_per_second(context.scene, found.fps)

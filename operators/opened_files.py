@@ -3,33 +3,29 @@ panel works on."""
 
 import os
 from collections.abc import Iterable
-from contextlib import suppress
 from math import radians
-from pathlib import Path
 from typing import Any
 
 import bpy
 from bpy.app.handlers import persistent
 
-from ..stga_addon.errors import StgaError
 from ..stga_addon.scene import tags
 from ..stga_addon.scene.compat import APPENDED, SAVE_FAILED, stored_value
-from ..stga_addon.scene.display import splat_nodes
 from ..stga_addon.scene.display.node_builder import Nodes, kept_material
 from ..stga_addon.scene.display.splat_object import (
-    get_input,
+    followed_head,
     hide_covered,
     hide_in_layers,
     hide_object,
     replace_native_splats,
 )
-from ..stga_addon.scene.objects import layers_with, mover_of, own_collections, remove
+from ..stga_addon.scene.objects import layers_with, mover_of, own_collections, own_scenes, remove
 from ..stga_addon.scene.record import owner_of, rebase, rebase_file, store_path, stored_path
 from ..stga_addon.scene.render.viewport_display import is_shown_as_trained
 from ..stga_addon.scene.rig.head import bone_shapes
-from ..stga_addon.training.run.folder import has_run
+from ..stga_addon.scene.tags import is_head
 from . import monitor
-from .common import UNSAVED, AtEnd, is_head, register_handlers
+from .common import UNSAVED, AtEnd, is_run, register_handlers
 from .results import HEADS, look_for_run
 from .windows import redraw, show_panel
 
@@ -62,7 +58,7 @@ NOTE_SIZE_M = 0.02
 def _add_notes() -> None:
     """Let the file say what is missing where nobody draws its avatars; here it is gone again as
     soon as the file is written."""
-    for scene in [scene for scene in bpy.data.scenes if scene.library is None]:
+    for scene in own_scenes():
         avatars = [each for each in scene.objects if is_shown_as_trained(each)]
         for avatar in avatars[:1]:
             text = bpy.data.curves.new("STGA note", "FONT")
@@ -123,7 +119,7 @@ def _after_append(imported: Any) -> None:
             hide_in_layers(thing, scene)
         elif tags.CONVENTION in thing:
             hide_covered(thing, scene)
-        elif thing.get(tags.KIND) == tags.RIG:
+        elif thing[tags.KIND] == tags.RIG:
             for shape in bone_shapes(thing):
                 hide_object(shape, scene)
         if item.source_library is not None and not isinstance(thing, bpy.types.Collection):
@@ -140,11 +136,10 @@ def _read_older(things: Iterable[Any]) -> None:
             continue
         avatar = thing.pop(tags.AVATAR, "")
         thing.pop("stga_run", None)
-        with suppress(StgaError):  # it has lost its modifier
-            head = get_input(thing, splat_nodes.HEAD)
-            if avatar and head is not None and head.library is None and tags.AVATAR not in head:
-                store_path(head, tags.AVATAR, avatar)
-    for scene in [scene for scene in bpy.data.scenes if scene.library is None]:
+        head = followed_head(thing)
+        if avatar and head is not None and head.library is None and tags.AVATAR not in head:
+            store_path(head, tags.AVATAR, avatar)
+    for scene in own_scenes():
         owner = owner_of(scene, scene.stga.head)
         for name, tag in (("run_folder", tags.RUN), ("avatar", tags.AVATAR)):
             value = stored_value(scene.stga, name)
@@ -157,10 +152,10 @@ def _read_older(things: Iterable[Any]) -> None:
 def _choose_head() -> None:
     """Let the panel work on the one head, and the splats, of a file that was made without it, as
     `stga demo` does, or into which an avatar was appended."""
-    for scene in [scene for scene in bpy.data.scenes if scene.library is None]:
+    for scene in own_scenes():
         settings = scene.stga
-        heads = [thing for thing in scene.objects if is_head(thing)]
-        shown = [thing for thing in scene.objects if thing.get(tags.KIND) == tags.SPLATS]
+        heads = tags.heads_of(scene)
+        shown = list(filter(tags.is_splats, scene.objects))
         if settings.head is None and len(heads) == 1:
             settings.head = heads[0]
             show_panel()
@@ -169,15 +164,13 @@ def _choose_head() -> None:
         for head in heads:
             avatar = stored_path(head, tags.AVATAR)
             folder = os.path.dirname(avatar)
-            known = Path(bpy.path.abspath(stored_path(head, tags.RUN) or "//"))
-            if head.library is None and not has_run(known) and is_run(folder):
+            if (
+                head.library is None
+                and is_run(folder)
+                and not is_run(stored_path(head, tags.RUN) or "//")
+            ):
                 store_path(head, tags.RUN, folder)
         look_for_run(settings)
-
-
-def is_run(folder: str) -> bool:
-    """Whether a path, which may begin with "//", is the folder of a run."""
-    return bool(folder) and has_run(Path(bpy.path.abspath(folder)))
 
 
 _active: dict[int, int] = {}

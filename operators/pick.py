@@ -1,6 +1,5 @@
 """A click on an avatar: selects what G then moves, of which Blender itself draws nothing there."""
 
-from contextlib import suppress
 from functools import partial
 from typing import Any
 
@@ -8,14 +7,13 @@ import bpy
 import numpy as np
 from bpy_extras.view3d_utils import region_2d_to_origin_3d, region_2d_to_vector_3d
 
-from ..stga_addon.errors import StgaError
 from ..stga_addon.scene import tags
 from ..stga_addon.scene.arrays import evaluated_vertices
-from ..stga_addon.scene.display import splat_nodes, splat_object
 from ..stga_addon.scene.display.splat_attributes import XYZ, read_attribute
+from ..stga_addon.scene.display.splat_object import followed_head
 from ..stga_addon.scene.objects import Identity, mover_of
+from ..stga_addon.scene.tags import is_head
 from . import options
-from .common import is_head
 from .windows import push_undo
 
 NEAR_PX = 12.0
@@ -70,11 +68,10 @@ def _distance(context: Any, part: Any, at: np.ndarray, origin: Any) -> float | N
     """From the eye to a head or splats at a point of the region; None where they are not there."""
     shape = part
     if tags.CONVENTION in part:
-        with suppress(StgaError):  # they have lost their modifier
-            shape = splat_object.get_input(part, splat_nodes.HEAD)
-        if shape in (None, part):
+        shape = followed_head(part)
+        if shape is None:
             return None
-    is_world = shape.get(tags.KIND) == tags.SPLATS
+    is_world = tags.is_splats(shape)
     vertices = read_attribute(shape.data, XYZ) if is_world else evaluated_vertices(shape)
     world = np.array(shape.matrix_world)
     points = vertices @ world[:3, :3].T + world[:3, 3]
@@ -98,7 +95,7 @@ def _select(identity: Any, extend: bool) -> None:
     if others and not extend:  # what Blender has found there: a bone, a camera, …
         return
     for part in layer.objects.selected:
-        if part.get(tags.KIND) == tags.SPLATS:
+        if tags.is_splats(part):
             part.select_set(False)
     mover.select_set(True)
     if not (is_head(layer.objects.active) and layer.objects.active.select_get()):

@@ -12,7 +12,7 @@ from ..stga_addon.driving.head_map import head_map
 from ..stga_addon.errors import StgaError, shorten
 from ..stga_addon.scene import tags
 from ..stga_addon.scene.compat import select_bones
-from ..stga_addon.scene.objects import Identity, leave_edit_mode, show_kind
+from ..stga_addon.scene.objects import Identity, leave_edit_mode, own_scenes, show_kind
 from ..stga_addon.scene.rig import keyframes, poses
 from ..stga_addon.scene.rig.head import usable_rig
 from ..stga_addon.scene.rig.motion import mirror_pose
@@ -255,9 +255,8 @@ class _Sliders:
 
 @persistent
 def _after_load(_: Any) -> None:
-    for scene in bpy.data.scenes:
-        if scene.library is None:
-            begin_sliders(scene.stga.head)
+    for scene in own_scenes():
+        begin_sliders(scene.stga.head)
 
 
 def register(at_end: AtEnd) -> None:

@@ -12,7 +12,7 @@ from typing import Any
 import bpy
 
 from ..stga_addon.capture.camera import Camera, to_and_fro
-from ..stga_addon.errors import StgaError
+from ..stga_addon.files import naming
 from ..stga_addon.jobs.blender import RenderRecording
 from ..stga_addon.jobs.monitor_state import Dismissed
 from ..stga_addon.jobs.render import Render
@@ -37,6 +37,7 @@ from ..stga_addon.scene.render import engine, viewport_display
 from ..stga_addon.scene.render.drawn_video import DrawnVideo
 from ..stga_addon.scene.render.scene_splats import SplatCache, all_layers, with_heads
 from ..stga_addon.scene.render.view_transform import srgb_background
+from ..stga_addon.scene.tags import is_head
 from ..stga_addon.worker.status import status_writer
 from . import monitor, options
 from .common import (
@@ -45,7 +46,6 @@ from .common import (
     StepGenerator,
     Stepwise,
     file_path,
-    is_head,
     need,
     preferences,
     scene_frames,
@@ -246,11 +246,8 @@ def _dismiss(scene: Identity) -> None:
 
 
 def _temporary_folder() -> Path:
-    try:
+    with naming(Path(tempfile.gettempdir())):
         return Path(tempfile.mkdtemp(prefix="stga_video_"))
-    except OSError as error:
-        problem = f"cannot be written ({error.strerror or error})"
-        raise StgaError(f"{tempfile.gettempdir()}: {problem}") from error
 
 
 def register(at_end: AtEnd) -> None:

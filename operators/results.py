@@ -30,10 +30,11 @@ from ..stga_addon.scene.record import (
     store_path,
     stored_path,
 )
+from ..stga_addon.scene.tags import is_head
 from ..stga_addon.tracking.folder import is_flame
-from ..stga_addon.training.run.folder import AVATAR, TRACKING, has_run, read_run
+from ..stga_addon.training.run.folder import AVATAR, TRACKING, read_run
 from ..stga_addon.worker.status import WorkerState
-from .common import capture_source, is_head
+from .common import capture_source, is_run
 
 Answer = SliceBuilt | Shown | None
 """Result of a function of `SHOW`; None: the result is still being read."""
@@ -59,12 +60,11 @@ _heads: dict[tuple[int, Kind], Identity] = {}
 
 def panel_head(scene: Any, kind: Kind) -> Any:
     """The head that a request of this kind is about as it begins; None: it has none, as yet."""
-    splats = scene.stga.splats
     head = scene.stga.head
     if kind == Kind.AVATAR:
         return None
-    if kind in ADDS and splats is not None:
-        head = splat_object.get_input(splats, splat_nodes.HEAD)
+    if kind in ADDS:
+        head = splat_object.followed_head(scene.stga.splats)
     return head if is_head(head) else None
 
 
@@ -106,8 +106,7 @@ def request_head(scene: Any, state: RequestState) -> Any:
 
 def _head_of_capture(scene: Any, capture: Path) -> Any:
     folder = str(capture.resolve())
-    heads = (thing for thing in scene.objects if is_head(thing))
-    return next((each for each in heads if str(capture_of(each)) == folder), None)
+    return next((each for each in tags.heads_of(scene) if str(capture_of(each)) == folder), None)
 
 
 def forget_heads() -> None:
@@ -166,7 +165,7 @@ def follow_head(settings: Any) -> None:
     scene = settings.id_data
     head = settings.head
     shown = shown_splats(scene, head)
-    others = [thing for thing in scene.objects if is_head(thing) and thing != head]
+    others = [thing for thing in tags.heads_of(scene) if thing != head]
     if shown is not None or (head is not None and others):
         settings.splats = shown
     if owner_of(scene, head) == head and tags.RUN not in head:
@@ -204,7 +203,7 @@ def store_panel_path(settings: Any, tag: str, value: str) -> None:
 
 def look_for_run(settings: Any) -> None:
     """Note for panels, which read no files, whether the run folder holds a run."""
-    settings.holds_run = has_run(Path(bpy.path.abspath(panel_path(settings, tags.RUN))))
+    settings.holds_run = is_run(panel_path(settings, tags.RUN))
 
 
 def _is_immature(state: RequestState) -> bool:

@@ -10,6 +10,7 @@ from ..stga_addon.capture.open import open_capture
 from ..stga_addon.errors import StgaError
 from ..stga_addon.scene import tags
 from ..stga_addon.scene import vertex_groups as groups
+from ..stga_addon.scene.avatar_scene import viewports
 from ..stga_addon.scene.objects import show_progress
 from ..stga_addon.selection import KEY_REGIONS, SelectionOptions, select_capture
 from ..stga_addon.training.run.folder import read_residuals
@@ -149,10 +150,8 @@ class HeatMap(Edit, bpy.types.Operator):
             splats.hide_set(self.show)
             head.hide_viewport = not self.show
             head.hide_set(False)
-        for area in context.screen.areas if context.screen else ():
-            if area.type == "VIEW_3D":
-                shading = area.spaces.active.shading
-                shading.color_type = "VERTEX" if self.show else "MATERIAL"
+        for area in viewports([context.screen] if context.screen else ()):
+            area.spaces.active.shading.color_type = "VERTEX" if self.show else "MATERIAL"
 
 
 def possible_regions(head: Any) -> list[str]:

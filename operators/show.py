@@ -1,7 +1,6 @@
 """The Show step: avatars and splats of files, their display, and their light."""
 
 import os
-from contextlib import suppress
 from math import radians
 from typing import Any
 
@@ -15,7 +14,7 @@ from ..stga_addon.jobs.finished_run import Relight
 from ..stga_addon.jobs.table import Kind
 from ..stga_addon.scene import compat, tags
 from ..stga_addon.scene.avatar_scene import show_world
-from ..stga_addon.scene.display import splat_nodes, splat_object
+from ..stga_addon.scene.display import splat_object
 from ..stga_addon.scene.display.splat_nodes import AS_TRAINED, LIMITS, NATIVE, POINTS, QUADS
 from ..stga_addon.scene.light import throw_shadow, throws_shadow
 from ..stga_addon.scene.objects import show_progress
@@ -24,8 +23,7 @@ from ..stga_addon.scene.render.scene_splats import forget_frame, relight_frame
 from ..stga_addon.scene.render.viewport_display import ENGINE, is_shown_as_trained
 from ..stga_addon.scene.rig.head import LINKED
 from . import common, options
-from .common import Action, Edit, FileImport, file_path, head_of, need
-from .opened_files import is_run
+from .common import Action, Edit, FileImport, file_path, head_of, is_run, need
 from .options import ONCE
 from .request import idle, start
 from .results import shown_splats
@@ -215,10 +213,7 @@ class StandardView(Edit, bpy.types.Operator):
 
 def _needs_splats(operator: Any, context: Any) -> bool:
     """Poll: whether there are splats that follow a head."""
-    splats = context.scene.stga.splats
-    head = None
-    with suppress(StgaError):
-        head = None if splats is None else splat_object.get_input(splats, splat_nodes.HEAD)
+    head = splat_object.followed_head(context.scene.stga.splats)
     return common.polled(operator, head is not None, "Show an avatar first")
 
 
@@ -227,8 +222,7 @@ def _needs_own_splats(operator: Any, context: Any) -> bool:
     if not _needs_splats(operator, context):
         return False
     splats = context.scene.stga.splats
-    head = splat_object.get_input(splats, splat_nodes.HEAD)
-    for thing in (splats, splats.data, head):
+    for thing in (splats, splats.data, splat_object.followed_head(splats)):
         if thing.library is not None:
             return common.polled(operator, False, f"{thing.name}: {LINKED}")
     return True

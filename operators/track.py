@@ -26,9 +26,10 @@ from ..stga_addon.scene.record import capture_of, stored_path
 from ..stga_addon.scene.rig.head import usable_rig
 from ..stga_addon.scene.rig.keyframes import key_current_pose
 from ..stga_addon.scene.rig.motion import sample_pose
+from ..stga_addon.scene.tags import is_head
 from ..stga_addon.training.settings import TrainingSettings, make_settings
 from . import common, options
-from .common import Action, Edit, FileImport, file_path, head_of, is_head, need, needs_rig
+from .common import Action, Edit, FileImport, file_path, head_of, need, needs_rig
 from .options import ONCE
 from .request import idle, start
 from .training_python import training_python
@@ -287,7 +288,7 @@ class AvatarFromVideo(Action, bpy.types.Operator, FileImport):
         return Track(video, None, capture, focal=focal, take=self.take, **quick)
 
 
-def proposed_folder(track: Track, takes: Sequence[Path] = ()) -> Path:
+def proposed_folder(track: Track, takes: Sequence[Path]) -> Path:
     """The folder of the capture in the first folder beside the .blend file, else beside the video,
     that is free or in which the avatar of these takes was begun."""
     beside = Path(bpy.data.filepath).parent if bpy.data.filepath else track.footage.parent

@@ -21,6 +21,7 @@ MODULE_NAME = re.compile(r"(?:(\.+)|stga_addon\.)([a-z_]\w*(?:\.[a-z_]\w*)*)", r
 BLENDER = {"bpy", "bmesh", "gpu", "mathutils", "bl_ext"}
 BLENDERS = (
     "stga_addon/scene/",
+    "stga_addon/development/demo/in_blender.py",
     "stga_addon/development/demo/studio.py",
     "stga_addon/development/benchmark/hands_on.py",
     "operators/",

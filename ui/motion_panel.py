@@ -7,7 +7,7 @@ from typing import Any
 import bpy
 
 from ..operators import drive
-from ..operators.common import is_head, rig_or_none, rig_problem
+from ..operators.common import rig_or_none, rig_problem
 from ..operators.pose import needs_sliders, preparing
 from ..stga_addon.driving.live.sources import LOOPBACK, SOURCES
 from ..stga_addon.driving.performance import ARKIT_SHAPES
@@ -16,7 +16,8 @@ from ..stga_addon.scene.objects import mover_of
 from ..stga_addon.scene.rig.keyframes import EXPRESSION_KEY, IDENTITY_KEY
 from ..stga_addon.scene.rig.motion import outside_now, stored_range
 from ..stga_addon.scene.rig.poses import poses
-from .sidebar import ClosedPanel, SidebarPanel, draw_running, draw_text
+from ..stga_addon.scene.tags import is_head
+from .sidebar import ClosedPanel, HeadPanel, SidebarPanel, draw_running, draw_text
 
 MAX_SLIDERS = 10  # the first components vary most
 SILENT_S = 1.0
@@ -76,15 +77,11 @@ class FacePanel(SidebarPanel, bpy.types.Panel):
             column.prop(keys[name], "value", text=name, slider=True)
 
 
-class PosesPanel(ClosedPanel, bpy.types.Panel):
+class PosesPanel(HeadPanel, bpy.types.Panel):
     """Poses of the asset browser, a button each."""
 
     bl_label = "Poses"
     bl_parent_id = MotionPanel.bl_idname
-
-    @classmethod
-    def poll(cls, context: Any) -> bool:
-        return is_head(context.scene.stga.head)
 
     def draw(self, context: Any) -> None:
         layout = self.layout

@@ -7,7 +7,7 @@ from typing import Any
 import bpy
 
 from ..operators import monitor
-from ..operators.common import UNSAVED, is_head, rig_or_none
+from ..operators.common import UNSAVED, rig_or_none
 from ..operators.import_capture import OpenDemo
 from ..operators.pose import is_posing
 from ..operators.training_python import has_training_python
@@ -21,6 +21,7 @@ from ..stga_addon.scene.display.splat_object import (
     is_partly_filmed,
     splat_modifier,
 )
+from ..stga_addon.scene.tags import is_head
 from ..stga_addon.worker.status import WorkerState
 from ..stga_addon.worker.training_python import PYTHON_VARIABLE
 from .select_panel import has_selection

@@ -5,13 +5,13 @@ from typing import Any
 
 import bpy
 
-from ..operators.common import is_head
 from ..operators.select import key_regions, possible_regions
 from ..stga_addon.capture.filmed import directions_picture
 from ..stga_addon.scene import tags
 from ..stga_addon.scene.objects import layers_of
+from ..stga_addon.scene.tags import is_head
 from ..stga_addon.scene.vertex_groups import has_heat_map, shows_residuals
-from .sidebar import SidebarPanel, draw_picture, draw_text
+from .sidebar import SidebarPanel, draw_arrow, draw_picture, draw_text
 
 LAYERS = ((tags.RIG, "Bones", "BONE_DATA"), (tags.CAMERA, "Cameras", "CAMERA_DATA"))
 """Collections that switches show and hide in viewports."""
@@ -53,11 +53,7 @@ def draw_filmed(layout: Any, context: Any, head: Any) -> None:
     """Draw from where the head was filmed, and, before it has splats, what to film next: these may
     be of further takes."""
     settings = context.scene.stga
-    arrow = "DISCLOSURE_TRI_DOWN" if settings.show_filmed else "DISCLOSURE_TRI_RIGHT"
-    row = layout.row()
-    row.alignment = "LEFT"
-    row.prop(settings, "show_filmed", text="Filmed", icon=arrow, emboss=False)
-    if not settings.show_filmed:
+    if not draw_arrow(layout, settings, "show_filmed", "Filmed"):
         return
     draw_picture(layout, head.name, directions_picture(tuple(head[tags.FILMED_CELLS])))
     lines = head[tags.FILMED].splitlines()

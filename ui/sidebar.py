@@ -14,6 +14,7 @@ from ..operators.common import TAB, AtEnd
 from ..stga_addon.format import describe_figures, describe_left, describe_quality
 from ..stga_addon.jobs.monitor_state import RequestState
 from ..stga_addon.jobs.table import KINDS, STORED, Kind
+from ..stga_addon.scene.tags import is_head
 from ..stga_addon.worker.status import WorkerState, WorkerStatus
 
 LETTER_WIDTH_PX = 7
@@ -44,6 +45,14 @@ class SidebarPanel:
 
 class ClosedPanel(SidebarPanel):
     bl_options = frozenset({"DEFAULT_CLOSED"})
+
+
+class HeadPanel(ClosedPanel):
+    """What is about a head, and is not shown without one."""
+
+    @classmethod
+    def poll(cls, context: Any) -> bool:
+        return is_head(context.scene.stga.head)
 
 
 def draw_text(layout: Any, context: Any, text: str, icon: str = "NONE") -> None:
@@ -95,6 +104,16 @@ def draw_running(layout: Any, context: Any, kind: Kind) -> bool:
     return True
 
 
+def draw_arrow(layout: Any, owner: Any, name: str, text: str) -> bool:
+    """Draw what unfolds the rows below it; whether they are to be drawn."""
+    is_open: bool = getattr(owner, name)
+    row = layout.row()
+    row.alignment = "LEFT"
+    arrow = "DISCLOSURE_TRI_DOWN" if is_open else "DISCLOSURE_TRI_RIGHT"
+    row.prop(owner, name, text=text, icon=arrow, emboss=False)
+    return is_open
+
+
 def draw_figures(layout: Any, context: Any, status: WorkerStatus) -> None:
     """Draw a word for how good the result is; figures, and what more time brings, unfold."""
     lines = describe_figures(status.figures)
@@ -103,12 +122,8 @@ def draw_figures(layout: Any, context: Any, status: WorkerStatus) -> None:
     if not lines:
         draw_text(column, context, status.detail)
         return
-    is_open = context.scene.stga.show_figures
-    arrow = "DISCLOSURE_TRI_DOWN" if is_open else "DISCLOSURE_TRI_RIGHT"
     text = f"Quality: {word}" if word else "Figures"
-    row = column.row()
-    row.alignment = "LEFT"
-    row.prop(context.scene.stga, "show_figures", text=text, icon=arrow, emboss=False)
+    is_open = draw_arrow(column, context.scene.stga, "show_figures", text)
     for line in (*lines, status.detail) if is_open else ():
         draw_text(column, context, line)
 

@@ -5,11 +5,11 @@ from typing import Any
 import bpy
 
 from ..operators import monitor
-from ..operators.common import is_head
 from ..operators.track import TrackOptions, tracking_keys
 from ..stga_addon.jobs.table import Kind
 from ..stga_addon.scene import tags
 from ..stga_addon.scene.record import capture_of
+from ..stga_addon.scene.tags import is_head
 from ..stga_addon.tracking.folder import SHEET_FILE
 from .sidebar import ClosedPanel, SidebarPanel, draw_end, draw_running, draw_text, set_options
 from .train_panel import draw_missing_python

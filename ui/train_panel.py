@@ -7,12 +7,13 @@ from typing import Any
 import bpy
 
 from ..operators import monitor, train
-from ..operators.common import is_head, package
+from ..operators.common import package
 from ..operators.training_python import has_training_python
 from ..stga_addon.capture.repairs import REPAIR_OPTION
 from ..stga_addon.format import format_duration
 from ..stga_addon.jobs.table import Kind
 from ..stga_addon.scene import tags
+from ..stga_addon.scene.tags import is_head
 from ..stga_addon.scene.vertex_groups import shows_residuals
 from ..stga_addon.training.effect_catalog import EFFECTS
 from ..stga_addon.training.run.folder import TRACKING
@@ -20,6 +21,7 @@ from ..stga_addon.worker.status import WorkerState
 from .properties import preset_times
 from .sidebar import (
     ClosedPanel,
+    HeadPanel,
     SidebarPanel,
     draw_curve,
     draw_end,
@@ -70,17 +72,14 @@ class TrainPanel(SidebarPanel, bpy.types.Panel):
         layout.prop(settings, "minutes")
         row = layout.row(align=True)
         draw_train_button(row, settings)
-        is_known = training.subject is not None and training.place == _run_folder(settings)
+        folder = Path(bpy.path.abspath(settings.run_folder))
+        is_known = training.subject is not None and training.place == folder
         is_known &= not is_of_another
         if is_known or settings.holds_run:
             finished = training.snapshot.state == WorkerState.FINISHED
             is_more = finished if is_known else bool(settings.avatar)
             draw_train_button(row, settings, goes_on="more" if is_more else "resume")
         draw_missing_python(layout, context)
-
-
-def _run_folder(settings: Any) -> Path:
-    return Path(bpy.path.abspath(settings.run_folder))
 
 
 def draw_train_button(layout: Any, settings: Any, goes_on: str = "") -> None:
@@ -127,13 +126,9 @@ class TrainOptionsPanel(ClosedPanel, bpy.types.Panel):
                 self.layout.prop(settings, name)
 
 
-class ContinuePanel(ClosedPanel, bpy.types.Panel):
+class ContinuePanel(HeadPanel, bpy.types.Panel):
     bl_label = "Refine and Extend"
     bl_parent_id = TrainPanel.bl_idname
-
-    @classmethod
-    def poll(cls, context: Any) -> bool:
-        return is_head(context.scene.stga.head)
 
     def draw(self, context: Any) -> None:
         settings = context.scene.stga

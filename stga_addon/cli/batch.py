@@ -146,7 +146,7 @@ def print_plan(plan: Plan) -> None:
     print("\n".join(plan_lines(Batch(plan), processors())))
 
 
-def carry_out_plan(plan: Plan, engine_name: str = "local", address: str = "") -> None:
+def carry_out_plan(plan: Plan, engine_name: str, address: str) -> None:
     """Carry out what is not finished, with a table. Raises StgaError where a job failed,
     KeyboardInterrupt after Ctrl-C when the running jobs have stopped."""
     from ..jobs.batch.engines import make_engine

@@ -15,6 +15,8 @@ TIMECODE = re.compile(
     re.ASCII,
 )
 """Also behind a date, as in ISO 8601; hours may be missing."""
+Columns = Mapping[str, Sequence[object]]
+"""Columns of a table by their names."""
 BASES = (24, 25, 30, 48, 50, 60, 100, 120, 240)
 """Frames per second that timecodes count."""
 TYPICAL_BASE = 60
@@ -112,7 +114,7 @@ class Guess:
 
 
 def find_times(
-    where: str, columns: Mapping[str, Sequence[object]], fps: float | None = None
+    where: str, columns: Columns, fps: float | None
 ) -> tuple[np.ndarray | None, list[str], Guess | None]:
     """(T,) seconds of rows, None where nothing says them; a sentence each for columns of times that
     are not used; and what was guessed of the used one.
@@ -157,7 +159,7 @@ def find_times(
     return None, [f"column {'; column '.join(left_out)}"] if left_out else [], None
 
 
-def _time_columns(columns: Mapping[str, Sequence[object]]) -> list[_Column]:
+def _time_columns(columns: Columns) -> list[_Column]:
     """Those that are called a time and are not empty, the likeliest first."""
     found = []
     for name, cells in columns.items():
@@ -175,7 +177,7 @@ def _time_columns(columns: Mapping[str, Sequence[object]]) -> list[_Column]:
 
 
 def _times_by_contents(
-    where: str, columns: Mapping[str, Sequence[object]]
+    where: str, columns: Columns
 ) -> tuple[np.ndarray | None, Guess | None, list[str]]:
     """(T,) seconds of the first column of timecodes, or of numbers that ascend as times do, as
     names in other languages leave it; and what was guessed. Else a sentence each for columns that
@@ -261,7 +263,7 @@ def _implausible(times: np.ndarray) -> str:
 
 
 def seconds_of_numbers(
-    column: str, values: np.ndarray, unit: float | None, fps: float | None = None
+    column: str, values: np.ndarray, unit: float | None, fps: float | None
 ) -> tuple[np.ndarray, Guess | None]:
     """(T,) seconds of a column of numbers, and a sentence where its unit is guessed: it is the one
     that gives a plausible rate. Small whole numbers are of frames, `fps` a second."""
@@ -280,9 +282,7 @@ def seconds_of_numbers(
     return values, None
 
 
-def seconds_of(
-    where: str, texts: list[str], fps: float | None = None
-) -> tuple[np.ndarray, float | None]:
+def seconds_of(where: str, texts: list[str], fps: float | None) -> tuple[np.ndarray, float | None]:
     """(T,) seconds from the first of timecodes `HH:MM:SS:FF.sub`, over midnight too; the rate of FF
     is found from the numbers, and returned where these do not determine it and `fps` is not given.
     A fraction behind a point is of the second where it has three digits or more, or where that of

@@ -105,12 +105,17 @@ def _is_number(text: str) -> bool:
     return True
 
 
+def list_of(document: dict[str, Any], keys: Sequence[str]) -> list[Any] | None:
+    """The first list that a document has by one of the keys; None without one."""
+    return next((document[key] for key in keys if isinstance(document.get(key), list)), None)
+
+
 def _with_names(frame: Any, depth: int = 0) -> Any:
     """The weights by their names, where lists of both lie somewhere in a frame."""
     if not isinstance(frame, dict) or depth > MAX_DEPTH:
         return frame
-    names = next((frame[key] for key in NAME_LISTS if isinstance(frame.get(key), list)), None)
-    weights = next((frame[key] for key in WEIGHT_LISTS if isinstance(frame.get(key), list)), None)
+    names = list_of(frame, NAME_LISTS)
+    weights = list_of(frame, WEIGHT_LISTS)
     if names is not None and weights is not None and len(names) == len(weights):
         return dict(zip(map(str, names), weights, strict=True))
     for value in frame.values():

@@ -2,12 +2,12 @@
 
 import math
 import re
-from collections.abc import Mapping, Sequence, Set
+from collections.abc import Set
 
 import numpy as np
 
 from ..errors import StgaError
-from .clocks import numbers
+from .clocks import Columns, numbers
 
 AXES = {"yaw": 0, "pitch": 1, "roll": 2, "y": 0, "x": 1, "z": 2, "w": 3}
 """Last letters of an angle's name -> its place in (yaw, pitch, roll), or the quaternion's real
@@ -42,7 +42,7 @@ WHOLE_TURN_DEG = 360.0
 
 
 def find_head(
-    where: str, columns: Mapping[str, Sequence[object]], times: np.ndarray
+    where: str, columns: Columns, times: np.ndarray
 ) -> tuple[np.ndarray | None, list[str]]:
     """(T, 3) yaw, pitch and roll in radians, None without any; and a sentence each for what was
     guessed, and for what is called a head's and is not used.
@@ -90,14 +90,14 @@ def find_head(
         notes.append(f"{origin}: angles about x, y, z are read as pitch, yaw, roll")
         return _in_radians(where, values[:, :3], times, (units, notes))
     notes.append(f"{origin}: is read as a quaternion x, y, z, w, with y up")
-    return _of_quaternions(values), notes
+    return angles_of_quaternions(values), notes
 
 
 def _plain(name: str) -> str:
     return re.sub(r"[^a-z]", "", name.lower().replace("°", "deg"))
 
 
-def _of_quaternions(values: np.ndarray) -> np.ndarray:
+def angles_of_quaternions(values: np.ndarray) -> np.ndarray:
     """(T, 3) yaw, pitch, roll of (T, 4) y, x, z, w."""
     length = np.linalg.norm(values, axis=1, keepdims=True)
     y, x, z, w = (values / np.maximum(length, 1e-12)).T

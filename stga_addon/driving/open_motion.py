@@ -49,6 +49,8 @@ NEUTRALS = {
     "calibrated": "the motion is relative to the performer's resting face already",
 }
 """Choice of a neutral face -> what it assumes."""
+Parts = dict[str, np.ndarray]
+"""Part of a face -> its parameters."""
 MIN_WIDTH = {"face": 0.5, "jaw": 0.02, "eyes": 0.1}
 """Least half width of a trained range, in units of coefficients and in radians."""
 OUTER_QUANTILE = 0.01
@@ -60,17 +62,17 @@ class TrainedRange:
     """Middle and half width, per part (`PART_FIELDS`), of what an avatar was trained on; the
     person's quiet face and that of the first frame."""
 
-    middle: dict[str, np.ndarray]
-    width: dict[str, np.ndarray]
-    quiet: dict[str, np.ndarray]
-    first: dict[str, np.ndarray]
+    middle: Parts
+    width: Parts
+    quiet: Parts
+    first: Parts
 
-    def neutral(self, choice: str) -> dict[str, np.ndarray]:
+    def neutral(self, choice: str) -> Parts:
         """The face of one of `NEUTRALS` but "none", on which a relative motion is put."""
         return self.first if choice == "first" else self.quiet
 
 
-def _by_part(frames: Sequence[FlameFrame]) -> dict[str, np.ndarray]:
+def _by_part(frames: Sequence[FlameFrame]) -> Parts:
     """Part -> its parameters (T, K) in all frames."""
     fields = PART_FIELDS.items()
     return {part: np.stack([getattr(frame, name) for frame in frames]) for part, name in fields}
@@ -95,7 +97,7 @@ def trained_range(frames: Sequence[FlameFrame]) -> TrainedRange:
     return TrainedRange(middle, width, quiet_neutral(frames), quiet_neutral(frames[:1]))
 
 
-def quiet_neutral(frames: Sequence[FlameFrame]) -> dict[str, np.ndarray]:
+def quiet_neutral(frames: Sequence[FlameFrame]) -> Parts:
     """Part -> the median of its parameters over the frames most alike: a face returns to rest."""
     parts = _by_part(evenly_spread(frames, MAX_COMPARED_FRAMES))
     face = np.concatenate([parts["face"], parts["jaw"]], axis=1)
@@ -116,7 +118,7 @@ def quiet_weights(performance: Performance) -> np.ndarray:
 
 def exchanged_neutral(
     frames: Sequence[FlameFrame],
-    theirs: Mapping[str, np.ndarray | float] | None = None,
+    theirs: Mapping[str, np.ndarray | float] | None,
     own: Mapping[str, np.ndarray | float] | None = None,
 ) -> list[FlameFrame]:
     """The frames with this head's neutral in place of the other person's, part by part; None: a
@@ -131,7 +133,7 @@ def exchanged_neutral(
     return _with_parts(frames, {part: each + (own[part] - theirs[part]) for part, each in parts})
 
 
-def outside(frames: Sequence[FlameFrame], trained: TrainedRange) -> dict[str, np.ndarray]:
+def outside(frames: Sequence[FlameFrame], trained: TrainedRange) -> Parts:
     """Part -> (T,) how far outside the trained range each frame is: 0 inside, 1 where it is twice
     as far from the middle as the range reaches, for the parameter that is farthest."""
     found = {}
@@ -354,7 +356,7 @@ def performed(
 
 def adapted(
     frames: list[FlameFrame], options: MotionOptions, trained: TrainedRange | None = None
-) -> tuple[list[FlameFrame], dict[str, np.ndarray]]:
+) -> tuple[list[FlameFrame], Parts]:
     """Frames of another's FLAME motion with the options' neutral, strength and range; and how far
     they were `outside`."""
     theirs = {"quiet": frames, "first": frames[:1]}.get(options.neutral)
@@ -364,7 +366,7 @@ def adapted(
 
 
 def prepared_performance(
-    performance: Performance, options: MotionOptions, fps: float | None = None
+    performance: Performance, options: MotionOptions, fps: float | None
 ) -> Performance:
     """Evenly sampled, relative to its neutral, smoothed, `corrected`, at the strength."""
     if fps is not None and not MIN_FPS <= fps <= MAX_FPS:
@@ -406,7 +408,7 @@ def at_strength(performance: Performance, options: MotionOptions) -> Performance
 
 def finished(
     frames: list[FlameFrame], options: MotionOptions, trained: TrainedRange | None
-) -> tuple[list[FlameFrame], dict[str, np.ndarray]]:
+) -> tuple[list[FlameFrame], Parts]:
     """The frames on the head's neutral, at the strength, led back; how far they were outside."""
     if options.neutral != "none" and trained is not None:
         frames = exchanged_neutral(frames, None, trained.neutral(options.neutral))

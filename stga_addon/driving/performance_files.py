@@ -3,7 +3,7 @@
 import math
 import re
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -12,12 +12,23 @@ import numpy as np
 
 from ..errors import StgaError, shorten
 from ..files import read_json, read_table, read_text
-from .clocks import DEFAULT_FPS, MAX_FPS, MIN_FPS, OTHER_RATE, Guess, evened, find_times, numbers
+from .clocks import (
+    DEFAULT_FPS,
+    MAX_FPS,
+    MIN_FPS,
+    OTHER_RATE,
+    Columns,
+    Guess,
+    evened,
+    find_times,
+    numbers,
+)
 from .frame_forms import (
     MAX_ROWS,
     check_rows,
     face_cap_frames,
     is_face_cap,
+    list_of,
     plain_frames,
     read_lines,
     rows_of_shapes,
@@ -155,10 +166,10 @@ def frames_performance(path: Path, document: Any) -> Performance:
     """Performance from a JSON document with frames of weights. Raises StgaError."""
     document = plain_frames(document)
     outer = document if isinstance(document, dict) else {}
-    frames = next((outer[key] for key in FRAME_KEYS if isinstance(outer.get(key), list)), document)
-    if not isinstance(frames, list) or not frames:
+    frames = document if isinstance(document, list) else list_of(outer, FRAME_KEYS)
+    if not frames:
         raise StgaError(f"{path}: has no list of frames; expected one of {', '.join(FRAME_KEYS)}")
-    names = next((outer[key] for key in NAME_KEYS if isinstance(outer.get(key), list)), None)
+    names = list_of(outer, NAME_KEYS)
     rows: list[dict[str, Any]] = []
     others: dict[str, list[object]] = {}
     for number, frame in enumerate(frames):
@@ -274,7 +285,7 @@ def _is_number(value: Any) -> bool:
 def _performance(
     path: Path,
     weights: np.ndarray,
-    others: Mapping[str, Sequence[object]],
+    others: Columns,
     guesses: list[str],
     fps: float | None = None,
     head: np.ndarray | None = None,

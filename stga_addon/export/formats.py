@@ -1,12 +1,10 @@
 """Export formats: a table of their writers, and export of an avatar in one of them."""
 
 import shutil
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
-
-import numpy as np
 
 from ..avatar.embedding import to_world
 from ..avatar.file import Avatar
@@ -17,15 +15,12 @@ from ..flame.sequence import FlameSequence
 from ..format import format_bytes
 from .gltf import write_gltf
 from .playback import Playback, check_rate
-from .ply import ply_bytes, write_gaussian_avatars, write_ply, write_ply_sequence
-from .rig import RiggedAvatar, rigged_avatar
+from .ply import SplatFrames, ply_bytes, write_gaussian_avatars, write_ply, write_ply_sequence
+from .rig import Meshes, RiggedAvatar, rigged_avatar
 from .skinned_gltf import write_skinned_gltf
 from .spz import write_spz
 from .usd import usd_bytes, write_usd
 from .web.page import web_bytes, write_web
-
-Meshes = Iterable[tuple[int, np.ndarray]]
-"""Pairs of a number and a posed mesh (V, 3) meters."""
 
 
 @dataclass(frozen=True)
@@ -89,7 +84,7 @@ class WorldContent:
     values may differ, and how they play. Harmonics are of the degree of the first frame. python: as
     of `Content`."""
 
-    numbered: Iterable[tuple[int, Splats]]
+    numbered: SplatFrames
     playback: Playback
     python: str = ""
     antialiased: bool = False

@@ -23,12 +23,18 @@ TYPES = {1: "SCALAR", 3: "VEC3", 4: "VEC4", 16: "MAT4"}
 COMPONENTS = {np.dtype(kind).name: number for number, kind in DTYPES.items()}
 
 
+Json = dict[str, Any]
+"""A glTF document, or a part of one."""
+Arrays = dict[str, np.ndarray]
+"""Arrays by their names in a file."""
+
+
 class Accessors:
     """Accessors and buffer views of a document, and the binary chunk that they describe."""
 
     def __init__(self) -> None:
-        self.accessors = list[dict[str, Any]]()
-        self.views = list[dict[str, Any]]()
+        self.accessors = list[Json]()
+        self.views = list[Json]()
         self.blocks = list[bytes]()
         self._size = 0
 
@@ -50,19 +56,19 @@ class Accessors:
         view = self.add_view(little_endian(array), **({"target": target} if target else {}))
         return self.append({"bufferView": view} | accessor_of(array) | properties)
 
-    def append(self, accessor: dict[str, Any]) -> int:
+    def append(self, accessor: Json) -> int:
         """Index of an accessor."""
         self.accessors.append(accessor)
         return len(self.accessors) - 1
 
 
-def accessor_of(array: np.ndarray) -> dict[str, Any]:
+def accessor_of(array: np.ndarray) -> Json:
     """Type and number of an accessor's values."""
     kind = TYPES[array.shape[1] if array.ndim > 1 else 1]
     return {"componentType": COMPONENTS[array.dtype.name], "type": kind, "count": len(array)}
 
 
-def range_of(array: np.ndarray) -> dict[str, Any]:
+def range_of(array: np.ndarray) -> Json:
     """Least and largest values of an accessor."""
     rows = array.reshape(len(array), -1)
     return {"min": rows.min(axis=0).tolist(), "max": rows.max(axis=0).tolist()}
@@ -108,7 +114,7 @@ def write_gltf(path: Path, world: Splats) -> None:
         partial.write_bytes(glb_bytes(document, accessors.binary))
 
 
-def _attributes(world: Splats) -> dict[str, np.ndarray]:
+def _attributes(world: Splats) -> Arrays:
     """Semantic -> values, (N,) or (N, 3 or 4), each row a multiple of four bytes."""
     opacity = world.opacities()
     fallback = srgb_to_linear(np.clip(0.5 + SH_C0 * world.sh[:, 0], 0, 1))
@@ -126,7 +132,7 @@ def _attributes(world: Splats) -> dict[str, np.ndarray]:
     return attributes
 
 
-def glb_bytes(document: dict[str, Any], binary: bytes) -> bytes:
+def glb_bytes(document: Json, binary: bytes) -> bytes:
     """A .glb file of a document and its binary chunk."""
     text = json.dumps(document, ensure_ascii=False, allow_nan=False, separators=(",", ":")).encode()
     text += b" " * (-len(text) % 4)

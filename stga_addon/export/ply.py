@@ -51,7 +51,11 @@ def write_ply(path: Path, world: Splats) -> None:
         save_columns(partial, PROPERTIES, splat_columns(world))
 
 
-def write_ply_sequence(folder: Path, frames: Iterable[tuple[int, Splats]]) -> list[Path]:
+SplatFrames = Iterable[tuple[int, Splats]]
+"""Splats in world space with the numbers of their frames."""
+
+
+def write_ply_sequence(folder: Path, frames: SplatFrames) -> list[Path]:
     """Write numbered world-space splats as 00012.ply, … into `folder`, all or none; returns the
     files.
 

@@ -14,6 +14,8 @@ from ..flame.parts import FLAME_SIZES
 from ..flame.quaternions import from_matrices, to_axis_angle
 from ..flame.sequence import FlameSequence, motion_arrays, with_identity
 
+Meshes = Iterable[tuple[int, np.ndarray]]
+"""Pairs of a number and a posed mesh (V, 3) meters."""
 BUNDLED_NOTICE = (
     "Contains a head derived from ICT-FaceKit. MIT License, Copyright (c) 2020 USC Institute for "
     "Creative Technologies."
@@ -106,10 +108,10 @@ class RiggedAvatar:
 
 def rigged_avatar(
     avatar: Avatar,
-    meshes: Iterable[tuple[int, np.ndarray]],
+    meshes: Meshes,
     sequence: FlameSequence | None,
-    motion_only: bool = False,
-    controls: ShapeControls | None = None,
+    motion_only: bool,
+    controls: ShapeControls | None,
 ) -> RiggedAvatar:
     """An avatar with the rig of its FLAME motion, unless `motion_only`; else with a rig without
     shapes that plays the numbered posed meshes (V, 3), which are only then taken.

@@ -4,7 +4,6 @@ bound to its triangles (docs/formats.md)."""
 import gzip
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -16,7 +15,7 @@ from ..capture.glb import DTYPES, WIDTHS, glb_chunks
 from ..errors import StgaError
 from ..files import replacing
 from ..light.relight import Relighter
-from .gltf import GENERATOR, glb_bytes
+from .gltf import GENERATOR, Arrays, Json, glb_bytes
 from .playback import Playback
 from .rig import Rig, RiggedAvatar, ShapeControls
 from .skinned_mesh import BASE_STEP_M, SHAPE_STEP_M, skinned_mesh
@@ -41,16 +40,14 @@ MIN_OPACITY = 1 / 255
 """Least opacity that any renderer draws."""
 
 
-def pack(
-    arrays: Mapping[str, np.ndarray], steps: Mapping[str, float]
-) -> tuple[dict[str, Any], bytes]:
+def pack(arrays: Mapping[str, np.ndarray], steps: Mapping[str, float]) -> tuple[Json, bytes]:
     """Entries of arrays in the header, and their values compressed: by their names in fixed point
     as multiples of a step, with an error of at most half of it (along the axes of TURNED).
 
     Other integers are stored exactly, others in float32. Equal contents give equal bytes. Raises
     ValueError where a value is not finite, or too many steps from zero.
     """
-    entries = dict[str, Any]()
+    entries = Json()
     blocks = list[bytes]()
     for name, array in _turned(arrays, steps).items():
         entries[name], block = _entry(name, array, steps.get(name))
@@ -58,7 +55,7 @@ def pack(
     return entries, gzip.compress(b"".join(blocks), GZIP_LEVEL, mtime=0)
 
 
-def _turned(arrays: Mapping[str, np.ndarray], steps: Mapping[str, float]) -> dict[str, np.ndarray]:
+def _turned(arrays: Mapping[str, np.ndarray], steps: Mapping[str, float]) -> Arrays:
     """The arrays, those of TURNED along axes that follow them."""
     turned = dict(arrays)
     for name in TURNED:
@@ -70,7 +67,7 @@ def _turned(arrays: Mapping[str, np.ndarray], steps: Mapping[str, float]) -> dic
     return turned
 
 
-def _entry(name: str, array: np.ndarray, step: float | None) -> tuple[dict[str, Any], bytes]:
+def _entry(name: str, array: np.ndarray, step: float | None) -> tuple[Json, bytes]:
     """Header entry and stored bytes of an array."""
     if step is not None:
         steps = np.rint(np.asarray(array, np.float64) / step)
@@ -158,9 +155,7 @@ def skinned_glb(rigged: RiggedAvatar, playback: Playback, exact: bool = False) -
     return glb_bytes(document, binary)
 
 
-def _splat_data(
-    rigged: RiggedAvatar, playback: Playback
-) -> tuple[dict[str, Any], dict[str, np.ndarray], dict[str, float]]:
+def _splat_data(rigged: RiggedAvatar, playback: Playback) -> tuple[Json, Arrays, dict[str, float]]:
     """Header, arrays and the steps of these."""
     avatar = rigged.avatar
     rig = rigged.rig
@@ -224,7 +219,7 @@ def glb_of(path: Path, rigged: RiggedAvatar, playback: Playback) -> bytes:
         raise StgaError(f"{path}: the avatar cannot be exported ({error})") from error
 
 
-def _splat_arrays(splats: Splats) -> dict[str, np.ndarray]:
+def _splat_arrays(splats: Splats) -> Arrays:
     largest, smaller = smallest_three(splats.rotation)
     view = splats.sh[:, 1:].reshape(len(splats), -1)
     return {
@@ -239,9 +234,7 @@ def _splat_arrays(splats: Splats) -> dict[str, np.ndarray]:
     }
 
 
-def _add_controls(
-    header: dict[str, Any], arrays: dict[str, np.ndarray], controls: ShapeControls
-) -> None:
+def _add_controls(header: Json, arrays: Arrays, controls: ShapeControls) -> None:
     arrays |= {"shape_linear": controls.linear, "shape_products": controls.products}
     header["shapes"] = {
         "names": list(controls.names),
@@ -251,8 +244,8 @@ def _add_controls(
 
 
 def _add_light(
-    header: dict[str, Any],
-    arrays: dict[str, np.ndarray],
+    header: Json,
+    arrays: Arrays,
     relighter: Relighter,
     moved: np.ndarray,
 ) -> None:
@@ -274,7 +267,7 @@ def _add_light(
     }
 
 
-def _header(avatar: Avatar, rig: Rig, playback: Playback) -> dict[str, Any]:
+def _header(avatar: Avatar, rig: Rig, playback: Playback) -> Json:
     """All fields but those of shapes, light and arrays."""
     # Sliders: every expression with its range, those that the motion uses most first.
     names = rig.shape_names

@@ -1,12 +1,11 @@
 """The mesh of a rig as glTF: skin, morph targets and motion."""
 
 import itertools
-from typing import Any
 
 import numpy as np
 
 from ..flame.quaternions import continuous, from_axis_angle
-from .gltf import COMPONENTS, VERTICES, Accessors, accessor_of, little_endian, range_of
+from .gltf import COMPONENTS, VERTICES, Accessors, Json, accessor_of, little_endian, range_of
 from .rig import Rig
 
 QUANTIZATION = "KHR_mesh_quantization"
@@ -24,9 +23,7 @@ _INDICES = 34963
 _SKIN_COLOR = [0.6, 0.42, 0.33, 1.0]
 
 
-def skinned_mesh(
-    rig: Rig, faces: np.ndarray, fps: float, exact: bool
-) -> tuple[dict[str, Any], Accessors]:
+def skinned_mesh(rig: Rig, faces: np.ndarray, fps: float, exact: bool) -> tuple[Json, Accessors]:
     """A document with the mesh, triangles `faces` (F, 3), and its accessors, to which more may be
     added; `exact`: displacements in float32, not in steps of SHAPE_STEP_M.
 
@@ -48,7 +45,7 @@ def skinned_mesh(
         "indices": accessors.add(indices, _INDICES),
         "material": 0,
     }
-    mesh: dict[str, Any] = {"name": "Head", "primitives": [primitive]}
+    mesh: Json = {"name": "Head", "primitives": [primitive]}
     if len(rig.basis):
         primitive["targets"] = _targets(rig.basis / unit, unit, accessors, exact)
         others = (f"motion_{k:03d}" for k in range(len(rig.basis) - rig.expressions))
@@ -59,7 +56,7 @@ def skinned_mesh(
     count = len(rig.parents)
     roots = [joint for joint in range(count) if rig.parents[joint] < 0]
     bind = _bind(rig, unit, accessors)
-    document: dict[str, Any] = {
+    document: Json = {
         "scene": 0,
         "scenes": [{"nodes": [*roots, count]}],
         "nodes": [*_joints(rig), {"name": "Head", "mesh": 0, "skin": 0}],
@@ -73,7 +70,7 @@ def skinned_mesh(
     return document, accessors
 
 
-def _material() -> dict[str, Any]:
+def _material() -> Json:
     look = {"baseColorFactor": _SKIN_COLOR, "metallicFactor": 0.0, "roughnessFactor": 0.6}
     return {"name": "Skin", "pbrMetallicRoughness": look, "doubleSided": True}
 
@@ -139,12 +136,12 @@ def _targets(
     return targets
 
 
-def _joints(rig: Rig) -> list[dict[str, Any]]:
+def _joints(rig: Rig) -> list[Json]:
     """Nodes of the joints, at rest."""
     nodes = []
     for joint, parent in enumerate(rig.parents):
         place = rig.joint_rest[joint] - (rig.joint_rest[parent] if parent >= 0 else 0)
-        node: dict[str, Any] = {"name": rig.joint_names[joint], "translation": place.tolist()}
+        node: Json = {"name": rig.joint_names[joint], "translation": place.tolist()}
         children = [child for child, other in enumerate(rig.parents) if other == joint]
         nodes.append(node | ({"children": children} if children else {}))
     return nodes
@@ -157,13 +154,13 @@ def _bind(rig: Rig, unit: float, accessors: Accessors) -> int:
     return accessors.add(columns.astype(np.float32))
 
 
-def _animation(rig: Rig, fps: float, accessors: Accessors) -> dict[str, Any]:
+def _animation(rig: Rig, fps: float, accessors: Accessors) -> Json:
     """The motion: rotations of the joints, translation of the root, weights of the shapes."""
     frames = len(rig.pose)
     seconds = (np.arange(frames) / fps).astype(np.float32)
     times = accessors.add(seconds, **range_of(seconds))
-    samplers = list[dict[str, Any]]()
-    channels = list[dict[str, Any]]()
+    samplers = list[Json]()
+    channels = list[Json]()
 
     def add(node: int, path: str, values: np.ndarray) -> None:
         output = accessors.add(np.ascontiguousarray(values, np.float32))

@@ -6,7 +6,6 @@ import zlib
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -19,6 +18,7 @@ from ..files import read_bytes, write_npz
 from ..flame.model import JOINTS, POSE_FEATURES, model_of
 from ..flame.quaternions import to_axis_angle
 from ..flame.sequence import motion_of
+from .gltf import Arrays, Json
 from .playback import MAX_FPS, MIN_FPS
 from .rig import Rig
 from .skinned_gltf import AXES, EXTRA, VERSION
@@ -110,7 +110,7 @@ def _flame_joints(path: Path, rig: Rig) -> list[int]:
     raise StgaError(f"{path}: has the joints {joints}; expected of {', '.join(JOINTS)}")
 
 
-def _model(path: Path, rig: Rig, faces: np.ndarray) -> dict[str, np.ndarray]:
+def _model(path: Path, rig: Rig, faces: np.ndarray) -> Arrays:
     """Arrays of a FLAME model; of each joint that the rig lacks, one that moves nothing. Raises
     StgaError as `_flame_joints`."""
     own = rig.basis[: rig.expressions]
@@ -147,7 +147,7 @@ def _model(path: Path, rig: Rig, faces: np.ndarray) -> dict[str, np.ndarray]:
     return arrays
 
 
-def _motion(path: Path, rig: Rig) -> dict[str, np.ndarray]:
+def _motion(path: Path, rig: Rig) -> Arrays:
     """Arrays of a FLAME motion. Raises StgaError as `_flame_joints`, and where it is too large."""
     frames = len(rig.pose)
     turns = np.zeros((frames, len(JOINTS), 3))
@@ -179,14 +179,14 @@ def _whole(value: object, least: int = 0) -> int:
     return value
 
 
-def _number(values: dict[str, Any], name: str) -> float:
+def _number(values: Json, name: str) -> float:
     """Raises ValueError unless it is a number, as true is not."""
     if type(values[name]) not in (int, float):
         raise ValueError(f"{name} is {shorten(values[name])}; expected a number")
     return float(values[name])
 
 
-def _arrays(entries: dict[str, Any], packed: bytes) -> dict[str, np.ndarray]:
+def _arrays(entries: Json, packed: bytes) -> Arrays:
     """Those of KNOWN_ARRAYS by their entries in the header. Raises ValueError where they are not
     whole, or, before they are unpacked, too large."""
     shapes = {name: [_whole(n) for n in entry["shape"]] for name, entry in entries.items()}
@@ -199,7 +199,7 @@ def _arrays(entries: dict[str, Any], packed: bytes) -> dict[str, np.ndarray]:
         raise ValueError("its arrays are larger than any avatar's")
     stream = zlib.decompressobj(wbits=zlib.MAX_WBITS | 16)
     rest = packed
-    arrays = dict[str, np.ndarray]()
+    arrays = Arrays()
     for name, entry in entries.items():
         raw = b""
         missing = sizes[name]
@@ -223,7 +223,7 @@ def _arrays(entries: dict[str, Any], packed: bytes) -> dict[str, np.ndarray]:
     return arrays
 
 
-def _planes(entry: dict[str, Any]) -> int:
+def _planes(entry: Json) -> int:
     """Bytes of a number of an array. Raises ValueError."""
     if entry["type"] == "float32":
         return np.dtype(np.float32).itemsize
@@ -233,7 +233,7 @@ def _planes(entry: dict[str, Any]) -> int:
     return planes
 
 
-def _array(entry: dict[str, Any], shape: list[int], planes: int, raw: bytes) -> np.ndarray:
+def _array(entry: Json, shape: list[int], planes: int, raw: bytes) -> np.ndarray:
     """An array by its entry and its bytes. Raises ValueError."""
     block = np.frombuffer(raw, np.uint8)
     if entry["type"] == "float32":
@@ -248,7 +248,7 @@ def _array(entry: dict[str, Any], shape: list[int], planes: int, raw: bytes) -> 
     return values * _number(entry, "step") if entry["type"] == "fixed" else values
 
 
-def _joints(document: dict[str, Any]) -> list[int]:
+def _joints(document: Json) -> list[int]:
     """Nodes of the skin's joints. Raises ValueError where they are malformed."""
     joints = [_whole(joint) for joint in document["skins"][0]["joints"]]
     if len(set(joints)) != len(joints) or not 0 < len(joints) <= len(JOINTS):
@@ -273,7 +273,7 @@ def _bind(matrices: np.ndarray) -> tuple[float, np.ndarray]:
 
 
 def _mesh(
-    document: dict[str, Any], binary: bytes, joints: int, unit: float
+    document: Json, binary: bytes, joints: int, unit: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Base (V, 3), shapes (R, V, 3) and skinning weights (V, J). Raises ValueError where they are
     together larger than the file can hold."""
@@ -301,7 +301,7 @@ def _mesh(
 
 
 def _animated(
-    document: dict[str, Any], binary: bytes, joints: list[int], shapes: int
+    document: Json, binary: bytes, joints: list[int], shapes: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Rotations (T, J, 4) xyzw, translation (T, 3) of the root and weights (T, R) of the motion."""
     motion = document["animations"][0]
@@ -328,9 +328,7 @@ def _animated(
     return turns, values(outputs["translation", joints[0]], frames, 3), coefficients
 
 
-def _rig(
-    document: dict[str, Any], binary: bytes, arrays: dict[str, np.ndarray], header: dict[str, Any]
-) -> tuple[Rig, np.ndarray]:
+def _rig(document: Json, binary: bytes, arrays: Arrays, header: Json) -> tuple[Rig, np.ndarray]:
     """The rig, and the mesh's triangles (F, 3). Raises one of UNREADABLE."""
     values = partial(accessor_values, document, binary)
     joints = _joints(document)
@@ -371,9 +369,7 @@ def _rig(
     return rig, values(mesh["primitives"][0]["indices"], width=1).reshape(-1, 3).astype(np.int32)
 
 
-def _avatar(
-    header: dict[str, Any], arrays: dict[str, np.ndarray], rig: Rig, faces: np.ndarray
-) -> Avatar:
+def _avatar(header: Json, arrays: Arrays, rig: Rig, faces: np.ndarray) -> Avatar:
     per_face = arrays["splats_per_face"]
     count = len(arrays["xyz"])
     if len(per_face) != len(faces) or per_face.min() < 0 or per_face.sum() != count:
@@ -412,7 +408,7 @@ def _avatar(
     )
 
 
-def _light(header: dict[str, Any], arrays: dict[str, np.ndarray]) -> AvatarLight | None:
+def _light(header: Json, arrays: Arrays) -> AvatarLight | None:
     if "light" not in header:
         return None
     own = header["light"]

@@ -5,7 +5,6 @@ import errno
 import os
 import sys
 import zipfile
-from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, BinaryIO, cast
@@ -19,6 +18,7 @@ from ..worker.helpers import claim_stdout
 from ..worker.launch import start_piped
 from ..worker.messages import receive, send
 from ..worker.training_python import own_python
+from .ply import SplatFrames
 
 PRIM_TYPE = "ParticleField3DGaussianSplat"
 COEFFICIENTS = "radiance:sphericalHarmonicsCoefficients"
@@ -36,10 +36,10 @@ ERROR = "error"
 
 def write_usd(
     path: Path,
-    frames: Iterable[tuple[int, Splats]],
+    frames: SplatFrames,
     fps: float,
-    moving_color: bool = False,
-    python: str = "",
+    moving_color: bool,
+    python: str,
 ) -> None:
     """Write numbered world-space splats as the time samples of one prim, atomically.
 
@@ -90,7 +90,7 @@ def _write_file(
     usd: Any,
     file: Path,
     path: Path,
-    frames: Iterable[tuple[int, Splats]],
+    frames: SplatFrames,
     fps: float,
     moving_color: bool,
 ) -> None:
@@ -118,7 +118,7 @@ def _write_elsewhere(
     python: str,
     file: Path,
     path: Path,
-    frames: Iterable[tuple[int, Splats]],
+    frames: SplatFrames,
     fps: float,
     moving_color: bool,
 ) -> None:
@@ -163,7 +163,7 @@ def serve(requests: BinaryIO, answers: BinaryIO, file: Path, path: Path, *settin
     if usd is None:
         return
 
-    def frames() -> Iterator[tuple[int, Splats]]:
+    def frames() -> SplatFrames:
         while arrays := receive(requests):
             number = int(arrays.pop(NUMBER))
             yield number, Splats(**arrays)
@@ -183,9 +183,7 @@ def usd_bytes(splats: Splats, frames: int, moving_color: bool) -> int:
     return len(splats) * (once + each * frames)
 
 
-def _write_layer(
-    usd: Any, file: Path, frames: Iterable[tuple[int, Splats]], fps: float, moving_color: bool
-) -> None:
+def _write_layer(usd: Any, file: Path, frames: SplatFrames, fps: float, moving_color: bool) -> None:
     layer = usd.Sdf.Layer.New(usd.Sdf.FileFormat.FindById("usdc"), str(file))
     stage = usd.Usd.Stage.Open(layer)
     usd.UsdGeom.SetStageMetersPerUnit(stage, 1.0)

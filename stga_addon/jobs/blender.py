@@ -17,7 +17,6 @@ from ..options import like
 from ..progress import Cancelled, Log, Progress, Report, Written, counted
 from ..render.device import Composer
 from ..render.video import (
-    check_output,
     finished,
     is_video,
     recorded_images,
@@ -55,11 +54,6 @@ class RenderRecording:
     fps: float = setting(above=0)
     background: tuple[float, float, float] | None = setting(None, 0, 1)
     device: str = like(Train, "device")
-
-
-def check_recording(request: RenderRecording) -> None:
-    """Raise StgaError where the output cannot be written."""
-    check_output(request.output)
 
 
 def render_recording(request: RenderRecording, report: Report, log: Log) -> Written:

@@ -19,13 +19,12 @@ from ..export.formats import (
     FORMATS,
     Content,
     Format,
-    Meshes,
     check_free_space,
     check_suffix,
     export_avatar,
 )
 from ..export.playback import DEFAULT_FPS, MAX_VIEWS, Playback, playback_fps
-from ..export.rig import flame_notice
+from ..export.rig import Meshes, flame_notice
 from ..files import is_folder
 from ..flame.sequence import FlameSequence
 from ..format import format_bytes, format_name

@@ -42,9 +42,7 @@ def start_check(python: str) -> "subprocess.Popen[str]":
     )
 
 
-def finish_check(
-    python: str, process: "subprocess.Popen[str]", timeout_s: float = CHECK_TIMEOUT_S
-) -> Checked:
+def finish_check(python: str, process: "subprocess.Popen[str]", timeout_s: float) -> Checked:
     """Wait for a check; StgaError, and its end, where it lacks something or does not answer."""
     with process:
         try:

@@ -7,11 +7,11 @@ from pathlib import Path
 from typing import Any, Union
 
 from ..progress import Written
+from ..render.video import check_output
 from .analyze import Analyze, Analyzed, Select, TimePresets, analyze, select, time_each_preset
 from .blender import (
     RenderBlend,
     RenderRecording,
-    check_recording,
     pictures,
     render_blend,
     render_recording,
@@ -24,7 +24,7 @@ from .track import (
     MakeAvatar,
     SolveAgain,
     Track,
-    check_avatar,
+    check_inputs,
     extend,
     make_avatar,
     refuse_tracked,
@@ -128,7 +128,12 @@ JOBS: dict[type[Any], Job] = {
     Resume: Job(train_and_finish, Kind.TRAINING, "run", check=require_run),
     Track: Job(track, Kind.TRACKING, "out", check=refuse_tracked, left=untracked, output="out"),
     SolveAgain: Job(solve_again, Kind.TRACKING, "capture", check=require_tracked),
-    MakeAvatar: Job(make_avatar, Kind.AVATAR, "out", check=check_avatar),
+    MakeAvatar: Job(
+        make_avatar,
+        Kind.AVATAR,
+        "out",
+        check=lambda request: check_inputs(request.track, request.takes),
+    ),
     Analyze: Job(analyze, Kind.ANALYSIS, "capture"),
     TimePresets: Job(time_each_preset),
     Select: Job(select),
@@ -137,7 +142,11 @@ JOBS: dict[type[Any], Job] = {
     MakeExact: Job(make_exact, Kind.EXACT, "run"),
     Render: Job(render, output="output"),
     RenderRecording: Job(
-        render_recording, Kind.VIDEO, "output", check=check_recording, output="output"
+        render_recording,
+        Kind.VIDEO,
+        "output",
+        check=lambda request: check_output(request.output),
+        output="output",
     ),
     RenderBlend: Job(render_blend, output="output", files=pictures),
     Export: Job(export, output="output"),

@@ -574,12 +574,7 @@ def _kinds(request: MakeAvatar, report: Report, log: Log) -> list[str]:
     return kinds
 
 
-def check_avatar(request: MakeAvatar) -> None:
-    """Raise StgaError as `check_inputs`."""
-    check_inputs(request.track, request.takes)
-
-
-def check_inputs(track: Track, takes: Sequence[Path] = ()) -> None:
+def check_inputs(track: Track, takes: Sequence[Path]) -> None:
     """Raise StgaError where the folder began with other inputs, or holds something else."""
     out = track.out.parent
     inputs = _inputs(track, takes)

@@ -115,6 +115,11 @@ def open_sidebar(tab: str, screens: Iterable[Any]) -> bool:
     return is_shown
 
 
+def shown_screens() -> list[Any]:
+    """The screens of all windows."""
+    return [window.screen for window in bpy.context.window_manager.windows]
+
+
 def viewports(screens: Iterable[Any]) -> list[Any]:
     """3D viewports of the screens, as areas."""
     return [area for screen in screens for area in screen.areas if area.type == "VIEW_3D"]

@@ -285,7 +285,7 @@ def turntable_cameras(subject: Any, depsgraph: Any, count: int, angle: float) ->
     sides that the cameras of the capture saw, a full turn where there are none."""
     start = scene_camera(depsgraph)
     matrix = np.array(subject.matrix_world, np.float64)
-    if subject.get(tags.KIND) == tags.SPLATS:  # in world space, some of them far away
+    if tags.is_splats(subject):  # in world space, some of them far away
         middle = np.median(arrays.mesh_vertices(subject.data), axis=0)
     else:
         vertices = arrays.evaluated_vertices(subject)

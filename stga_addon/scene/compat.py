@@ -44,7 +44,7 @@ def stored_value(settings: Any, name: str) -> str:
 def action_curves(owner: Any) -> Any:
     """The f-curves that animate the data-block `owner`, whose action (and slot) is made where
     missing."""
-    animation = owner.animation_data or owner.animation_data_create()
+    animation = owner.animation_data_create()
     if animation.action is None:
         animation.action = bpy.data.actions.new(f"{owner.name} action")
     action = animation.action
@@ -119,17 +119,15 @@ def animation_curves(owner: Any) -> list[Any]:
 def copy_action(owner: Any, name: str) -> Any:
     """Give `owner` a copy of its action, or an empty one; the old one stays in the file. Returns
     the new action's f-curves."""
-    animation = owner.animation_data or owner.animation_data_create()
+    animation = owner.animation_data_create()
     old = animation.action
     if old is None:
         animation.action = bpy.data.actions.new(name)
         return action_curves(owner)
-    slot = animation.action_slot.identifier if SLOTTED_ACTIONS and animation.action_slot else None
     old.use_fake_user = True
-    animation.action = old.copy()
-    animation.action.name = name
-    if slot is not None:
-        animation.action_slot = animation.action.slots[slot]
+    copy = old.copy()
+    copy.name = name
+    assign_action(animation, copy, slot_of(animation))
     return action_curves(owner)
 
 
@@ -250,7 +248,7 @@ def give_animation(owner: Any, kept: KeptAnimation) -> None:
     own, which stays in the file, once."""
     if not kept.fields:
         return
-    animation = owner.animation_data or owner.animation_data_create()
+    animation = owner.animation_data_create()
     for name, value in kept.fields.items():
         setattr(animation, name, value)
     for track_fields, strips in kept.tracks:

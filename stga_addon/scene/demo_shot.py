@@ -1,7 +1,6 @@
 """The demo's shot: its avatar on a body, among objects, lit, in motion, seen through a lens."""
 
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,14 +12,12 @@ from ..driving.open_motion import MotionOptions, performed
 from ..driving.performers import read_performance
 from ..flame.quaternions import from_axis_angle
 from ..flame.sequence import FlameSequence
-from . import light, tags
 from .arrays import evaluated_vertices
 from .avatar_scene import viewports
 from .compat import action_curves, enable_nodes
 from .duplicate import attach_to_bone
 from .light import lighting_settings
-from .objects import save_file, set_frames_per_second
-from .render import engine
+from .objects import set_frames_per_second
 from .render.film_set import show_set
 from .render.scene_splats import SplatCache, level_exposure
 from .render.viewport_display import ENGINE
@@ -60,30 +57,6 @@ LOOK_DEG = {62: 0.0, 65: 16.0, 82: 16.0, 86: 0.0}
 """Frame -> turn of both eyes to the person's left."""
 TURN_DEG = {1: -14.0, 40: 6.0, 96: 16.0}
 """Frame -> turn of the body about its spine."""
-
-
-def make_shot(path: Path, person: FlameSequence, speech: Path) -> None:
-    """Build the shot around the head with splats in the open file, and save it. Raises
-    StgaError."""
-    heads = [each for each in bpy.context.scene.objects if each.get(tags.KIND) == tags.HEAD]
-    with _registered():
-        build_shot(heads[0], person, speech)
-        save_file(path)
-
-
-@contextmanager
-def _registered() -> Iterator[None]:
-    """Register the engine and the settings of lighting for the block, where no extension has."""
-    if lighting_settings(bpy.context.scene) is not None:
-        yield
-        return
-    light.register()
-    engine.register(lambda: "")
-    try:
-        yield
-    finally:
-        engine.unregister()
-        light.unregister()
 
 
 def build_shot(head: Any, person: FlameSequence, speech: Path) -> None:
@@ -126,7 +99,7 @@ def _placed(name: str, data: Any, location: Sequence[float] = (0, 0, 0)) -> Any:
     return made
 
 
-def _painted(thing: Any, color: Sequence[float], roughness: float = 0.6) -> Any:
+def _painted(thing: Any, color: Sequence[float], roughness: float) -> Any:
     material = bpy.data.materials.new(thing.name)
     shader = enable_nodes(material).nodes["Principled BSDF"]
     shader.inputs["Base Color"].default_value = (*color, 1.0)

@@ -21,14 +21,12 @@ BLOCKS = ("objects", "meshes", "armatures", "actions", "node_groups", "materials
 """Kinds of data that come with them."""
 
 
-def duplicate_avatar(head: Any, linked: bool = False) -> Any:
+def duplicate_avatar(head: Any, linked: bool) -> Any:
     """Copy the avatar of a head beside all heads, into a collection of its own; the new head.
 
     linked: whether both play the same keyframes. Raises StgaError where the head cannot be copied.
     """
-    root = mover_of(head)
-    if root is head or root.library is not None or head.library is not None:
-        raise StgaError(f"{head.name}: is linked, or has lost the Empty that holds it")
+    root = _own_root(head)
     family = [root, *(part for part in root.children if part.get(tags.KIND) in COPIED)]
     before = set(_blocks())
     copies = _written_and_read(family)
@@ -40,9 +38,17 @@ def duplicate_avatar(head: Any, linked: bool = False) -> Any:
         bpy.data.batch_remove(unused)
         unused = {block for block in set(_blocks()) - before if not block.users}
     new_head = copies[family.index(head)]
-    heads = [each for each in bpy.context.scene.objects if each.get(tags.KIND) == tags.HEAD]
+    heads = tags.heads_of(bpy.context.scene)
     place_beside(new_head, [each for each in heads if each != new_head])
     return new_head
+
+
+def _own_root(head: Any) -> Any:
+    """The Empty that holds an avatar's parts. Raises StgaError without one, or for a linked one."""
+    root = mover_of(head)
+    if root is head or root.library is not None:
+        raise StgaError(f"{head.name}: is linked, or has lost the Empty that holds it")
+    return root
 
 
 def _blocks() -> Iterator[Any]:
@@ -118,10 +124,8 @@ def _parent_of(collection: Any) -> Any:
 def attach_to_bone(head: Any, armature: Any, bone: str) -> None:
     """Let an avatar ride on a bone of another armature, from where it is now; it keeps its own
     neck. bone "": let it go where it is. Raises StgaError."""
-    root = mover_of(head)
+    root = _own_root(head)
     place = root.matrix_world.copy()
-    if root is head or root.library is not None:
-        raise StgaError(f"{head.name}: is linked, or has lost the Empty that holds it")
     if bone and (armature is None or bone not in armature.data.bones):
         raise StgaError(f"{bone}: is no bone of {getattr(armature, 'name', 'an armature')}")
     if bone and root in _above(armature):

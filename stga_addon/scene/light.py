@@ -18,8 +18,7 @@ from ..light.values import SKIN_ROUGHNESS, Caster, Light, Lighting
 from . import tags
 from .arrays import mesh_vertices, read_values
 from .compat import light_strength, shader_nodes
-from .display import splat_nodes
-from .display.splat_object import get_input
+from .display.splat_object import followed_head
 from .layers import Relit
 
 PROPERTY = "stga_lighting"  # the scene's `LightingSettings`
@@ -353,15 +352,15 @@ def _casters(visible: Iterable[tuple[Any, Any]], depsgraph: Any) -> Iterable[tup
     do."""
     heads = set()
     for each, matrix in visible:
-        if each.get(tags.KIND) == tags.SPLATS:
-            head = get_input(each, splat_nodes.HEAD) if tags.CONVENTION in each else None
+        if tags.is_splats(each):
+            head = followed_head(each)
             if head is not None and head not in heads:
                 heads.add(head)
                 local = head.evaluated_get(depsgraph).matrix_world
                 # instances move splats and head together
                 placed = each.evaluated_get(depsgraph).matrix_world
                 yield head, _read(head, matrix @ placed.inverted_safe() @ local, depsgraph)
-        elif each.type == "MESH" and each.visible_shadow and each.get(tags.KIND) != tags.HEAD:
+        elif each.type == "MESH" and each.visible_shadow and not tags.is_head(each):
             yield each, _read(each, matrix, depsgraph)
 
 
@@ -379,14 +378,14 @@ def _moved(caster: Caster, matrix: np.ndarray) -> Caster:
 
 def throws_shadow(splat_object: Any) -> bool:
     """Whether a splat object's head throws its shadow in images, and is not seen."""
-    head = get_input(splat_object, splat_nodes.HEAD)
+    head = followed_head(splat_object)
     is_hidden = head is None or head.hide_render or head.visible_camera
     return not is_hidden and bool(head.visible_shadow)
 
 
 def throw_shadow(splat_object: Any, is_on: bool) -> None:
     """Let the head throw its shadow onto the scene unseen, or hide it from images again."""
-    head = get_input(splat_object, splat_nodes.HEAD)
+    head = followed_head(splat_object)
     head.hide_render = not is_on
     head.visible_shadow = True
     for ray in ("camera", "diffuse", "glossy", "transmission", "volume_scatter"):

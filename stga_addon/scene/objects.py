@@ -191,11 +191,6 @@ def _purge(datas: Iterable[Any], actions: Iterable[Any]) -> None:
     bpy.data.batch_remove({block for block in left if block is not None and not block.users})
 
 
-def new_file() -> None:
-    """Start from an empty file with factory settings: no default cube, no user preferences."""
-    bpy.ops.wm.read_factory_settings(use_empty=True)
-
-
 def empty_file() -> None:
     """Start from an empty file; preferences and add-ons stay."""
     bpy.ops.wm.read_homefile(use_empty=True)
@@ -212,22 +207,6 @@ def save_file(path: Path) -> None:
         raise StgaError(f"{path}: cannot be saved ({error})") from error
 
 
-def open_file(path: Path) -> None:
-    """Open a .blend file. Raises StgaError where it cannot be read."""
-    try:
-        bpy.ops.wm.open_mainfile(filepath=str(path.resolve()))
-    except RuntimeError as error:
-        raise StgaError(f"{path}: cannot be opened ({error})") from error
-
-
-def object_named(name: str) -> Any:
-    """The object of that name in the open file. Raises StgaError where there is none."""
-    found = bpy.data.objects.get(name)
-    if found is None:
-        raise StgaError(f"{bpy.data.filepath}: has no object '{name}'")
-    return found
-
-
 def frames_per_second(scene: Any) -> float:
     """At which the scene plays."""
     return float(scene.render.fps / scene.render.fps_base)
@@ -238,6 +217,11 @@ def set_frames_per_second(scene: Any, rate: float) -> None:
     whole = max(1, round(rate))
     scene.render.fps = whole
     scene.render.fps_base = whole / rate
+
+
+def own_scenes() -> list[Any]:
+    """The scenes of the open file that are not linked."""
+    return [scene for scene in bpy.data.scenes if scene.library is None]
 
 
 class Identity:

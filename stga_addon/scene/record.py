@@ -26,7 +26,7 @@ COPIED = "copybuffer.blend"
 def owner_of(scene: Any, head: Any) -> Any:
     """What stores the paths of the scene's head: the scene, where that is None or linked, or a
     library override, of which Blender saves no new properties."""
-    if head is None or head.get(tags.KIND) != tags.HEAD:
+    if not tags.is_head(head):
         return scene
     return head if head.library is None and head.override_library is None else scene
 

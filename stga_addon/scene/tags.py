@@ -74,6 +74,21 @@ def mark(obj: Any, kind: str, capture: Path) -> None:
     obj[CAPTURE] = str(capture.resolve())
 
 
+def is_head(thing: Any) -> bool:
+    """Whether an object (or None) is a head that was imported from a capture."""
+    return thing is not None and thing.get(KIND) == HEAD
+
+
+def heads_of(scene: Any) -> list[Any]:
+    """The heads of a scene, also linked ones."""
+    return [thing for thing in scene.objects if is_head(thing)]
+
+
+def is_splats(thing: Any) -> bool:
+    """Whether an object is one of splats that the add-on shows."""
+    return bool(thing.get(KIND) == SPLATS)
+
+
 def find(kind: str, capture: Path) -> list[Any]:
     """All objects of a kind in the current scene that were made from the capture in folder
     `capture`. Objects linked from other files are left out: they cannot be edited here."""

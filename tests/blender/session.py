@@ -6,6 +6,7 @@ from pathlib import Path
 import bpy
 import numpy as np
 import pytest
+from capture.factory import write_flame_capture
 from PIL import Image
 
 from stga_addon.scene.render.scene_splats import SplatCache, visible_layers
@@ -46,6 +47,21 @@ def failure(sentence):
 def panel():
     """The settings of the scene, which the panel shows."""
     return bpy.context.scene.stga
+
+
+def import_flame(folder):
+    """A FLAME capture written into a folder and imported: capture and model."""
+    capture, model = write_flame_capture(folder)
+    ops.import_capture(directory=capture, flame=model)
+    return capture, model
+
+
+def bring(file, how, name):
+    """Append, link or, as one instance, link a collection of a file into the open one."""
+    within = f"{file}/Collection/"
+    operator = bpy.ops.wm.append if how in ("append", "paste") else bpy.ops.wm.link
+    more = {"instance_collections": how == "instance"}
+    operator(filepath=within + name, directory=within, filename=name, **more)
 
 
 def state_of(kind):

@@ -6,7 +6,7 @@ from importlib import import_module
 import bpy
 import numpy as np
 import pytest
-from capture.factory import write_flame_capture, write_mesh_capture
+from capture.factory import write_mesh_capture
 from numpy.testing import assert_allclose, assert_array_equal
 
 from stga_addon.avatar.embedding import to_world
@@ -16,7 +16,7 @@ from stga_addon.export.ply import read_ply
 from stga_addon.scene.vertex_groups import read_selection
 
 from .captures import mesh_at
-from .session import open_file, ops, panel, save
+from .session import import_flame, open_file, ops, panel, save
 from .test_operators import show_ball
 
 
@@ -65,8 +65,7 @@ def here(extension):
 def test_what_the_open_head_plays(stga, here, tmp_path):
     """Catches an export or rendering that misses avatar or capture, or has the tracked motion where
     the head in the file is animated otherwise."""
-    folder, model = write_flame_capture(tmp_path / "capture")
-    ops.import_capture(directory=folder, flame=model)
+    folder, model = import_flame(tmp_path / "capture")
     avatar = show_ball(tmp_path / "a.npz", open_capture(folder, model).neutral, order=0)
     keys = panel().head.data.shape_keys
     keys.animation_data.action = None

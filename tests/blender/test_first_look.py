@@ -3,7 +3,7 @@
 import bpy
 import numpy as np
 import pytest
-from capture.factory import write_flame_capture, write_mesh_capture
+from capture.factory import write_mesh_capture
 from mathutils import Vector
 from numpy.testing import assert_allclose, assert_array_equal
 
@@ -16,15 +16,14 @@ from stga_addon.scene.display.splat_nodes import AS_TRAINED, DISPLAY, LIMITS, NA
 from stga_addon.scene.display.splat_object import display_mode, set_input, splat_modifier
 from stga_addon.scene.objects import layers_of
 
-from .session import failure, ops, panel, picture
+from .session import failure, import_flame, ops, panel, picture
 from .test_operators import show_ball, write_ball_avatar
 from .test_panel import draw
 
 
 @pytest.fixture
 def head(extension, tmp_path):
-    folder, model = write_flame_capture(tmp_path / "capture")
-    ops.import_capture(directory=folder, flame=model)
+    import_flame(tmp_path / "capture")
     return panel().head
 
 

@@ -3,7 +3,6 @@
 import bpy
 import numpy as np
 import pytest
-from capture.factory import write_flame_capture
 
 from stga_addon.export.ply import read_ply
 from stga_addon.scene.display.splat_object import splat_modifier
@@ -11,7 +10,7 @@ from stga_addon.scene.evaluation import HELPER
 from stga_addon.scene.render.viewport_display import ENGINE
 from stga_addon.scene.rig.motion import sample_motion
 
-from .session import failure, ops, panel
+from .session import failure, import_flame, ops, panel
 from .test_operators import show_ball
 
 pytestmark = pytest.mark.usefixtures("extension")
@@ -25,6 +24,7 @@ HIDE = {
     "nothing": lambda splats, collection: None,
     "splats": lambda splats, collection: setattr(splats, "hide_viewport", True),
     "modifier": lambda splats, collection: setattr(splat_modifier(splats), "show_viewport", False),
+    "deleted splats": lambda splats, collection: bpy.data.objects.remove(splats),
     "collection": lambda splats, collection: uncheck(collection),
     "collection's monitor": lambda splats, collection: setattr(collection, "hide_viewport", True),
 }
@@ -48,7 +48,7 @@ def test_hidden_heads_move_in_exports(head, tmp_path, hides):
     assert np.ptp(expected, axis=0).max() > 0.001
     np.testing.assert_allclose(found, expected, atol=1e-6)
     splats = {"filepath": tmp_path / "splats", "format": "ply-sequence"}
-    if hides == "collection":  # which images leave out, too
+    if hides in ("collection", "deleted splats"):  # which images leave out, too
         with failure("shows no splats"):
             ops.export_splats(**splats)
         return
@@ -71,8 +71,7 @@ def test_renders_of_a_head_that_stands_still_are_refused(head, tmp_path):
 
 def test_a_hidden_performer_is_sampled(extension, tmp_path):
     """Catches a performer in an unchecked collection whose motion is all zero."""
-    folder, model = write_flame_capture(tmp_path / "capture")
-    ops.import_capture(directory=folder, flame=model)
+    import_flame(tmp_path / "capture")
     head = panel().head
     own = extension.operators.common.own_motion(head)
     before = sample_motion(head, own, range(4))

@@ -18,10 +18,10 @@ from capture.factory import (
 from numpy.testing import assert_allclose
 
 from stga_addon.capture.open import open_capture
-from stga_addon.scene.display.splat_object import evaluated_splats
+from stga_addon.development.demo.in_blender import evaluated_splats
 
 from .captures import mesh_at
-from .session import failure, ops, panel, placed, save
+from .session import failure, import_flame, ops, panel, placed, save
 from .test_operators import show_ball, write_ball_avatar
 
 pytestmark = pytest.mark.usefixtures("extension")
@@ -214,8 +214,7 @@ def test_an_npz_is_opened_by_its_content(tmp_path):
     ):
         with failure(f"^Error: .*{name}: {sentence}"):
             ops.open_npz(filepath=tmp_path / name)
-    folder, model = write_flame_capture(tmp_path / "capture")
-    ops.import_capture(directory=folder, flame=model)
+    import_flame(tmp_path / "capture")
     objects = len(bpy.data.objects)
     ops.open_npz(filepath=motion)
     assert len(bpy.data.objects) == objects

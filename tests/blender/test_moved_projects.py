@@ -10,7 +10,7 @@ from capture.factory import write_flame_capture
 from stga_addon.scene import tags
 from stga_addon.scene.record import stored_path
 
-from .session import failure, open_file, ops, panel, save
+from .session import bring, failure, open_file, ops, panel, save
 from .test_operators import write_ball_run
 
 pytestmark = pytest.mark.usefixtures("extension")
@@ -23,6 +23,7 @@ def make_project(folder, blend="shots/head.blend"):
     model = model.rename(folder / "flame.npz")
     ops.import_capture(directory=captured, flame=model)
     ops.show_avatar(filepath=write_ball_run(folder / "run") / "avatar.npz")
+    panel().holds_run = False  # as in a file that an older version saved
     (folder / blend).parent.mkdir(exist_ok=True)
     save(folder / blend)
     return folder
@@ -45,14 +46,16 @@ def try_all(folder):
     ops.export_avatar(filepath=folder / "pair", format="gaussian-avatars")
 
 
-@pytest.mark.parametrize("blend", ["head.blend", "shots/head.blend"])
-def test_a_project_is_moved_as_a_whole(tmp_path, blend):
+@pytest.mark.parametrize(("blend", "run"), [("head.blend", "//run"), ("shots/head.blend", None)])
+def test_a_project_is_moved_as_a_whole(tmp_path, blend, run):
     """Catches "OLD/capture: is not a folder" in Apply Motion, Measure, Select and exports of
-    motion."""
+    motion; and a panel that offers no more training of a run that is there."""
     old = make_project(tmp_path / "old", blend)
     shutil.move(old, tmp_path / "new")
     open_file(tmp_path / "new" / blend)
     assert places(panel().head) == expected(tmp_path / "new")
+    assert panel().run_folder == (run or str(tmp_path / "new/run"))
+    assert panel().holds_run
     try_all(tmp_path / "new")
 
 
@@ -109,12 +112,6 @@ def test_a_save_that_failed_changes_nothing(tmp_path):
             str(project / "run"),
             expected(project),
         )
-
-
-def bring(file, how, name):
-    within = f"{file}/Collection/"
-    operator = bpy.ops.wm.link if how == "link" else bpy.ops.wm.append
-    operator(filepath=within + name, directory=within, filename=name, instance_collections=False)
 
 
 @pytest.mark.parametrize("how", ["append", "link", "paste"])

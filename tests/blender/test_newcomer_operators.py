@@ -1,9 +1,7 @@
 """A newcomer's first hour: messages that can be read, a .blend file that knows its run."""
 
-import shutil
 from contextlib import nullcontext
 from dataclasses import replace
-from pathlib import Path
 from types import SimpleNamespace
 
 import bpy
@@ -77,28 +75,6 @@ def test_next_step_tells_what_is_so_now(extension, head, monkeypatch, tmp_path):
     texts = draw(extension, "next_step")
     assert any("Training: the splats follow" in text for text in texts)
     assert not any("Orbit" in text for text in texts)
-
-
-def test_the_file_knows_its_run(extension, head, tmp_path):
-    """Catches a run lost when an avatar is shown, or the file moved with it or saved elsewhere."""
-    settings = panel()
-    folder = tmp_path / "work"
-    ops.show_avatar(filepath=write_ball_run(folder / "run") / "avatar.npz")
-    assert settings.run_folder == str(folder / "run")
-    save(folder / "head.blend")
-    assert (settings.run_folder, settings.avatar) == ("//run", "//run/avatar.npz")
-    save(tmp_path / "copy.blend", copy=True)
-    assert settings.run_folder == "//run"
-    settings.holds_run = False
-    bpy.ops.wm.save_mainfile()
-    shutil.move(folder, tmp_path / "moved")
-    open_file(tmp_path / "moved/head.blend")
-    settings = panel()
-    assert Path(bpy.path.abspath(settings.run_folder)) == tmp_path / "moved/run"
-    assert settings.holds_run, "as in a file that an older version saved"
-    (tmp_path / "elsewhere").mkdir()
-    save(tmp_path / "elsewhere/head.blend")
-    assert settings.run_folder == str(tmp_path / "moved/run")
 
 
 def test_a_run_made_after_its_head(extension, head, tmp_path):

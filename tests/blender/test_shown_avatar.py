@@ -10,6 +10,7 @@ import pytest
 from capture.factory import write_mesh_capture
 
 from stga_addon.avatar.file import read_avatar
+from stga_addon.development.demo.in_blender import evaluated_splats
 from stga_addon.export.ply import write_ply
 from stga_addon.jobs.table import Kind
 from stga_addon.progress import Progress
@@ -18,7 +19,6 @@ from stga_addon.scene.arrays import evaluated_vertices, mesh_vertices
 from stga_addon.scene.compat import modifier_input, modifier_input_owner
 from stga_addon.scene.display import splat_nodes
 from stga_addon.scene.display.splat_object import (
-    evaluated_splats,
     get_input,
     input_identifier,
     set_input,
@@ -28,7 +28,7 @@ from stga_addon.training.run.folder import Run, write_run
 from stga_addon.training.settings import make_settings
 
 from .captures import mesh_at
-from .session import open_file, ops, panel, reopen, save, state_of
+from .session import bring, open_file, ops, panel, reopen, save, state_of
 from .test_operators import expected_world, show_ball, write_ball_avatar, write_ball_run
 from .test_train_operators import tick_until
 
@@ -216,25 +216,6 @@ def test_a_world_is_shown_in_the_scene_of_its_training(extension, worker, head):
     assert not world.visible_get()
 
 
-def test_a_head_hidden_by_its_splats_is_still_moved(extension, head, tmp_path):
-    """Catches a head that stands still, in exports, once its splats are disabled or deleted."""
-
-    def moves():
-        return not np.array_equal(*map(mesh_at, (0, 1)))
-
-    show_ball(tmp_path / "a.npz")
-    assert not head.visible_get()
-    assert moves()
-    panel().splats.hide_viewport = True
-    bpy.context.view_layer.update()
-    assert not head.visible_get()
-    assert moves()
-    ops.show_avatar(filepath=tmp_path / "a.npz")
-    bpy.data.objects.remove(panel().splats)
-    bpy.context.view_layer.update()
-    assert moves()
-
-
 def saved_head(folder):
     """A file with a head and its splats, whose run lies beside it."""
     write_ball_run(folder / "run")
@@ -244,13 +225,10 @@ def saved_head(folder):
     return folder / "head.blend"
 
 
-def bring(file, how):
+def bring_head(file, how):
     name = panel().head.parent.name
     bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
-    operator = bpy.ops.wm.append if how == "append" else bpy.ops.wm.link
-    within = f"{file}/Collection/"
-    more = {"instance_collections": how == "instance"}
-    operator(filepath=within + name, directory=within, filename=name, **more)
+    bring(file, how, name)
 
 
 @pytest.mark.parametrize("how", ["append", "link", "instance"])
@@ -258,7 +236,7 @@ def test_what_is_brought_into_another_file_is_shown_alike(extension, head, tmp_p
     """Catches gray heads, bones and cameras over appended, linked or instanced splats, and a path
     to nowhere."""
     file = saved_head(tmp_path)
-    bring(file, how)
+    bring_head(file, how)
     depsgraph = bpy.context.evaluated_depsgraph_get()
     drawn = {each.object.original for each in depsgraph.object_instances}
     assert not [each.name for each in drawn if each.type == "MESH" and tags.CONVENTION not in each]
@@ -274,7 +252,7 @@ def test_what_is_brought_into_another_file_is_shown_alike(extension, head, tmp_p
     (tmp_path / "shots").mkdir()
     save(tmp_path / "shots/shot.blend")
     if how == "append":
-        bring(tmp_path / "shots/shot.blend", "append")
+        bring_head(tmp_path / "shots/shot.blend", "append")
         settings = panel()
     assert Path(bpy.path.abspath(settings.avatar)) == tmp_path / "run/avatar.npz"
 
@@ -287,7 +265,7 @@ def test_heads_of_files_from_before_are_hidden_as_well(extension, head, tmp_path
     neutral.hide_viewport = neutral.hide_render = False
     head.hide_set(True)
     bpy.ops.wm.save_mainfile()
-    bring(file, "append")
+    bring_head(file, "append")
     drawn = [each for each in bpy.context.visible_objects if each.type == "MESH"]
     assert [tags.CONVENTION in each for each in drawn] == [True]
 

@@ -18,6 +18,7 @@ from stga_addon.avatar.file import Avatar
 from stga_addon.avatar.offsets import COLOR, OFFSETS, POSITION, SCALE
 from stga_addon.avatar.splats import SH_C0
 from stga_addon.avatar.strain import at_rest, edge_neighbors
+from stga_addon.development.demo.in_blender import evaluated_splats
 from stga_addon.scene import compat, tags
 from stga_addon.scene.arrays import evaluated_vertices
 from stga_addon.scene.display import splat_nodes
@@ -32,7 +33,6 @@ from stga_addon.scene.display.splat_attributes import (
 from stga_addon.scene.display.splat_nodes import POINTS, QUADS
 from stga_addon.scene.display.splat_object import (
     can_update,
-    evaluated_splats,
     get_input,
     set_input,
     show_avatar,
@@ -288,15 +288,26 @@ def test_a_head_of_other_triangles_shows_no_splats(kind, names):
         assert "check its modifiers" in triangles_hint(shown, depsgraph)
 
 
-def test_updated_splats_follow_strain_anew():
-    """Catches new splats shown with the strain coefficients of the first ones."""
+def two_avatars():
+    """Two on the same mesh."""
     first, second = (driven_avatar("stga", ("strain_position",), seed) for seed in (6, 7))
-    second = replace(second, neutral=first.neutral, faces=first.faces)
+    return first, replace(second, neutral=first.neutral, faces=first.faces)
+
+
+def test_updated_splats_follow_strain_anew():
+    """Catches new splats shown with the strain coefficients of the first ones, or with colors that
+    Relight Frame has found for those."""
+    first, second = two_avatars()
     shown, head = show_on_head(first)
     bpy.context.scene.frame_set(5)
     assert_follows(shown, head, first)
     assert can_update(shown, second)
+    color = np.ones(4 * len(first.splats), np.float32)
+    write_attributes(shown.data, {RELIT_COLOR: ("FLOAT_COLOR", "color", color)}, "POINT")
+    shown.data[tags.RELIT_FRAME] = 1
     update_splats(shown, avatar_attributes(second))
+    assert RELIT_COLOR not in shown.data.attributes
+    assert tags.RELIT_FRAME not in shown.data
     assert_follows(shown, head, second)
     stored = stored_avatar(shown).driven_offsets["strain_position"]
     assert_array_equal(stored, second.driven_offsets["strain_position"])
@@ -308,8 +319,7 @@ def test_updated_splats_follow_strain_anew():
 
 def test_a_duplicate_keeps_its_avatar():
     """Catches a version kept by Shift+D that changes with the original, by their neutral mesh."""
-    first, second = (driven_avatar("stga", ("strain_position",), seed) for seed in (6, 7))
-    second = replace(second, neutral=first.neutral, faces=first.faces)
+    first, second = two_avatars()
     shown, _ = show_on_head(first)
     version = shown.copy()  # Shift+D
     twin = shown.copy()  # Alt+D
@@ -325,18 +335,6 @@ def test_a_duplicate_keeps_its_avatar():
     neutral = get_input(shown, splat_nodes.NEUTRAL)
     update_splats(shown, avatar_attributes(first))
     assert get_input(shown, splat_nodes.NEUTRAL) == neutral
-
-
-def test_new_splats_are_not_lit_as_those_before():
-    """Catches colors of Relight Frame that outlive the splats they were found for."""
-    avatar = driven_avatar("stga", ())
-    shown, _ = show_on_head(avatar)
-    color = np.ones(4 * len(avatar.splats), np.float32)
-    write_attributes(shown.data, {RELIT_COLOR: ("FLOAT_COLOR", "color", color)}, "POINT")
-    shown.data[tags.RELIT_FRAME] = 1
-    update_splats(shown, avatar_attributes(avatar))
-    assert RELIT_COLOR not in shown.data.attributes
-    assert tags.RELIT_FRAME not in shown.data
 
 
 def test_world_splats():

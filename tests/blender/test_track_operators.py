@@ -5,7 +5,7 @@ from math import radians
 
 import bpy
 import numpy as np
-from capture.factory import ball, write_flame_capture, write_mesh_capture
+from capture.factory import ball, write_mesh_capture
 from flame.small_head import small_head
 from mathutils import Quaternion
 from numpy.testing import assert_allclose
@@ -17,7 +17,7 @@ from stga_addon.scene.arrays import evaluated_vertices
 from stga_addon.tracking.head_model import HeadModel, read_head_model
 
 from .captures import mesh_at
-from .session import failure, open_file, ops, panel, save, viewport
+from .session import failure, import_flame, open_file, ops, panel, save, viewport
 
 HEAD = HeadModel(small_head(0), "flame")
 
@@ -121,8 +121,7 @@ def test_mistakes_are_one_sentence(extension, take, tmp_path):
     assert panel().head is None
     assert not ops.cancel.poll()
     assert ops.track_footage.poll()
-    folder, model = write_flame_capture(tmp_path / "capture")
-    ops.import_capture(directory=folder, flame=model)
+    import_flame(tmp_path / "capture")
     assert not ops.solve_again.poll()
 
 

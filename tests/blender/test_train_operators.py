@@ -12,9 +12,9 @@ import pytest
 from capture.factory import write_mesh_capture
 
 from stga_addon.avatar.file import read_avatar, write_avatar
+from stga_addon.development.demo.in_blender import evaluated_splats
 from stga_addon.jobs.table import Kind
 from stga_addon.progress import Progress
-from stga_addon.scene.display.splat_object import evaluated_splats
 
 from .session import failure, open_file, ops, panel, save, state_of, write_interpreter
 from .test_operators import write_ball_avatar

@@ -3,14 +3,13 @@
 import bpy
 import numpy as np
 import pytest
-from capture.factory import write_flame_capture
 from numpy.testing import assert_allclose
 
 from stga_addon.scene import tags
 from stga_addon.scene.rig.head import rig_of
 
 from .captures import mesh_at
-from .session import failure, ops, panel, placed, reopen, save
+from .session import failure, import_flame, ops, panel, placed, reopen, save
 from .test_operators import show_ball
 from .test_panel import draw
 
@@ -28,8 +27,7 @@ DEFECTS = {
 
 @pytest.fixture
 def flame_head(tmp_path):
-    folder, model = write_flame_capture(tmp_path / "capture")
-    ops.import_capture(directory=folder, flame=model)
+    import_flame(tmp_path / "capture")
     return panel().head
 
 

@@ -83,9 +83,14 @@ def can_train():
 def positions():
     """Of the splats that are displayed, in the capture's coordinates."""
     bpy.context.scene.frame_set(4)
-    splat_object = importlib.import_module(MODULE + ".stga_addon.scene.display.splat_object")
-    positions, _, _ = splat_object.evaluated_splats(bpy.context.scene.stga.splats)
-    return list(positions.ravel().tolist())
+    display = MODULE + ".stga_addon.scene.display"
+    splat_object = importlib.import_module(display + ".splat_object")
+    splat_object.set_input(bpy.context.scene.stga.splats, "Display", "Points")
+    depsgraph = bpy.context.evaluated_depsgraph_get()
+    shown = (each.object for each in depsgraph.object_instances)
+    cloud = next(each for each in shown if each.type == "POINTCLOUD")
+    read_attribute = importlib.import_module(display + ".splat_attributes").read_attribute
+    return list(read_attribute(cloud.data, "position").ravel().tolist())
 
 
 if __name__ == "__main__":

@@ -11,7 +11,8 @@ from blender.test_splat_object import evaluated_vertices, random_splats, same_ro
 
 from stga_addon.avatar.embedding import CONVENTIONS, face_frames, to_world  # noqa: E402
 from stga_addon.avatar.file import Avatar  # noqa: E402
-from stga_addon.scene.display.splat_object import evaluated_splats, show_avatar  # noqa: E402
+from stga_addon.development.demo.in_blender import evaluated_splats  # noqa: E402
+from stga_addon.scene.display.splat_object import show_avatar  # noqa: E402
 
 from .meshes import DEGENERATE, WHOLE, mesh_of  # noqa: E402
 

@@ -10,7 +10,6 @@ with --processor-time: that of all threads together.
 """
 
 import argparse
-import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -25,17 +24,17 @@ from ...avatar.splats import joined
 from ...capture.open import open_capture
 from ...driving.demo_speech import demo_speech
 from ...driving.open_motion import MotionOptions, performed
-from ...scene import light, tags
+from ...scene import tags
 from ...scene.cameras import render_camera
 from ...scene.display.splat_object import show_avatar
 from ...scene.gpu import packing
-from ...scene.objects import open_file
 from ...scene.render import engine
 from ...scene.render.scene_splats import SplatCache, all_layers
 from ...scene.render.viewport_display import ENGINE
 from ...scene.rig.head import usable_rig
 from ...scene.rig.keyframes import Placement
 from ...scene.rig.motion import apply_motion
+from ..demo.in_blender import open_file, registered
 
 SIZE_PX = 1920, 1080
 """Width and height of the images."""
@@ -53,9 +52,7 @@ def main() -> None:
     parser.add_argument("--processor-time", action="store_true")
     options = parser.parse_args()
     clock = process_time if options.processor_time else perf_counter
-    light.register()
-    engine.register(lambda: sys.executable)
-    try:
+    with registered():
         for name, (act, repeats) in _acts(options.demo, options.splats, options.repeats).items():
             act(0)
             times = []
@@ -64,17 +61,14 @@ def main() -> None:
                 act(number)
                 times.append(1e3 * (clock() - begin))
             print(f"{name:<24}{np.median(times):8.1f}")
-    finally:
-        engine.unregister()
-        light.unregister()
 
 
 def _acts(demo: Path, splats: int, repeats: int) -> dict[str, tuple[Callable[[int], object], int]]:
     """Name -> what is measured, by the number of the repeat, and how often."""
     open_file(demo / "demo.blend")
     scene = bpy.context.scene
-    head = next(each for each in scene.objects if each.get(tags.KIND) == tags.HEAD)
-    for old in [each for each in scene.objects if each.get(tags.KIND) == tags.SPLATS]:
+    head = tags.heads_of(scene)[0]
+    for old in list(filter(tags.is_splats, scene.objects)):
         bpy.data.objects.remove(old)
     show_avatar(_with_copies(read_avatar(demo / "avatar.npz"), splats), head)
     rig = usable_rig(head)

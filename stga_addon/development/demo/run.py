@@ -71,11 +71,11 @@ def run_demo(
     avatar = _train(capture, out, budget, selection, device)
     error = _show(capture, avatar, head, out / "demo.blend")
     if with_shot:
-        from ...scene.demo_shot import make_shot  # needs Blender
+        from .in_blender import make_shot
 
         assert capture.flame is not None
         write_performance(out / SPEECH_FILE, demo_speech())
-        make_shot(out / "shot.blend", capture.flame, out / SPEECH_FILE)
+        make_shot(out, capture.flame)
     _picture(capture, avatar, selection, out)
     _page(capture, avatar, selection, out / "avatar.html")
     metrics = {
@@ -151,8 +151,8 @@ def _import_and_select(capture: Capture) -> tuple[object, dict[int, np.ndarray]]
     """Make a Blender scene with head, cameras and a vertex group per frame; returns head and
     selection read back."""
     from ...scene.avatar_scene import set_up_head
-    from ...scene.objects import new_file
     from ...scene.vertex_groups import read_selection, write_selection
+    from .in_blender import new_file
 
     new_file()
     head = set_up_head(capture)
@@ -182,8 +182,8 @@ def _show(capture: Capture, avatar: Avatar, head: object, path: Path) -> float:
     """Show the avatar, save and reopen the file; returns the largest distance (meters) of a splat
     from numpy's."""
     from ...scene.avatar_scene import show_on_head
-    from ...scene.display.splat_object import evaluated_splats
-    from ...scene.objects import go_to_frame, object_named, open_file, save_file
+    from ...scene.objects import go_to_frame, save_file
+    from .in_blender import evaluated_splats, object_named, open_file
 
     name = show_on_head(avatar, head, "//run/avatar.npz", FRAMES_PER_SECOND).name
     save_file(path)

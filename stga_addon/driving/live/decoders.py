@@ -9,6 +9,7 @@ from typing import TypeGuard
 
 import numpy as np
 
+from ..head_rotations import angles_of_quaternions
 from ..performance import (
     ARKIT_SHAPES,
     COLUMN,
@@ -197,10 +198,8 @@ def _is_number(value: Value) -> TypeGuard[int | float]:
 
 def _head(quaternion: list[float]) -> tuple[float, float, float] | None:
     """Yaw, pitch, roll of Unity's quaternion: left-handed, mirrored in x, so y and z turn back."""
-    length = math.hypot(*quaternion)
-    if not 0.5 < length < 2:
+    if not 0.5 < math.hypot(*quaternion) < 2:
         return None
-    x, y, z, w = (part / length for part in quaternion)
-    yaw = math.atan2(2 * (w * -y - x * z), 1 - 2 * (x * x + y * y))
-    pitch = math.asin(max(-1.0, min(1.0, 2 * (w * x - y * z))))
-    return yaw, pitch, math.atan2(2 * (-x * y - w * z), 1 - 2 * (x * x + z * z))
+    x, y, z, w = quaternion
+    yaw, pitch, roll = angles_of_quaternions(np.array([[-y, x, -z, w]]))[0].tolist()
+    return yaw, pitch, roll

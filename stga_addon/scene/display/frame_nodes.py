@@ -5,14 +5,12 @@ from collections.abc import Callable, Iterable
 from functools import cache, partial, reduce
 from typing import Any
 
-import bpy
-
 from ...avatar.embedding import CONVENTIONS, MIN_AREA_RATIO, UPRIGHT_COSINE
 from ...avatar.offsets import COLOR, OFFSETS, SCALE
 from ...avatar.strain import AVERAGING_ROUNDS, MIN_SQUARED_NORMAL, STRAIN_COMPONENTS, STRAIN_GAIN
 from .. import compat
 from . import splat_attributes as stored
-from .node_builder import NodeGroup, Nodes
+from .node_builder import NodeGroup, Nodes, Socket
 
 MAX_AREA_RATIO = 4.0
 """Largest ratio of the area of the splats' triangles to that of the evaluated head, for which the
@@ -87,7 +85,7 @@ def _placed_splats(convention: str | None, nodes: Nodes, splats: Any, mesh: Any 
 
 def _axes_to_rotation(
     nodes: Nodes, first: Any, edge: Any, side: Any, normal_axis: str
-) -> tuple[bpy.types.NodeSocket, bpy.types.NodeSocket, bpy.types.NodeSocket]:
+) -> tuple[Socket, Socket, Socket]:
     """Rotation with the x axis `first` of a triangle with two edges, its normal (its length twice
     the area), and whether `first` is degenerate: it and the normal then take the substitutes of
     `avatar.embedding`."""
@@ -142,24 +140,24 @@ def _moved_neutral(nodes: Nodes, posed: Any, neutral: Any) -> Any:
     return nodes.out("GeometryNodeSetPosition", {"Geometry": neutral, "Position": moved})
 
 
+def _count(nodes: Nodes, mesh: Any, of: str) -> Any:
+    """ "Face Count" or "Point Count" of a mesh."""
+    size = nodes.add("GeometryNodeAttributeDomainSize", {"Geometry": mesh}, component="MESH")
+    return size.outputs[of]
+
+
 def _posed(nodes: Nodes, head: Any, neutral: Any) -> Any:
     """The head with the faces that splats are bound to, also where it is subdivided."""
-    sizes = []
-    for mesh in (head, neutral):
-        size = nodes.add("GeometryNodeAttributeDomainSize", {"Geometry": mesh}, component="MESH")
-        sizes.append(size.outputs["Face Count"])
-    differs = nodes.compare("NOT_EQUAL", *sizes)
-    is_known = nodes.compare("GREATER_THAN", sizes[1], 0.0)
+    faces = [_count(nodes, mesh, "Face Count") for mesh in (head, neutral)]
+    differs = nodes.compare("NOT_EQUAL", *faces)
+    is_known = nodes.compare("GREATER_THAN", faces[1], 0.0)
     moved = _moved_neutral(nodes, head, neutral)
     return nodes.switch("GEOMETRY", nodes.logic("AND", differs, is_known), head, moved)
 
 
 def _following(nodes: Nodes, splats: Any, head: Any, neutral: Any) -> Any:
     """The splats; none where the head has lost the vertices that they are bound to."""
-    points = []
-    for mesh in (head, neutral):
-        size = nodes.add("GeometryNodeAttributeDomainSize", {"Geometry": mesh}, component="MESH")
-        points.append(size.outputs["Point Count"])
+    points = [_count(nodes, mesh, "Point Count") for mesh in (head, neutral)]
     areas = []
     for mesh in (nodes.group(POSED, head, neutral), head):
         inputs = {"Geometry": mesh, "Attribute": nodes.out("GeometryNodeInputMeshFaceArea")}

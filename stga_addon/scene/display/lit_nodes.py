@@ -3,10 +3,8 @@ mesh that throws the shadows."""
 
 from typing import Any
 
-import bpy
-
 from . import splat_attributes as stored
-from .node_builder import NodeGroup, Nodes, kept_material
+from .node_builder import NodeGroup, Nodes, Socket, kept_material
 
 RECORDED = "Recorded"
 
@@ -31,7 +29,7 @@ LIFT_M = 1e-4
 TRANSLUCENT_FRACTION = 1e-3
 
 
-def _surface(nodes: Nodes, splats: Any, head: Any) -> bpy.types.NodeSocket:
+def _surface(nodes: Nodes, splats: Any, head: Any) -> Socket:
     """Splats with what they are lit by; without a known light, colors are taken for albedo."""
     albedo, is_known = nodes.attribute_if_any(stored.ALBEDO, "FLOAT_COLOR")
     color = nodes.attribute(stored.DISPLAY_COLOR, "FLOAT_COLOR")
@@ -43,7 +41,7 @@ def _surface(nodes: Nodes, splats: Any, head: Any) -> bpy.types.NodeSocket:
     return nodes.store(splats, NORMAL, normal, "FLOAT_VECTOR")
 
 
-def _lit(nodes: Nodes, splats: Any, head: Any) -> bpy.types.NodeSocket:
+def _lit(nodes: Nodes, splats: Any, head: Any) -> Socket:
     """Native splats with their material, and the mesh that throws shadows."""
     material = kept_material("STGA Lit Splats", _lit_shader, "DITHERED")
     if cycles := getattr(material, "cycles", None):

@@ -11,19 +11,22 @@ import bpy
 from ... import __version__
 from .. import compat
 
+Socket = bpy.types.NodeSocket
+Tree = bpy.types.NodeTree
+
 VERSION = "stga_version"  # property of our trees: `_version`
 _COLUMN_WIDTH = 220.0
 _ROW_HEIGHT = 200.0
 
 
-def new_tree(name: str) -> bpy.types.NodeTree:
+def new_tree(name: str) -> Tree:
     """An empty geometry node tree that `find_tree` finds again."""
     tree = bpy.data.node_groups.new(name, "GeometryNodeTree")
     tree[VERSION] = _version()
     return tree
 
 
-def find_tree(name: str) -> bpy.types.NodeTree | None:
+def find_tree(name: str) -> Tree | None:
     """The tree of this name for which `is_current` is true, or None."""
     for tree in bpy.data.node_groups:
         if tree.name.startswith(name) and is_current(tree):
@@ -31,7 +34,7 @@ def find_tree(name: str) -> bpy.types.NodeTree | None:
     return None
 
 
-def is_current(tree: bpy.types.NodeTree) -> bool:
+def is_current(tree: Tree) -> bool:
     """Whether this version of the add-on made the tree, in a Blender with the same nodes."""
     return bool(tree.get(VERSION) == _version())
 
@@ -41,7 +44,7 @@ def _version() -> str:
     return f"{__version__} with unseen{lit} splats on subdivided, not on lost heads"
 
 
-def new_socket(tree: bpy.types.NodeTree, name: str, side: str, kind: str) -> Any:
+def new_socket(tree: Tree, name: str, side: str, kind: str) -> Any:
     """Add an input or output ("INPUT", "OUTPUT") of a socket type ("Vector") to the tree."""
     return tree.interface.new_socket(name, in_out=side, socket_type=f"NodeSocket{kind}")
 
@@ -56,9 +59,9 @@ class NodeGroup:
     name: str
     inputs: Mapping[str, str]
     output: str
-    build: Callable[..., bpy.types.NodeSocket]
+    build: Callable[..., Socket]
 
-    def tree(self) -> bpy.types.NodeTree:
+    def tree(self) -> Tree:
         """The group's tree, built where the file has none."""
         if (existing := find_tree(f".{self.name}")) is not None:
             return existing
@@ -73,7 +76,7 @@ class NodeGroup:
         return tree
 
 
-def new_material(name: str, build: Callable[["Nodes"], bpy.types.NodeSocket]) -> bpy.types.Material:
+def new_material(name: str, build: Callable[["Nodes"], Socket]) -> bpy.types.Material:
     """A material whose surface is the shader that `build` returns."""
     material = bpy.data.materials.new(name)
     tree = compat.enable_nodes(material)
@@ -96,7 +99,7 @@ def kept_material(name: str, build: Callable[["Nodes"], Any], method: str) -> bp
 class Nodes:
     """Adds nodes to a tree; most methods return the first enabled output of the node they name."""
 
-    def __init__(self, tree: bpy.types.NodeTree) -> None:
+    def __init__(self, tree: Tree) -> None:
         self.tree = tree
 
     def add(
@@ -115,7 +118,7 @@ class Nodes:
             named = [s for s in node.inputs if s.enabled and name in (s.name, s.identifier)]
             values = values if isinstance(values, list) else [values]
             for socket, value in zip(named, values, strict=True):
-                if isinstance(value, bpy.types.NodeSocket):
+                if isinstance(value, Socket):
                     self.tree.links.new(value, socket)
                 else:
                     socket.default_value = value
@@ -141,50 +144,48 @@ class Nodes:
         # one by one, each would update the whole tree
         self.tree.nodes.foreach_set("location", locations)
 
-    def out(
-        self, kind: str, inputs: Mapping[str, Any] | None = None, **properties: Any
-    ) -> bpy.types.NodeSocket:
+    def out(self, kind: str, inputs: Mapping[str, Any] | None = None, **properties: Any) -> Socket:
         node = self.add(kind, inputs, **properties)
         return next(socket for socket in node.outputs if socket.enabled)
 
-    def group(self, group: NodeGroup, *values: Any) -> bpy.types.NodeSocket:
+    def group(self, group: NodeGroup, *values: Any) -> Socket:
         """Output of a node group; values or sockets for its inputs, in their order."""
         inputs = dict(zip(group.inputs, values, strict=True))
         return self.out("GeometryNodeGroup", inputs, node_tree=group.tree())
 
-    def math(self, operation: str, *values: Any) -> bpy.types.NodeSocket:
+    def math(self, operation: str, *values: Any) -> Socket:
         return self.out("ShaderNodeMath", {"Value": list(values)}, operation=operation)
 
-    def vector(self, operation: str, *values: Any) -> bpy.types.NodeSocket:
+    def vector(self, operation: str, *values: Any) -> Socket:
         return self.out("ShaderNodeVectorMath", {"Vector": list(values)}, operation=operation)
 
-    def sum(self, *vectors: Any) -> bpy.types.NodeSocket:
+    def sum(self, *vectors: Any) -> Socket:
         return reduce(partial(self.vector, "ADD"), vectors)
 
-    def scale(self, vector: Any, factor: Any) -> bpy.types.NodeSocket:
+    def scale(self, vector: Any, factor: Any) -> Socket:
         inputs = {"Vector": vector, "Scale": factor}
         return self.out("ShaderNodeVectorMath", inputs, operation="SCALE")
 
-    def components(self, vector: Any) -> list[bpy.types.NodeSocket]:
+    def components(self, vector: Any) -> list[Socket]:
         return list(self.add("ShaderNodeSeparateXYZ", {"Vector": vector}).outputs)
 
-    def combine(self, x: Any, y: Any, z: Any) -> bpy.types.NodeSocket:
+    def combine(self, x: Any, y: Any, z: Any) -> Socket:
         return self.out("ShaderNodeCombineXYZ", {"X": x, "Y": y, "Z": z})
 
-    def compare(self, operation: str, a: Any, b: Any) -> bpy.types.NodeSocket:
+    def compare(self, operation: str, a: Any, b: Any) -> Socket:
         kind = {"data_type": "FLOAT", "operation": operation}
         return self.out("FunctionNodeCompare", {"A": a, "B": b}, **kind)
 
-    def logic(self, operation: str, a: Any, b: Any) -> bpy.types.NodeSocket:
+    def logic(self, operation: str, a: Any, b: Any) -> Socket:
         return self.out("FunctionNodeBooleanMath", {"Boolean": [a, b]}, operation=operation)
 
-    def switch(self, kind: str, condition: Any, false: Any, true: Any) -> bpy.types.NodeSocket:
+    def switch(self, kind: str, condition: Any, false: Any, true: Any) -> Socket:
         inputs = {"Switch": condition, "False": false, "True": true}
         return self.out("GeometryNodeSwitch", inputs, input_type=kind)
 
     def menu(
         self, kind: str, choice: Any, values: Mapping[str, Any], descriptions: Mapping[str, str]
-    ) -> bpy.types.NodeSocket:
+    ) -> Socket:
         """What the menu socket `choice` has chosen of values or sockets by name."""
         node = self.add("GeometryNodeMenuSwitch", data_type=kind)
         node.enum_definition.enum_items.clear()
@@ -193,10 +194,10 @@ class Nodes:
         self.set_inputs(node, {**values, "Menu": choice})
         return node.outputs[0]
 
-    def attribute(self, name: Any, data_type: str = "FLOAT_VECTOR") -> bpy.types.NodeSocket:
+    def attribute(self, name: Any, data_type: str = "FLOAT_VECTOR") -> Socket:
         return self.attribute_if_any(name, data_type)[0]
 
-    def attribute_if_any(self, name: Any, data_type: str) -> list[bpy.types.NodeSocket]:
+    def attribute_if_any(self, name: Any, data_type: str) -> list[Socket]:
         """The attribute, and whether it is there."""
         kind = "GeometryNodeInputNamedAttribute"
         node = self.add(kind, {"Name": name}, data_type=data_type)
@@ -211,12 +212,12 @@ class Nodes:
         inputs = {"Geometry": mesh, "Value": value, "Index": index}
         return self.out("GeometryNodeSampleIndex", inputs, data_type=kind, domain=domain)
 
-    def at_points(self, value: Any, kind: str) -> bpy.types.NodeSocket:
+    def at_points(self, value: Any, kind: str) -> Socket:
         """A field of faces interpolated to points: means of the touching elements."""
         inputs = {"Value": value}
         return self.out("GeometryNodeFieldOnDomain", inputs, data_type=kind, domain="POINT")
 
-    def triangle_corners(self) -> list[bpy.types.NodeSocket]:
+    def triangle_corners(self) -> list[Socket]:
         """Positions of each face's three corners, in the order of its vertices."""
         position = self.out("GeometryNodeInputPosition")
         found = []

@@ -4,8 +4,6 @@ follow a head it computes each triangle's frame on the *evaluated* mesh."""
 from functools import cached_property, partial
 from typing import Any, NamedTuple
 
-import bpy
-
 from ...avatar.offsets import COLOR, OFFSETS
 from ...avatar.splats import SH_C0, harmonics
 from ...capture.meshes import SELECTED_WEIGHT
@@ -23,7 +21,16 @@ from .frame_nodes import (
     driven,
 )
 from .lit_nodes import LIGHTS, LIT, RECORDED, SCENE_LIGHT, SURFACE
-from .node_builder import NodeGroup, Nodes, find_tree, kept_material, new_socket, new_tree
+from .node_builder import (
+    NodeGroup,
+    Nodes,
+    Socket,
+    Tree,
+    find_tree,
+    kept_material,
+    new_socket,
+    new_tree,
+)
 
 # Inputs of the modifier, by their displayed names.
 HEAD = "Head"
@@ -200,7 +207,7 @@ def displayed(nodes: Nodes, mode: Any, splats: Any, visible: Any, size: Any, nat
     return nodes.menu("GEOMETRY", mode, geometries, LIMITS)
 
 
-def _points(nodes: Nodes, splats: Any, visible: Any, size: Any) -> bpy.types.NodeSocket:
+def _points(nodes: Nodes, splats: Any, visible: Any, size: Any) -> Socket:
     # A point has one radius.
     scale = nodes.attribute(stored.WORLD_SCALE)
     mean = nodes.vector("DOT_PRODUCT", scale, (DOT_SIZE / DISK / 3,) * 3)
@@ -211,7 +218,7 @@ def _points(nodes: Nodes, splats: Any, visible: Any, size: Any) -> bpy.types.Nod
     return nodes.out("GeometryNodeSetMaterial", {"Geometry": points, "Material": material})
 
 
-def _quads(nodes: Nodes, splats: Any, visible: Any, size: Any) -> bpy.types.NodeSocket:
+def _quads(nodes: Nodes, splats: Any, visible: Any, size: Any) -> Socket:
     """Two triangles per splat, which cover its ellipsoid as the scene's camera sees it: in its own
     space, a sphere, the quad faces the camera. Instances: realizing them takes twenty times as
     long."""
@@ -261,7 +268,7 @@ class _NativeInputs(NamedTuple):
     painted: Any
 
 
-def _radiance(nodes: Nodes, added: Any, flat: Any) -> bpy.types.NodeSocket:
+def _radiance(nodes: Nodes, added: Any, flat: Any) -> Socket:
     """Field: constant coefficient and opacity of native splats, those fitted for linear light
     where there are any; flat: of the display color. As a color, which 5.3 draws as four floats; of
     FLOAT4, the node that stores it in 5.2 takes three."""
@@ -283,7 +290,7 @@ def _radiance(nodes: Nodes, added: Any, flat: Any) -> bpy.types.NodeSocket:
 _RADIANCE = NodeGroup("STGA Radiance", {"Added": "Vector", "Flat": "Bool"}, "Color", _radiance)
 
 
-def _native(degree: int, nodes: Nodes, *sockets: Any) -> bpy.types.NodeSocket:
+def _native(degree: int, nodes: Nodes, *sockets: Any) -> Socket:
     """Native splats with what they are drawn from alone, harmonics in the object's axes; sockets:
     as _NativeInputs."""
     given = _NativeInputs(*sockets)
@@ -349,7 +356,7 @@ class TreeOptions(NamedTuple):
         return f"STGA Splats ({', '.join(parts)})"
 
 
-def splat_tree(options: TreeOptions) -> bpy.types.NodeTree:
+def splat_tree(options: TreeOptions) -> Tree:
     """The node tree for splats of this kind. Built once per file."""
     tree = find_tree(options.tree_name)
     if tree is None:
@@ -386,7 +393,7 @@ def build_next_node_group(options: TreeOptions) -> bool:
     return True
 
 
-def _add_interface(tree: bpy.types.NodeTree, embedded: bool, degree: int) -> None:
+def _add_interface(tree: Tree, embedded: bool, degree: int) -> None:
     def add(name: str, kind: str, description: str, **properties: Any) -> None:
         socket = new_socket(tree, name, "INPUT", kind)
         for key, value in {"description": description, **properties}.items():
@@ -497,7 +504,7 @@ def _color(nodes: Nodes, inputs: Any, added: Any, degree: int) -> Any:
     return nodes.switch("RGBA", is_chosen, color, nodes.group(SRGB_TO_LINEAR, seen))
 
 
-def _frozen_splats(nodes: Nodes, mesh: Any) -> bpy.types.NodeSocket:
+def _frozen_splats(nodes: Nodes, mesh: Any) -> Socket:
     """Field: splats on triangles that the frame's selection, if there is one, leaves out."""
     time = nodes.add("GeometryNodeInputSceneTime").outputs["Frame"]
     frame = nodes.out("FunctionNodeValueToString", {"Value": time})
@@ -513,14 +520,14 @@ def _frozen_splats(nodes: Nodes, mesh: Any) -> bpy.types.NodeSocket:
 _FROZEN_SPLATS = NodeGroup("STGA Frozen Splats", {"Mesh": "Geometry"}, "Bool", _frozen_splats)
 
 
-def _marked(nodes: Nodes, frozen: Any, unseen: Any) -> bpy.types.NodeSocket:
+def _marked(nodes: Nodes, frozen: Any, unseen: Any) -> Socket:
     """Field: splats of those kinds that are asked for."""
     kinds = (_FROZEN, frozen), (stored.UNSEEN, unseen)
     found = [nodes.logic("AND", nodes.attribute(name, "BOOLEAN"), asked) for name, asked in kinds]
     return nodes.logic("OR", *found)
 
 
-def _paint(nodes: Nodes, shows_unseen: Any) -> bpy.types.NodeSocket:
+def _paint(nodes: Nodes, shows_unseen: Any) -> Socket:
     """Field: the color of a marked splat; unseen ones have theirs where it is shown."""
     unseen = nodes.logic("AND", nodes.attribute(stored.UNSEEN, "BOOLEAN"), shows_unseen)
     return nodes.switch("RGBA", unseen, FROZEN_COLOR, UNSEEN_COLOR)
@@ -530,7 +537,7 @@ _MARKED = NodeGroup("STGA Marked Splats", {"Frozen": "Bool", "Unseen": "Bool"}, 
 _PAINT = NodeGroup("STGA Paint", {"Shows Unseen": "Bool"}, "Color", _paint)
 
 
-def _relit_color(nodes: Nodes, color: Any) -> bpy.types.NodeSocket:
+def _relit_color(nodes: Nodes, color: Any) -> Socket:
     """Field: the relit color of a frame where the splats have one, else `color`."""
     relit, exists = nodes.attribute_if_any(stored.RELIT_COLOR, "FLOAT_COLOR")
     return nodes.switch("RGBA", exists, color, relit)

@@ -2,7 +2,6 @@
 
 import re
 from collections.abc import Iterable
-from contextlib import suppress
 from typing import Any
 from uuid import uuid4
 
@@ -25,7 +24,7 @@ from .frame_nodes import SIGNALS
 from .lit_nodes import SCENE_LIGHT
 from .node_builder import VERSION, find_tree, is_current
 from .splat_attributes import SplatAttributes, avatar_attributes
-from .splat_nodes import AS_TRAINED, NATIVE, POINTS, QUADS
+from .splat_nodes import NATIVE, QUADS
 
 
 def view_transform_hint(scene: bpy.types.Scene) -> str | None:
@@ -121,13 +120,7 @@ def splats_of(head: Any, scene: Any, linked: bool = False) -> list[Any]:
     """The splat objects of the scene that follow the head and can be changed, or are linked."""
     shown = [each for each in scene.objects if tags.CONVENTION in each]
     own = [each for each in shown if (each.library is not None) == linked]
-    return [each for each in own if _follows(each, head)]
-
-
-def _follows(splat_object: Any, head: Any) -> bool:
-    with suppress(StgaError):  # it has lost its modifier
-        return bool(get_input(splat_object, splat_nodes.HEAD) == head)
-    return False
+    return [each for each in own if followed_head(each) == head]
 
 
 def show_world_splats(splats: Splats, name: str, scene: Any = None) -> Any:
@@ -153,10 +146,8 @@ def can_update(splat_object: Any, avatar: Avatar) -> bool:
 
 def _stored_neutral(splat_object: Any) -> Any:
     """The neutral mesh; None for splats without one, or an object without a modifier."""
-    with suppress(StgaError):
-        neutral = get_input(splat_object, splat_nodes.NEUTRAL)
-        return None if neutral is None else neutral.data
-    return None
+    neutral = get_input(splat_object, splat_nodes.NEUTRAL)
+    return None if neutral is None else neutral.data
 
 
 def _own_neutral(splat_object: Any) -> Any:
@@ -243,20 +234,17 @@ def hide_object(obj: Any, scene: Any) -> None:
 def hide_covered(splat_object: Any, scene: Any) -> None:
     """Hide what covers splats that were appended or linked: their head, where its file hides it in
     images, and their neutral mesh."""
-    with suppress(StgaError):  # they have lost their modifier
-        head, neutral = (
-            get_input(splat_object, name) for name in (splat_nodes.HEAD, splat_nodes.NEUTRAL)
-        )
-        for each in (head, neutral):
-            if each is not None and (each.hide_render or each is neutral):
-                hide_object(each, scene)
+    neutral = get_input(splat_object, splat_nodes.NEUTRAL)
+    for each in (followed_head(splat_object), neutral):
+        if each is not None and (each.hide_render or each is neutral):
+            hide_object(each, scene)
 
 
-def hide_in_layers(obj: Any, scene: Any, hide: bool = True) -> None:
-    """Hide an object in the scene's viewports, or show it there."""
+def hide_in_layers(obj: Any, scene: Any) -> None:
+    """Hide an object in the scene's viewports."""
     for layer in scene.view_layers:
         if layer.objects.get(obj.name) is obj:
-            obj.hide_set(hide, view_layer=layer)
+            obj.hide_set(True, view_layer=layer)
 
 
 def splat_modifier(splat_object: Any) -> Any:
@@ -281,9 +269,8 @@ def is_partly_filmed(splat_object: Any) -> bool:
 
 def triangles_hint(splat_object: Any, depsgraph: Any) -> str | None:
     """A sentence where a head has lost the vertices that the splats are bound to, or None."""
-    head, neutral = (
-        get_input(splat_object, name) for name in (splat_nodes.HEAD, splat_nodes.NEUTRAL)
-    )
+    head = followed_head(splat_object)
+    neutral = get_input(splat_object, splat_nodes.NEUTRAL)
     if head is None or neutral is None:
         return None
     shown = head.evaluated_get(depsgraph)
@@ -306,10 +293,19 @@ def set_input(splat_object: Any, name: str, value: Any) -> None:
 
 
 def get_input(splat_object: Any, name: str) -> Any:
-    """An input of the splat modifier by its displayed name; None where it has no such input."""
-    modifier = splat_modifier(splat_object)
+    """An input of the splat modifier by its displayed name; None where it has no such input, or the
+    object, which may be None, has lost that modifier."""
+    try:
+        modifier = splat_modifier(splat_object)
+    except StgaError:
+        return None
     identifier = input_identifier(modifier, name)
     return None if identifier is None else modifier_input(modifier, identifier)
+
+
+def followed_head(splat_object: Any) -> Any:
+    """The head that the splats follow, or None."""
+    return get_input(splat_object, splat_nodes.HEAD)
 
 
 def input_identifier(modifier: Any, name: str) -> str | None:
@@ -355,7 +351,7 @@ def replace_native_splats(objects: Iterable[Any]) -> str:
         return ""
     messages = []
     for each in objects:
-        if each.get(tags.KIND) != tags.SPLATS or not _is_native(each):
+        if not tags.is_splats(each) or display_mode(each) != NATIVE:
             continue
         if each.library is None:
             set_input(each, splat_nodes.DISPLAY, QUADS)
@@ -363,12 +359,6 @@ def replace_native_splats(objects: Iterable[Any]) -> str:
         else:
             messages.append(f"{each.name} is linked, and not displayed")
     return "; ".join([*messages, "native splats need Blender 5.3 or newer"]) if messages else ""
-
-
-def _is_native(splat_object: Any) -> bool:
-    with suppress(StgaError):  # it has lost its modifier
-        return display_mode(splat_object) == NATIVE
-    return False
 
 
 def _set_menus(splat_object: Any) -> None:
@@ -410,26 +400,6 @@ def stored_avatar(splat_object: Any) -> Avatar:
         light=stored.read_light(neutral),
         linear_base=stored.read_linear_base(splat_object.data),
     )
-
-
-def evaluated_splats(splat_object: Any) -> tuple[np.ndarray, ...]:
-    """What a splat object displays as points at the current frame, in its object space: position
-    (N, 3), rotation (N, 4) wxyz and linear standard deviations (N, 3), float32; of splats displayed
-    as trained, too. Raises StgaError where it displays quads, which are instances."""
-    if display_mode(splat_object) == AS_TRAINED:
-        set_input(splat_object, splat_nodes.DISPLAY, POINTS)
-        try:
-            return evaluated_splats(splat_object)
-        finally:
-            set_input(splat_object, splat_nodes.DISPLAY, AS_TRAINED)
-    depsgraph = bpy.context.evaluated_depsgraph_get()
-    for instance in depsgraph.object_instances:
-        owner = instance.parent if instance.is_instance else instance.object
-        is_own = owner is not None and owner.original == splat_object
-        if is_own and instance.object.type == "POINTCLOUD":
-            names = "position", stored.WORLD_ROTATION, stored.WORLD_SCALE
-            return tuple(stored.read_attribute(instance.object.data, name) for name in names)
-    raise StgaError(f"{splat_object.name}: shows quads or nothing, expected points")
 
 
 def _splat_object(name: str, collection: Any, options: splat_nodes.TreeOptions) -> Any:

@@ -148,7 +148,7 @@ def posed_frames(
 
 
 def drawing_order(
-    static: StaticSplats, frames: PosedFrames, view: View, short_keys: bool = False
+    static: StaticSplats, frames: PosedFrames, view: View, short_keys: bool
 ) -> np.ndarray:
     """Indices (M,) float32 of the splats within near and far ends, farthest first. short_keys:
     those a few micrometers apart may be swapped, in half the time."""

@@ -1,16 +1,13 @@
 """The set of a shot: objects that the engine STGA Splats leaves out. EEVEE renders them as a second
 scene in the same press, and nodes of the compositor combine both images by depth."""
 
-from contextlib import suppress
 from typing import Any
 
 import bpy
 
-from ...errors import StgaError
 from .. import compat, tags
-from ..display import splat_nodes
 from ..display.node_builder import Nodes, new_socket
-from ..display.splat_object import get_input
+from ..display.splat_object import followed_head
 from ..light import throw_shadow, throws_shadow
 from ..objects import objects_of_images
 
@@ -61,11 +58,10 @@ def show_set(scene: Any) -> None:
             tree.links.new(both.outputs[name], link.to_socket)
         tree.links.new(own.outputs[name], both.inputs[f"Splats {name}"])
         tree.links.new(layers.outputs[name], both.inputs[f"Set {name}"])
-    for splats in (each for each in scene.objects if each.get(tags.KIND) == tags.SPLATS):
-        with suppress(StgaError):  # splats of no head
-            head = get_input(splats, splat_nodes.HEAD)
-            if head is not None and head.library is None and not throws_shadow(splats):
-                throw_shadow(splats, True)
+    for splats in filter(tags.is_splats, scene.objects):
+        head = followed_head(splats)
+        if head is not None and head.library is None and not throws_shadow(splats):
+            throw_shadow(splats, True)
 
 
 def leave_out_set(scene: Any) -> None:
@@ -95,7 +91,7 @@ def update_set(scene: Any) -> None:
     if other is None or not other.collection.children:
         return
     shown = objects_of_images(scene.view_layers[0].layer_collection)
-    wanted = {each for each in shown if each.get(tags.KIND) != tags.SPLATS}
+    wanted = {each for each in shown if not tags.is_splats(each)}
     followers = other.collection.children[0].objects
     present = set(followers)
     for each in present - wanted:

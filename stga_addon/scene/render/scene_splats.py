@@ -1,7 +1,6 @@
 """A scene's visible splats, posed, and their relit colors stored for EEVEE and Cycles."""
 
 from collections.abc import Callable, Iterator
-from contextlib import suppress
 from dataclasses import replace
 from typing import Any
 
@@ -27,7 +26,7 @@ from ..display.splat_attributes import (
 from ..display.splat_object import (
     display_mode,
     display_settings,
-    get_input,
+    followed_head,
     is_lit,
     later_modifiers,
     splat_modifier,
@@ -154,7 +153,7 @@ def visible_layers(
 
     layers = []
     for owner, each, matrix in _visible_objects(depsgraph, view, _may_show_splats):
-        if each.get(tags.KIND) != tags.SPLATS or not is_wanted(each):
+        if not tags.is_splats(each) or not is_wanted(each):
             continue
         if view is None and not _is_seen(owner, each, depsgraph):
             continue
@@ -167,7 +166,7 @@ def visible_layers(
             layer = SceneLayer(stored, WORLD, to_world, settings=settings, holdout=holdout)
             layers.append(layer)
             continue
-        head = get_input(each, splat_nodes.HEAD)
+        head = followed_head(each)
         if head is None:
             raise StgaError(f"{each.name}: has no head to follow; choose one in its modifier")
         vertices = _posed_vertices(each, head, stored.faces, depsgraph)
@@ -226,7 +225,7 @@ def native_layers(
 def _is_own(owner: Any, shown: Any) -> bool:
     """Whether `visible_layers` has these splats."""
     is_known = owner == shown or owner.instance_type == "COLLECTION"
-    return is_known and shown.get(tags.KIND) == tags.SPLATS
+    return is_known and tags.is_splats(shown)
 
 
 def all_layers(depsgraph: Any, cache: SplatCache, view: Any = None) -> list[SceneLayer]:
@@ -265,12 +264,8 @@ def with_heads(scene: Any) -> list[Any]:
     """The splat objects of the scene and its background, and the heads that they follow, for
     `kept_evaluated`."""
     objects = [each for own in (scene, *_background_scenes(scene)) for each in own.objects]
-    shown = [each for each in objects if each.get(tags.KIND) == tags.SPLATS]
-    heads = []
-    for each in shown:
-        with suppress(StgaError):  # it has lost its modifier
-            heads.append(get_input(each, splat_nodes.HEAD))
-    return [*shown, *heads]
+    shown = list(filter(tags.is_splats, objects))
+    return [*shown, *map(followed_head, shown)]
 
 
 def _posed_vertices(splat_object: Any, head: Any, faces: np.ndarray, depsgraph: Any) -> np.ndarray:
@@ -292,8 +287,7 @@ def _posed_vertices(splat_object: Any, head: Any, faces: np.ndarray, depsgraph: 
 
 def _may_show_splats(candidate: Any) -> bool:
     """Whether the object shows splats or instances a collection, which may hold some."""
-    is_splats = candidate.get(tags.KIND) == tags.SPLATS
-    return is_splats or candidate.instance_type == "COLLECTION"
+    return tags.is_splats(candidate) or candidate.instance_type == "COLLECTION"
 
 
 def _visible_objects(
@@ -355,18 +349,18 @@ def _with_instances(
 
 def _is_seen(owner: Any, instance: Any, depsgraph: Any) -> bool:
     """Whether the camera sees an object of a final image, which is an instance of `owner`."""
-    evaluated = [each.evaluated_get(depsgraph) for each in (owner, instance)]
     layers = shown_view_layers(depsgraph)
     is_indirect = any(owner.indirect_only_get(view_layer=layer) for layer in layers)
-    return not is_indirect and all(each.visible_camera for each in evaluated)
+    seen = (each.evaluated_get(depsgraph).visible_camera for each in (owner, instance))
+    return not is_indirect and all(seen)
 
 
 def _is_holdout(owner: Any, instance: Any, depsgraph: Any) -> bool:
     """Whether an object of a final image hides what it covers, by its collections or its own."""
-    evaluated = [each.evaluated_get(depsgraph) for each in (owner, instance)]
     layers = shown_view_layers(depsgraph)
     is_masked = any(owner.holdout_get(view_layer=layer) for layer in layers)
-    return is_masked or any(each.is_holdout for each in evaluated)
+    own = (each.evaluated_get(depsgraph).is_holdout for each in (owner, instance))
+    return is_masked or any(own)
 
 
 def relight_frame(splat_object: Any, scene: Any) -> None:

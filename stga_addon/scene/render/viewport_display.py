@@ -2,7 +2,6 @@
 drawn."""
 
 import traceback
-from contextlib import suppress
 from typing import Any
 
 import bpy
@@ -141,9 +140,7 @@ display = GpuDisplay()
 
 def is_shown_as_trained(candidate: Any) -> bool:
     """Whether the object is one of splats that are displayed as trained."""
-    with suppress(StgaError):  # it has lost its modifier
-        return candidate.get(tags.KIND) == tags.SPLATS and display_mode(candidate) == AS_TRAINED
-    return False
+    return tags.is_splats(candidate) and display_mode(candidate) == AS_TRAINED
 
 
 def show_points() -> float | None:

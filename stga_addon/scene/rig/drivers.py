@@ -45,7 +45,7 @@ def give_drivers(owner: Any, keeper: Any, warn: Warn) -> None:
     if keeper is None:
         return
     lost = list[str]()
-    animation = owner.animation_data or owner.animation_data_create()
+    animation = owner.animation_data_create()
     for each in keeper.animation_data.drivers:
         if _is_there(owner, each.data_path):
             animation.drivers.from_existing(src_driver=each)

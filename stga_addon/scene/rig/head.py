@@ -351,6 +351,12 @@ def rig_of(head: Any) -> Any:
 LINKED = "is linked from another file: open that file, or make the head local"
 
 
+def check_local(head: Any) -> None:
+    """Raise StgaError where a head is linked; it may be overridden."""
+    if head.library is not None:
+        raise StgaError(f"{head.name}: {LINKED}")
+
+
 def check_own(head: Any) -> None:
     """Raise StgaError where a head is linked or overridden: shape keys, vertex groups and
     properties that are added to a library override are gone after reopening."""
@@ -371,8 +377,7 @@ def _check_parent(part: Any) -> None:
 def usable_rig(head: Any, with_sliders: bool = True) -> Any:
     """The armature object of a head that can be posed here. with_sliders: and its shape keys, which
     a library override cannot change. Raises StgaError that says why not."""
-    if head.library is not None:
-        raise StgaError(f"{head.name}: {LINKED}")
+    check_local(head)
     if with_sliders and head.data.library is not None:
         raise StgaError(f"{head.name}: is overridden, but its sliders are in another file: {OWN}")
     rig = rig_of(head)

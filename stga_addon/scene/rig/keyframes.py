@@ -279,7 +279,7 @@ def new_actions(
         title = f"{owner.name} {placement.name}"
         if placement.as_strip:
             push_down_own(owner)
-            animation = owner.animation_data or owner.animation_data_create()
+            animation = owner.animation_data_create()
             animation.action = bpy.data.actions.new(title)
             continue
         curves = copy_action(owner, title)
