@@ -1,7 +1,7 @@
 """Triangle meshes: normals, parts, rigid alignment, and which triangle a camera's pixels show."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -71,9 +71,9 @@ def connected_parts(vertices: int, faces: np.ndarray) -> np.ndarray:
 class Similarity:
     """x ↦ scale · rotation x + translation."""
 
-    scale: float
-    rotation: np.ndarray
-    translation: np.ndarray
+    scale: float = 1.0
+    rotation: np.ndarray = field(default_factory=lambda: np.eye(3))
+    translation: np.ndarray = field(default_factory=lambda: np.zeros(3))
 
     def apply(self, points: np.ndarray) -> np.ndarray:
         return self.scale * points @ self.rotation.T + self.translation

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import StgaError, shorten
+from ..errors import StgaError, listed, shorten
 from ..files import (
     check_encodable,
     is_file,
@@ -79,8 +79,6 @@ NEUTRAL = ("neutral", "canonical")
 """Names of a mesh without expression."""
 MAX_COMPARED_VIEWS = 4
 """Views whose images or masks are read to check a capture."""
-NAMES_IN_WARNING = 3
-"""Files that a warning names at most."""
 MIN_FRACTION_DIFFERENCE = 0.01
 """Fraction of the vertices by which a convention must be worse than another to be doubted."""
 CANONICAL_NAME = "canonical_flame_param.npz"
@@ -307,12 +305,9 @@ def _unnamed_images(frames: Sequence[Frame]) -> list[str]:
         images = [path for path in paths if path.suffix.lower() in IMAGE_SUFFIXES]
         left_out = [path for path in images if path not in named]
         if left_out:
-            names = ", ".join(path.name for path in left_out[:NAMES_IN_WARNING])
-            more = ", …" if len(left_out) > NAMES_IN_WARNING else ""
-            found.append(
-                f"{folder}: {len(left_out)} of {len(images)} images are named by no frame: "
-                f"{names}{more}"
-            )
+            names = listed([path.name for path in left_out])
+            counted = f"{len(left_out)} of {len(images)} images are named by no frame"
+            found.append(f"{folder}: {counted}: {names}")
     return found
 
 

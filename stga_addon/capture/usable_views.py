@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..errors import StgaError
+from ..errors import StgaError, listed
 from .camera import Camera
 from .images import has_alpha, read_view, upper_border
 from .model import Capture, View, evenly_spread, views_by_camera
@@ -114,9 +114,7 @@ def with_training_views(capture: Capture) -> tuple[Capture, tuple[str, ...]]:
 
 def _timesteps(views: Iterable[View]) -> str:
     numbers = sorted({view.timestep for view in views})
-    listed = ", ".join(map(str, numbers[:NAMED_TIMESTEPS]))
-    more = ", …" if len(numbers) > NAMED_TIMESTEPS else ""
-    return f"timestep{'s' if len(numbers) > 1 else ''} {listed}{more}"
+    return f"timestep{'s' if len(numbers) > 1 else ''} {listed(numbers, NAMED_TIMESTEPS)}"
 
 
 def _unusable(views: Sequence[View]) -> list[set[Path]]:

@@ -172,6 +172,7 @@ def shaded(
     """
     points, normals, roughness = surface
     irradiance, highlight = np.zeros((2, len(points), 3), np.float32)
+    ahead = np.float32(reflectance)
     for start in range(0, len(points), CHUNK_POINTS):
         part = slice(start, start + CHUNK_POINTS)
         place, normal = (np.ascontiguousarray(rows[part].T) for rows in (points, normals))
@@ -201,8 +202,7 @@ def shaded(
             shadowing += toward_eye * np.sqrt(facing * facing * (1 - square) + square)
             fade = 1 - np.clip(_dot(view, half), 0, 1)
             fade_square = fade * fade
-            fresnel = np.float32(reflectance)
-            fresnel = fresnel + (1 - fresnel) * fade_square * fade_square * fade
+            fresnel = ahead + (1 - ahead) * fade_square * fade_square * fade
             least = np.float32(1e-12)
             gloss = square * fresnel / np.maximum(2 * np.pi * spread * spread * shadowing, least)
             strength *= np.where(alpha > 0, gloss, 0)

@@ -14,7 +14,7 @@ from ..capture.camera import Camera
 from ..capture.lens import Lens, undistortion
 from ..capture.mesh_geometry import weighted_procrustes
 from ..capture.model import evenly_spread
-from ..errors import StgaError
+from ..errors import StgaError, listed
 from ..flame.parts import flame_model
 from ..worker.helpers import Step
 from ..worker.machine import processors
@@ -23,7 +23,6 @@ from .face_networks import FaceNetworks, PersonNetwork
 from .fit import pose_from_one_camera
 from .footage.model import Footage, FootageCamera, ImageFrames
 from .footage.open import typical_focal
-from .footage.shots import listed
 from .footage.video import VideoFrames
 from .landmarks import read_places
 from .opened import check_place, file_state

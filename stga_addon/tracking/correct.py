@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from ..capture.model import Capture
-from ..capture.open import PARAMETERS, open_capture
+from ..capture.open import open_capture
 from ..errors import StgaError, shorten
 from ..files import read_json, read_npz, write_json, write_npz
 from ..flame.forward import RIGID_SIZE, by_change, change_between, changed_by
@@ -23,7 +23,7 @@ from .pictures import PosedHead, write_contact_sheet
 from .posed_points import PosedPoints, SurfacePoints
 from .solve import LANDMARK_SIGMA_M, acceleration_precision
 from .stages import ReportStage, Stage, unreported
-from .write_capture import moving_arrays
+from .write_capture import replace_head
 
 SOLVED_FILE = "tracking_solved.npz"
 """File in a corrected capture with the parameters as they were solved without keys."""
@@ -63,8 +63,7 @@ def correct_capture(
     heads = corrected(person, places[used], solved, trust, rows, span)
     write_npz(out / SOLVED_FILE, {"timesteps": np.array(timesteps), "parameters": solved})
     for number, (timestep, values) in enumerate(zip(timesteps, heads, strict=True)):
-        path = out / PARAMETERS / f"{timestep:05d}.npz"
-        write_npz(path, {**read_npz(path), **moving_arrays(values)})  # identity and offsets stay
+        replace_head(out, timestep, values)
         report(Stage.HEADS, number + 1, len(timesteps))
     report(Stage.CONTACT_SHEET, 0, 1)
     report_errors(out, model)

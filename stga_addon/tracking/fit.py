@@ -218,8 +218,7 @@ def in_cameras_world(fit: HeadFit) -> HeadFit:
             rigid[:3], rigid[POSE_SIZE:], root, turn, -turn @ world.translation
         )
         moved[timestep] = np.concatenate([expression, rigid])
-    kept = Similarity(world.scale, np.eye(3), np.zeros(3))
-    return replace(fit, parameters=moved, to_capture=kept)
+    return replace(fit, parameters=moved, to_capture=Similarity(world.scale))
 
 
 def scaled_down(world: Similarity, factor: float) -> Similarity:

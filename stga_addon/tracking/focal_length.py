@@ -67,7 +67,7 @@ MAX_COMPARED_TIMESTEPS = 40
 SCALE_ITERATIONS = 8
 OUTLIER_SCALE = 1.5
 
-HERE = Similarity(1.0, np.eye(3), np.zeros(3))
+HERE = Similarity()
 """The camera's world, in meters, in which the head is fitted."""
 
 

@@ -47,8 +47,7 @@ def captured_person(capture: Capture, name: str = "") -> KnownPerson:
         where = name or capture.root
         raise StgaError(f"{where}: its head is neither FLAME nor the bundled one; expected either")
     head = HeadModel(with_identity(sequence).model, "flame")
-    unmoved = Similarity(1.0, np.eye(3), np.zeros(3))
-    fit = HeadFit(head, sequence.shape, {}, unmoved, sequence.static_offset)
+    fit = HeadFit(head, sequence.shape, {}, Similarity(), sequence.static_offset)
     cameras = list(cameras_of(capture).values())
     return KnownPerson(fit, cameras[0] if len(cameras) == 1 else None)
 

@@ -18,6 +18,7 @@ import numpy as np
 from scipy.ndimage import binary_fill_holes
 
 from ..capture.model import evenly_spread, parts_of
+from ..errors import listed
 from ..files import read_json, write_json
 from ..worker.helpers import Step
 from .appearance import box_of, mean_around, reduced
@@ -135,9 +136,8 @@ def with_mattes(
         unseen += [f"{camera.name} at timestep {t}" for t in left if not known.get(t, True)]
         mattes = {t: file for t, file in files.items() if t in kept or t in known}
         cameras.append(replace(camera, mattes=mattes))
-    listed = ", ".join(unseen[:6]) + (", …" if len(unseen) > 6 else "")
     warning = f"no person was recognized in {len(unseen)} frames"
-    warning += f", whose mattes follow the head alone: {listed}"
+    warning += f", whose mattes follow the head alone: {listed(unseen)}"
     warnings += [warning] if unseen else []
     return replace(footage, cameras=tuple(cameras)), tuple(warnings)
 

@@ -9,6 +9,7 @@ import numpy as np
 
 from ..capture.mesh_geometry import silhouette
 from ..capture.model import evenly_spread
+from ..errors import listed
 from ..flame.forward import parameters_at
 from . import fit as head_fit
 from .dense import DenseFit, fit_dense
@@ -232,14 +233,13 @@ def _warnings(fitted: FittedHead) -> tuple[str, ...]:
     footage = recorded.footage
     fit = fitted.fit
     missing = [timestep for timestep in footage.timesteps if timestep not in fit.parameters]
-    listed = ", ".join(map(str, missing[:20])) + (", …" if len(missing) > 20 else "")
     fraction = f"{len(missing)} of {len(footage.timesteps)} timesteps"
     blind = recorded.blind_cameras
     single = len(footage.cameras) == 1
     scale = f"{fit.to_capture.scale:.4g}"
     is_scaled = recorded.opened.keeps_world and not recorded.take.metric
     own = {
-        f"no face at {fraction}, interpolated: {listed}": bool(missing),
+        f"no face at {fraction}, interpolated: {listed(missing, 20)}": bool(missing),
         f"no face in any frame of: {', '.join(blind)}": bool(blind),
         "one camera: size and distance of the head, and its depth, are those of the average "
         "head": single and recorded.opened.options.person is None,

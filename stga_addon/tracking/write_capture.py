@@ -10,7 +10,7 @@ from PIL import Image
 from ..capture.camera import Camera
 from ..capture.open import CANONICAL_NAME, PARAMETERS
 from ..capture.transforms import camera_entry
-from ..files import replacing, write_json, write_npz
+from ..files import read_npz, replacing, write_json, write_npz
 from ..flame.forward import frame_of
 from ..flame.sequence import FRAME_FIELDS
 from .fit import posed_mesh
@@ -63,10 +63,8 @@ def write_capture(
     person["shape"] = fit.shape.astype(np.float32)
     for number, (timestep, values) in enumerate(parameters.items()):
         if flame:
-            arrays = {**moving_arrays(values), **person}
-            if timestep in torso.offsets:
-                arrays["dynamic_offset"] = torso.offsets[timestep][None].astype(np.float32)
-            write_npz(out / PARAMETERS / f"{timestep:05d}.npz", arrays)
+            moving = {**moving_arrays(values), **person, **_offset(torso.offsets.get(timestep))}
+            write_npz(_head_file(out, timestep), moving)
         if meshes or not flame:
             path = out / "meshes" / f"{timestep:05d}.obj"
             write_obj(path, torso.mesh(timestep), model.faces)
@@ -121,3 +119,20 @@ def moving_arrays(parameters: np.ndarray) -> dict[str, np.ndarray]:
     """What changes from timestep to timestep of (E + 18,), as in VHAP's files: (1, …) float32."""
     frame = frame_of(parameters)
     return {name: getattr(frame, name)[None].astype(np.float32) for name in FRAME_FIELDS}
+
+
+def replace_head(
+    out: Path, timestep: int, parameters: np.ndarray, offset: np.ndarray | None = None
+) -> None:
+    """Write other parameters (E + 18,) of a timestep, and vertex offsets (V, 3) if given; the
+    identity stays, and else the offsets."""
+    path = _head_file(out, timestep)
+    write_npz(path, {**read_npz(path), **moving_arrays(parameters), **_offset(offset)})
+
+
+def _head_file(out: Path, timestep: int) -> Path:
+    return out / PARAMETERS / f"{timestep:05d}.npz"
+
+
+def _offset(offset: np.ndarray | None) -> dict[str, np.ndarray]:
+    return {} if offset is None else {"dynamic_offset": offset[None].astype(np.float32)}

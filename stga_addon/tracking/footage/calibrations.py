@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from ...capture.transforms import WHOLE_FILE, transforms_files
-from ...errors import StgaError
+from ...errors import StgaError, listed
 from ...files import decoded_text, is_file, is_folder, matching
 from .colmap import colmap_models, incomplete_models, read_colmap
 from .json_cameras import (
@@ -24,7 +24,7 @@ from .realitycapture import (
     read_realitycapture_csv,
     read_realitycapture_xmp,
 )
-from .shots import Calibrated, ImageSize, listed
+from .shots import Calibrated, ImageSize
 
 EXPECTED = (
     "transforms.json, a COLMAP model (sparse/0), Metashape's cameras.xml, "

@@ -10,8 +10,8 @@ import numpy as np
 
 from ...capture.camera import MAX_FOCAL_PIXELS
 from ...capture.lens import Lens
-from ...errors import StgaError, shorten
-from .shots import Calibrated, Shot, listed, numbers, pinhole, read_xml
+from ...errors import StgaError, listed, shorten
+from .shots import Calibrated, Shot, numbers, pinhole, read_xml
 
 PROJECTIONS = {
     "frame": "perspective",

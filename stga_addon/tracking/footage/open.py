@@ -15,7 +15,7 @@ from ...capture.images import image_size, is_inside_out, is_turned, stored_mask
 from ...capture.lens import Lens, Undistortion, undistortion
 from ...capture.model import View, evenly_spread
 from ...capture.transforms import IMAGE_SUFFIXES, VIDEO_SUFFIXES
-from ...errors import StgaError
+from ...errors import StgaError, listed
 from ...files import is_file, is_folder
 from .calibrations import EXPECTED, calibration_above, find_calibration, read_calibration
 from .colmap import is_distorted, model_suffix
@@ -24,7 +24,7 @@ from .json_cameras import camera_names
 from .model import Footage, FootageCamera, Frames, ImageFrames
 from .moments import central_pose, find_moments, images_by_camera
 from .sequences import FrameRange, Sequence, open_sequence, sequence_size, synchronized
-from .shots import Shot, listed
+from .shots import Shot
 from .sources import (
     CONTAINERS,
     ORIGINALS,

@@ -7,10 +7,10 @@ import numpy as np
 
 from ...capture.camera import GL_TO_CV
 from ...capture.lens import Lens
-from ...errors import StgaError, shorten
+from ...errors import StgaError, listed, shorten
 from ...files import LINES_BEFORE_COLUMNS, read_table, table_rows
 from ...flame.forward import axis_angle_matrices
-from .shots import Calibrated, ImageSize, Shot, listed, numbers, pinhole, read_xml
+from .shots import Calibrated, ImageSize, Shot, numbers, pinhole, read_xml
 
 FILM_WIDTH_MM = 36.0
 """Width of the 35 mm film to which focal lengths refer; it stands for the image's longer side."""

@@ -2,7 +2,7 @@
 these."""
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from xml.etree import ElementTree
@@ -14,8 +14,6 @@ from ...capture.lens import Lens
 from ...errors import StgaError, shorten
 from ...files import read_bytes
 
-NAMES_IN_SENTENCE = 5
-"""Files that a message names at most."""
 ROTATION_TOLERANCE = 1e-3
 """Some exports round rotations to a few decimals."""
 MAX_POSITION = 1e12
@@ -71,12 +69,6 @@ def read_xml(path: Path) -> ElementTree.Element:
         return ElementTree.fromstring(data, ElementTree.XMLParser(target=Builder()))
     except (ElementTree.ParseError, ValueError, LookupError) as error:
         raise StgaError(f"{path}: is not valid XML ({error})") from error
-
-
-def listed(names: Sequence[str]) -> str:
-    """The first names, and how many more there are."""
-    more = len(names) - NAMES_IN_SENTENCE
-    return ", ".join(names[:NAMES_IN_SENTENCE]) + (f" and {more} more" if more > 0 else "")
 
 
 def numbers(words: Iterable[str], where: str, count: int | None = None) -> list[float]:

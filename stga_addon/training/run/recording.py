@@ -13,9 +13,9 @@ from ...capture.camera import Camera
 from ...capture.images import read_view
 from ...capture.mesh_geometry import Similarity, rasterize
 from ...capture.model import Capture, View, cameras_at_once, evenly_spread, views_by_camera
-from ...capture.open import PARAMETERS, open_capture
+from ...capture.open import open_capture
 from ...capture.usable_views import with_usable_views
-from ...files import read_json, read_npz, write_json, write_npz
+from ...files import read_json, write_json
 from ...flame.forward import joint_positions, moved_pose, shaped_vertices
 from ...flame.sequence import FlameSequence, torso_offset, torso_shapes, with_identity
 from ...light.harmonics import basis, uniform
@@ -23,7 +23,7 @@ from ...render.render import render_avatar, to_uint8
 from ...tracking import folder as tracking_folder
 from ...tracking.folder import REPORT_FILE, SPLIT_FILES
 from ...tracking.known_person import KnownPerson, cameras_of, captured_person
-from ...tracking.write_capture import moving_arrays
+from ...tracking.write_capture import replace_head
 from ...worker.helpers import Helpers, Step
 from ..optimize.avatar_tracking import (
     AvatarTracking,
@@ -54,7 +54,7 @@ SCALE_TIMESTEPS = 6
 ROUNDS = 2
 """Rounds of tracking, each from the motion that the round before led to, smoothed in takes in
 order."""
-IDENTITY = Similarity(1.0, np.eye(3), np.zeros(3))
+IDENTITY = Similarity()
 
 PART_TIMESTEPS = 16
 """Timesteps that a helping process tracks at a time."""
@@ -134,12 +134,8 @@ def _replace_heads(root: Path, sequence: FlameSequence, tracked: AvatarTracking)
     torso = torso_shapes(sequence.model)
     rows = zip(tracked.timesteps, tracked.parameters, tracked.shift, strict=True)
     for timestep, values, shift in rows:
-        path = root / PARAMETERS / f"{timestep:05d}.npz"
-        arrays = {**read_npz(path), **moving_arrays(values)}  # the identity stays
         offset = torso_offset(torso, shift, sequence.frame(timestep).dynamic_offset)
-        if offset is not None:
-            arrays["dynamic_offset"] = offset[None].astype(np.float32)
-        write_npz(path, arrays)
+        replace_head(root, timestep, values, offset)
 
 
 def _track_part(
@@ -222,8 +218,7 @@ def move_capture(root: Path, flame: Path | None, factor: float, rotation: np.nda
         root_joint = joint_positions(person, shaped)[0]
         turned, moved = moved_pose(frame.rotation, frame.translation, root_joint, rotation, shift)
         values = replace(frame, rotation=turned, translation=moved).parameters
-        path = root / PARAMETERS / f"{timestep:05d}.npz"
-        write_npz(path, {**read_npz(path), **moving_arrays(values)})
+        replace_head(root, timestep, values)
     torso = tracking_folder.read_torso_points(root)
     if torso is not None:
         at = factor * torso.at @ rotation.T
