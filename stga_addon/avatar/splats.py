@@ -67,7 +67,8 @@ class Splats:
 
     def opacities(self) -> np.ndarray:
         """(N,) float32 in 0 to 1."""
-        return np.asarray(1 / (1 + np.exp(-self.opacity.astype(np.float64))), np.float32)
+        with np.errstate(over="ignore"):  # of a logit of -1000, which is 0
+            return np.asarray(1 / (1 + np.exp(-self.opacity.astype(np.float64))), np.float32)
 
     def rows(self, index: np.ndarray) -> "Splats":
         """The splats at `index` (a boolean mask or integer array)."""

@@ -76,9 +76,10 @@ def read_skinned_splats(path: Path) -> SkinnedSplats:
         end = start + _whole(header["byteLength"])
         if end > len(binary):
             raise ValueError("it is cut off")
-        arrays = _arrays(header["arrays"], binary[start:end])
-        rig, faces = _rig(document, binary, arrays, header)
-        avatar = _avatar(header, arrays, rig, faces)
+        with np.errstate(all="ignore"):  # `check_avatar` refuses what is not finite
+            arrays = _arrays(header["arrays"], binary[start:end])
+            rig, faces = _rig(document, binary, arrays, header)
+            avatar = _avatar(header, arrays, rig, faces)
     except (*UNREADABLE, struct.error, zlib.error) as error:
         raise StgaError(f"{path}: is no file of skinned splats ({error})") from error
     check_avatar(path, avatar)

@@ -47,6 +47,12 @@ COORDINATE_BITS = 24
 
 MAX_COORDINATE = (1 << (COORDINATE_BITS - 1)) - 1
 """Largest coordinate in units of its resolution."""
+MIN_LOG_SCALE = -10.0
+"""Least logarithm of a standard deviation, 45 µm; smaller ones are as large."""
+SCALE_STEPS = 16
+"""Steps of that logarithm in 1."""
+MAX_LOG_SCALE = MIN_LOG_SCALE + 255 / SCALE_STEPS
+"""Largest one that a byte holds."""
 COLOR_SCALE = 0.15
 """Scale of the constant coefficient in a byte."""
 OTHERS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
@@ -59,8 +65,8 @@ def write_spz(path: Path, world: Splats, antialiased: bool = False) -> None:
     Axes as in the splats: x right, y up, z back. Quantized: positions as MAX_FRACTION_BITS defines,
     standard deviations from 45 µm in steps of 6 %, rotations 10 bits a component, opacity and color
     8 bits; coefficients above degree 0 are cut at ±1. antialiased as in `Avatar`. Raises StgaError
-    for values that are not finite, and positions beyond MAX_COORDINATE. Source: Niantic's README
-    and `load-spz.cc`.
+    for values that are not finite, positions beyond MAX_COORDINATE and larger splats than
+    MAX_LOG_SCALE. Source: Niantic's README and `load-spz.cc`.
     """
     for each in fields(world):
         if not np.isfinite(getattr(world, each.name)).all():
@@ -69,6 +75,11 @@ def write_spz(path: Path, world: Splats, antialiased: bool = False) -> None:
     if largest > MAX_COORDINATE:
         limit = f"positions from -{MAX_COORDINATE} to {MAX_COORDINATE}"
         raise StgaError(f"{path}: .spz holds {limit}, but a splat is at {largest:g}")
+    largest_scale = float(world.log_scale.max(initial=MIN_LOG_SCALE))
+    if largest_scale > MAX_LOG_SCALE:
+        limit = f"standard deviations to {math.exp(MAX_LOG_SCALE):.0f}"
+        problem = f"a splat has one of e^{largest_scale:.4g}"
+        raise StgaError(f"{path}: .spz holds {limit}, but {problem}")
     # As many bits of a coordinate behind the point as the largest one leaves.
     bits = COORDINATE_BITS - 2 - math.floor(math.log2(max(largest, 1.0)))
     bits = max(min(MAX_FRACTION_BITS, bits), 0)
@@ -87,7 +98,7 @@ def write_spz(path: Path, world: Splats, antialiased: bool = False) -> None:
         whole.view(np.uint8).reshape(-1, 3, 4)[..., :3],
         _byte(world.opacities() * 255),
         _byte((world.sh[:, 0] * COLOR_SCALE + 0.5) * 255),
-        _byte((world.log_scale + 10) * 16),
+        _byte((world.log_scale - MIN_LOG_SCALE) * SCALE_STEPS),
         rotations,
         _byte(world.sh[:, 1:] * 128 + 128),
     )
@@ -152,7 +163,11 @@ def _unpacked(path: Path, data: bytes, log: Log) -> Splats:
     rotation = _smallest_three(turn) if version >= 3 else _three(turn)
     xyz = places.view("<f2") if version == 1 else _fixed(places) / 2.0**bits
     return in_world(
-        xyz, rotation, scale.astype(np.float32) / 16 - 10, logits(alpha[:, 0] / 255), sh
+        xyz,
+        rotation,
+        scale.astype(np.float32) / SCALE_STEPS + MIN_LOG_SCALE,
+        logits(alpha[:, 0] / 255),
+        sh,
     )
 
 

@@ -82,6 +82,7 @@ def test_far_and_extreme_splats(tmp_path):
         ("log_scale", -np.inf, "log_scale holds a value that is not finite"),
         ("rotation", np.nan, "rotation holds a value that is not finite"),
         ("sh", np.inf, "sh holds a value that is not finite"),
+        ("log_scale", 6.0, "standard deviations to 379, but a splat has one of e\\^6"),
         ("xyz", 1e7, "positions from -8388607 to 8388607, but a splat is at 1e\\+07"),
     ],
 )
