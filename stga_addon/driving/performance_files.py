@@ -262,7 +262,7 @@ def _first(entry: dict[str, Any], keys: tuple[str, ...], default: Any) -> Any:
     return next((entry[key] for key in keys if key in entry), default)
 
 
-def _constant_rate(columns: Mapping[str, Sequence[object]]) -> float | None:
+def _constant_rate(columns: Columns) -> float | None:
     """Rows a second by a column that is called so and holds one plausible number; None without."""
     for name, cells in columns.items():
         with suppress(StgaError):
