@@ -19,6 +19,7 @@ from ..flame.parts import flame_model
 from ..flame.sequence import FlameSequence, strengthened, transferred_motion
 from ..options import When, option
 from .clocks import MAX_FPS, MIN_FPS
+from .frame_forms import MAX_ROWS
 from .head_map import head_map, person_of
 from .performance import (
     ARKIT_SHAPES,
@@ -32,7 +33,6 @@ from .performance import (
     resampled,
     smoothed,
 )
-from .performance_files import MAX_ROWS
 from .performers import READ_SUFFIXES, is_performance, performer_of, read_performance
 
 PART_FIELDS = {"face": "expr", "jaw": "jaw_pose", "eyes": "eyes_pose"}

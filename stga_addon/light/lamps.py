@@ -149,7 +149,7 @@ def depth_kernel() -> Callable[[np.ndarray, np.ndarray, np.ndarray], None]:
     """`add_depths` of `raster.cpu.shadow`, ten times as fast, where Numba's kernels are compiled,
     else NumPy's."""
     kernels = import_module("...raster.cpu.shadow", __name__) if prefers_numba() else array_kernels
-    return kernels.add_depths  # type: ignore[no-any-return]
+    return kernels.add_depths
 
 
 FEW = 1

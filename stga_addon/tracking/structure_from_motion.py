@@ -35,6 +35,13 @@ NEAR_IMAGES = 10
 """Images of a video that are compared with one before them."""
 LOOP_STEP = 4
 """Every LOOP_STEP-th image is compared with all others of them: a camera may come back."""
+MODEL_GROWTH = 1.3
+"""Ratio by which images or points of a model grow before all of it is adjusted again. COLMAP's 1.1
+takes up to twice the time; cameras of three takes are as exact."""
+MAX_ADJUSTMENTS = 2
+"""Adjustments of a whole model in a row, between which outliers are removed; COLMAP's are 5."""
+MAX_ADJUSTMENT_ITERATIONS = 20
+"""Iterations of such an adjustment; COLMAP's are 50. The last one is another's: `_adjust`."""
 MIN_MODEL_IMAGES = 3
 """Images of the smallest model that COLMAP keeps."""
 LENS_GAIN = 0.03
@@ -272,6 +279,9 @@ class _Search:
         options.triangulation.random_seed = SEED
         options.min_model_size = MIN_MODEL_IMAGES
         options.extract_colors = False
+        options.ba_global_frames_ratio = options.ba_global_points_ratio = MODEL_GROWTH
+        options.ba_global_max_refinements = MAX_ADJUSTMENTS
+        options.ba_global_max_num_iterations = MAX_ADJUSTMENT_ITERATIONS
         options.ba_refine_focal_length = not self._options.keeps_focal
         options.mapper.abs_pose_refine_focal_length = not self._options.keeps_focal
         models = self._folder / MODELS_FOLDER

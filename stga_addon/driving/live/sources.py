@@ -14,9 +14,9 @@ import numpy as np
 from ...errors import StgaError
 from .. import performance_files
 from ..clocks import DEFAULT_FPS, MAX_FPS
+from ..frame_forms import MAX_ROWS
 from ..open_motion import MotionOptions, corrected
 from ..performance import FacePacket, Performance
-from ..performance_files import MAX_ROWS
 from .decoders import Received, decode_live_link_face, decode_vmc
 
 Decoded = tuple[FacePacket | None, Any]

@@ -11,8 +11,10 @@ import bpy
 from ... import __version__
 from .. import compat
 
-Socket = bpy.types.NodeSocket
-Tree = bpy.types.NodeTree
+Socket = Any
+"""A `bpy.types.NodeSocket`."""
+Tree = Any
+"""A `bpy.types.NodeTree`."""
 
 VERSION = "stga_version"  # property of our trees: `_version`
 _COLUMN_WIDTH = 220.0

@@ -237,8 +237,11 @@ def world(facts: CaptureFacts) -> Verdict:
     moving = set()
     for view in facts.views:
         known = first.setdefault(view.camera_index, view.camera)
-        both = [(*own.intrinsics, *own.world_to_camera.ravel()) for own in (known, view.camera)]
-        if known is not view.camera and not np.allclose(*both, atol=1e-6):
+        first_numbers, numbers = (
+            np.array([*camera.intrinsics, *camera.world_to_camera.ravel()])
+            for camera in (known, view.camera)
+        )
+        if not np.allclose(first_numbers, numbers, atol=1e-6):
             moving.add(view.camera_index)
     if moving:
         return Verdict(False, f"{len(moving)} of {facts.cameras} cameras move", fixed=True)
