@@ -120,7 +120,7 @@ class Nodes:
             named = [s for s in node.inputs if s.enabled and name in (s.name, s.identifier)]
             values = values if isinstance(values, list) else [values]
             for socket, value in zip(named, values, strict=True):
-                if isinstance(value, Socket):
+                if isinstance(value, bpy.types.NodeSocket):
                     self.tree.links.new(value, socket)
                 else:
                     socket.default_value = value
