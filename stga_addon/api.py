@@ -47,6 +47,14 @@ if TYPE_CHECKING:
     from .raster.cpu.autograd import render_differentiable
     from .render.render import render, render_avatar, to_uint8
 
+_LOADED_WHEN_USED = {
+    "render": "render.render",
+    "render_avatar": "render.render",
+    "to_uint8": "render.render",
+    "render_differentiable": "raster.cpu.autograd",
+}
+"""Names that need more than numpy -> their modules."""
+
 __all__ = [
     "Analyze",
     "Avatar",
@@ -93,14 +101,6 @@ read_avatar = _takes_paths(_avatar_file.read_avatar)
 read_splats = _takes_paths(_splat_files.read_splats)
 write_avatar = _takes_paths(_avatar_file.write_avatar)
 write_ply = _takes_paths(_ply.write_ply)
-
-_LOADED_WHEN_USED = {
-    "render": "render.render",
-    "render_avatar": "render.render",
-    "to_uint8": "render.render",
-    "render_differentiable": "raster.cpu.autograd",
-}
-"""Names that need more than numpy -> their modules."""
 
 
 def __getattr__(name: str) -> Any:

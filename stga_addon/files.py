@@ -32,8 +32,11 @@ from numpy.typing import ArrayLike, DTypeLike
 from .errors import StgaError, shorten
 
 MAX_FILE_BYTES = 1 << 30
+"""Largest file that is read where its reader sets no limit."""
 MAX_JSON_BYTES = 256 << 20
+"""Largest JSON file that is read."""
 MAX_TOML_BYTES = 16 << 20
+"""Largest TOML file that is read."""
 
 MAX_TEXT_VALUES = 12_000_000
 """Values and lines of a JSON file or a table; one takes up to 100 bytes of memory."""
@@ -41,11 +44,15 @@ SEPARATORS = ",;\t\n\r[{"
 """Characters that stand before or behind each value."""
 
 PROBED_BYTES = 1 << 10
+"""Bytes at the beginning of a file that show a Git LFS pointer or a web page."""
 DAMAGE_BYTES = 1 << 20
+"""Bytes at the beginning of a file in which changed line ends are looked for."""
 WEB_PAGE = re.compile(rb"(<\?xml[^>]*>|<!--.*?-->|\s)*<(!doctype html|html|head|body)\b", re.DOTALL)
+"""Beginning of an HTML page, in lower case."""
 CHANGED_LINE_ENDS = (
     "was carried over as text, which changed its line ends (CR LF); copy it again as binary"
 )
+"""What a message says of a binary file whose line ends were changed."""
 
 MAX_ARRAYS_BYTES = 1 << 30
 """Largest sum of the arrays that are read from an npz: an avatar of four million splats."""
@@ -78,7 +85,9 @@ WINDOWS_SHARING_ERRORS = (5, 32)
 NO_FILE = (errno.ENOENT, errno.ENOTDIR, errno.ELOOP, errno.ENAMETOOLONG, errno.EINVAL)
 """Errors of the system where no file has a name."""
 NewFile = Callable[[Path], AbstractContextManager[Path]]
+"""Called with a path, yields a temporary file that is renamed to it (`replacing`)."""
 SEQUENCE_FILE = ".stga_sequence"
+"""List of the numbered files in a folder (`NumberedFiles`)."""
 BYTE_ORDER_MARKS = {
     codecs.BOM_UTF8: "utf-8-sig",
     codecs.BOM_UTF32_LE: "utf-32",  # before UTF-16's, with whose mark it begins
@@ -86,8 +95,11 @@ BYTE_ORDER_MARKS = {
     codecs.BOM_UTF16_LE: "utf-16",
     codecs.BOM_UTF16_BE: "utf-16",
 }
+"""First bytes of a text -> Python's name of its encoding."""
 DELIMITERS = ",;\t"
+"""Characters that separate the columns of tables."""
 DECIMAL_COMMA = re.compile(r"\s*[-+]?\d*,\d+([eE][-+]?\d+)?\s*", re.ASCII)
+"""Number with a decimal comma, as in tables whose columns another character separates."""
 
 LINES_BEFORE_COLUMNS = 5
 """Comments in which the row of a table's columns is searched."""

@@ -12,7 +12,9 @@ from .splats import SH_C0, Splats, turned_harmonics
 from .strain import StrainBasis, gram_deformation
 
 CONVENTIONS = ("stga", "gaussian_avatars")
+"""Names of the ways to derive a local frame from a triangle (`face_frames`)."""
 MIN_DIVISOR = 1e-30
+"""Least value that is divided by, or whose logarithm is taken, in place of zero."""
 
 MAX_UNEVENNESS = 1e-6
 """Relative difference between a matrix's scales that is float32's rounding."""

@@ -29,8 +29,11 @@ from .splats import ARRAYS, SH_C0, Splats, sh_color
 from .strain import STRAIN_COMPONENTS, TRAINED_RANGE, StrainBasis, at_rest, strain_basis
 
 FORMAT = "stga-avatar"
+"""`format` in the header, which tells an avatar from other .npz files."""
 VERSION = 3
+"""`version` in the header: the only one that is read and written."""
 MAX_HEADER_BYTES = 16 << 20
+"""Largest header that is parsed."""
 
 _HEADER = {
     "convention": str,
@@ -53,7 +56,9 @@ _LIGHT_ARRAYS = {
 }
 """Array of a light -> its shape, -1: vertices."""
 _PREFIX = "light_"
+"""Prefix of the names that the arrays of a light have in the file."""
 _OPTIONAL_ARRAYS = "strain_range", "linear_base", "filmed_along"
+"""Arrays that are stored only where the avatar has them."""
 
 MIN_COLOR_CHANGE = 1 / 255
 """Offsets of colors that never change them by as much are not stored."""

@@ -16,9 +16,13 @@ SIGNALS: dict[str, Callable[[StrainBasis, FaceFrames], np.ndarray]] = {
 """Name -> (F, 3) float32 of a posed mesh's triangles, from the neutral mesh's basis and the frames;
 0 where it is at rest. "normal": the change of the unit normal, world axes."""
 POSITION = "position"
+"""Target of an offset that moves splats, in the triangle's own axes and unit."""
 SCALE = "scale"
+"""Target of an offset that is added to the logarithm of a splat's size."""
 COLOR = "color"
+"""Target of an offset that is added to colors (sRGB)."""
 TARGETS = (POSITION, SCALE, COLOR)
+"""Targets in the order of their numbers in the kernels (`raster.cpu.project`)."""
 
 MAX_ENLARGEMENT = 3.0
 """Factor by which a signal may enlarge any splat: 99 % of the triangles of one `studio_head` run
@@ -48,14 +52,15 @@ class DrivenOffset:
     of_light: bool = False
 
 
-_ROWS = (
-    DrivenOffset("strain_position", "smoothed_strain", POSITION, "xyz", 0.5),
-    DrivenOffset("strain_scale", "smoothed_strain", SCALE, "log_scale", 0.5),
-    DrivenOffset("strain_color", "smoothed_strain", COLOR, "strain_color", 0.8),
-    DrivenOffset("normal_color", "normal", COLOR, "strain_color", 0.4, of_light=True),
-)
-
-OFFSETS: dict[str, DrivenOffset] = {offset.name: offset for offset in _ROWS}
+OFFSETS: dict[str, DrivenOffset] = {
+    offset.name: offset
+    for offset in (
+        DrivenOffset("strain_position", "smoothed_strain", POSITION, "xyz", 0.5),
+        DrivenOffset("strain_scale", "smoothed_strain", SCALE, "log_scale", 0.5),
+        DrivenOffset("strain_color", "smoothed_strain", COLOR, "strain_color", 0.8),
+        DrivenOffset("normal_color", "normal", COLOR, "strain_color", 0.4, of_light=True),
+    )
+}
 """Name -> driven offset. Everything that trains, stores or poses avatars uses this table.
 Compressed skin bulges and darkens, splats on stretched skin become larger, and skin that turns in a
 fixed light becomes brighter or darker."""

@@ -13,6 +13,7 @@ import numpy as np
 from ..flame.quaternions import normalized, unit
 
 MAX_SH_DEGREE = 3
+"""Highest degree of spherical harmonics, as in 3D Gaussian Splatting (Kerbl et al. 2023)."""
 
 SH_C0 = 0.28209479177387814
 """The constant spherical harmonic, 1 / (2·sqrt(π)): a color is 0.5 + SH_C0 times the degree-0

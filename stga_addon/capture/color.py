@@ -12,11 +12,17 @@ CHROMATICITIES = {
 }
 """Code of color primaries -> CIE xy of red, green and blue (white: D65). Others are sRGB's."""
 D65 = (0.3127, 0.3290)
+"""CIE xy of the white point that all of these primaries have."""
 SRGB = 1
+"""Code of sRGB's and BT.709's primaries (ITU-T H.273, table 2)."""
 LINEAR = 8
+"""Code of the linear transfer characteristic (ITU-T H.273, table 3)."""
 PQ = 16
+"""Code of the perceptual quantizer, SMPTE ST 2084 (ITU-T H.273, table 3)."""
 HLG = 18
-Conversion = Callable[[np.ndarray], np.ndarray]  # Of pixels
+"""Code of hybrid log-gamma, ARIB STD-B67 (ITU-T H.273, table 3)."""
+Conversion = Callable[[np.ndarray], np.ndarray]
+"""Function of the pixels in some rows of an image, which returns their colors from 0 to 255."""
 
 GAMMAS = {4: 2.2, 5: 2.8}
 """Code of transfer characteristics -> exponent. Codes that are not named here are sRGB's curve."""
@@ -25,8 +31,11 @@ REFERENCE_WHITE_CD_M2 = 203.0
 """Luminance of diffuse white in HDR (ITU-R BT.2408), which becomes sRGB's; brighter values are
 clipped."""
 HLG_PEAK = 1000.0 / REFERENCE_WHITE_CD_M2
+"""Luminance of the brightest HLG signal on a display of 1000 cd/m², where 1 is diffuse white."""
 HLG_SYSTEM_GAMMA = 1.2
+"""Exponent between the light of the scene and that of such a display (ITU-R BT.2100, table 5)."""
 BT2020_LUMINANCE = np.array([0.2627, 0.6780, 0.0593])
+"""Luminance of linear red, green and blue (ITU-R BT.2020)."""
 
 BAND_PIXELS = 1 << 18
 """Pixels converted at a time: wide intermediate numbers of a large image would fill the memory."""

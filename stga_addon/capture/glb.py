@@ -9,9 +9,13 @@ from ..errors import shorten
 from ..files import parse_json
 
 Json = dict[str, Any]
+"""JSON object of a glTF document."""
 MAGIC = b"glTF"
+"""First bytes of a GLB, glTF's binary form."""
 VERSION = 2
+"""Version of glTF in the header of a GLB."""
 JSON_KIND = b"JSON"
+"""Type of a GLB's first chunk, which holds the document."""
 
 HEADER_BYTES = 20
 """Bytes of the file's header and of that of its first chunk."""

@@ -20,8 +20,6 @@ from .color import in_bands, is_srgb, to_srgb, with_gamma
 from .green_screen import without_spill
 from .model import View
 
-WHITE = (255, 255, 255)
-
 WHITE_LEVEL = 247
 """Level of all channels from which a pixel without a mask counts as a white background."""
 MIN_LEFT_OUT = 0.02
@@ -40,6 +38,7 @@ GAMMA_TOLERANCE = 0.02
 CICP = "stga_cicp"
 """Key of an opened image's information: what `_cicp` found in its file."""
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
+WHITE = (255, 255, 255)
 
 # Once, not by `catch_warnings`, which is not safe in threads. Sizes have limits of their own; what
 # else Pillow warns about, such as damaged metadata, does not concern the pixels.

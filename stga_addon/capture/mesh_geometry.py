@@ -9,7 +9,9 @@ from ..flame.quaternions import unit
 from .camera import Camera
 
 ArrayPair = tuple[np.ndarray, np.ndarray]
+"""Two arrays, as the function that returns them describes."""
 MAX_ITERATIONS = 100
+"""Reweighted fits of a posed mesh to the neutral one, at most."""
 
 MIN_RESIDUAL = 1e-7
 """Fraction of the mesh's size below which residuals are rounding."""

@@ -19,12 +19,14 @@ from .ply import ply_rows
 Mesh = tuple[np.ndarray, np.ndarray]
 """Vertices (V, 3) and triangles (F, 3)."""
 MESH_SUFFIXES = (".obj", ".ply", ".glb", ".stl")
+"""Suffixes of the mesh files that are read."""
 
 PRIMITIVE_NUMBERS = 1000
 """Numbers that each primitive counts for: trimesh takes time even for a small one."""
 CACHE_BYTES = 96 << 20
 """Memory for posed meshes: of a take of ten seconds, each is posed once."""
 MAX_MESH_BYTES = 512 << 20
+"""Largest mesh file that is read."""
 
 MIN_EXTENT_M = 1e-9
 """A smaller mesh is a point: no shape to train on, and no scale to compare motion with."""

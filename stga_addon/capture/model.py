@@ -15,6 +15,7 @@ from .camera import Camera
 from .lens import Undistortion
 
 Item = TypeVar("Item")
+"""Type of the items that a function is given and returns."""
 
 FPS_LIMIT = 1000.0
 """Frame rates are below it."""

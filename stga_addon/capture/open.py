@@ -82,7 +82,9 @@ MAX_COMPARED_VIEWS = 4
 MIN_FRACTION_DIFFERENCE = 0.01
 """Fraction of the vertices by which a convention must be worse than another to be doubted."""
 CANONICAL_NAME = "canonical_flame_param.npz"
+"""File of the canonical head's FLAME parameters, by which VHAP's captures are recognized."""
 PARAMETERS = "flame_param"
+"""Folder of VHAP's FLAME parameters, one file for each timestep."""
 
 OWN_MODELS = ("flame_model.npz", "flame_model.pkl")
 """Names of a FLAME model file in the folder of a capture, which is used where none is given."""

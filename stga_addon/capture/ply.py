@@ -14,6 +14,7 @@ from ..errors import StgaError, shorten
 from ..files import CHANGED_LINE_ENDS, converted, line_ends_changed
 
 MAX_HEADER_BYTES = 1 << 16
+"""Bytes within which the header of a file must end."""
 
 MAX_LINES = 1 << 23
 """Lines of an ASCII file, each of which becomes a Python object."""

@@ -19,10 +19,15 @@ from .camera import MAX_COORDINATE_M, MAX_FOCAL_PIXELS, Camera, camera_from_gl, 
 from .model import FPS_LIMIT, Item, View, Views
 
 SPLITS = ("train", "val", "test")
+"""Splits of a capture: training views, the held-out camera, the held-out expressions."""
 WHOLE_FILE = "transforms.json"
+"""File of a capture without splits, all of whose views are training views."""
 SPLIT_FILES = {s: f"transforms_{s}.json" for s in SPLITS}
+"""Split -> its file."""
 PRINCIPAL_POINTS = ("vhap", "opencv", "center")
+"""Choices of what a file's cx and cy mean (`read_transforms`)."""
 DEFAULT_PRINCIPAL_POINT = PRINCIPAL_POINTS[0]
+"""Choice where the user makes none: VHAP's, cy from the bottom."""
 
 ROTATION_TOLERANCE = 1e-3
 """Exporters write float32 poses, some rounded to a few decimals."""
@@ -31,9 +36,13 @@ MAX_NUMBER = sys.float_info.max
 MIN_ANGLE = 1e-9
 """Least angle of view in radians; half of it still has a tangent."""
 INDEX_LIMIT = 1 << 31
+"""Timesteps and camera indices are below it, to fit into int32."""
 MAX_PATH_CHARACTERS = 2000
+"""Longest path that a file may name."""
 MAX_NAME_BYTES = 255
+"""Longest name within a path, as `files.MAX_NAME_BYTES`."""
 MATRIX = "a 4x4 matrix of finite numbers"
+"""What a message says that `transform_matrix` must be."""
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp")
 """Suffixes of images, in the order in which a path without one is looked for."""

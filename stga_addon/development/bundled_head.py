@@ -24,17 +24,26 @@ from ..tracking.landmarks import write_places
 from ..tracking.recorded import BUNDLED_PLACES
 from .arkit_shapes import METERS_PER_UNIT, ict_names
 
-# First and last vertex of the model's parts. Its second shells of the eyeballs, tear films and
-# lashes are left out.
+# Ranges of vertices: the first, and the one behind the last, of ICT-FaceKit's parts. Its second
+# shells of the eyeballs, tear films and lashes are left out.
 FACE = (0, 9409)
+"""Vertices of the face, the front of the skin."""
 HEAD = (9409, 11248)
+"""Vertices of the skin of skull and neck."""
 MOUTH_INSIDE = (11248, 13294)
+"""Vertices of the mouth's lining."""
 EYE_SOCKETS = (13294, 14062)
+"""Vertices of both eye sockets."""
 SKIN = (0, 14062)
+"""Vertices of the whole skin: the four parts above."""
 GUMS = (14062, 17039)
+"""Vertices of gums and tongue."""
 TEETH = (17039, 21451)
+"""Vertices of all teeth."""
 LEFT_EYEBALL = (21451, 22221)
+"""Vertices of one shell of the left eyeball."""
 RIGHT_EYEBALL = (23021, 23791)
+"""Vertices of one shell of the right eyeball."""
 
 KEPT_TRIANGLES = {SKIN: 19000, GUMS: 900, TEETH: 2500, LEFT_EYEBALL: 500, RIGHT_EYEBALL: 500}
 """Part -> how many of its triangles are kept."""

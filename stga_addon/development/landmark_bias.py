@@ -20,11 +20,17 @@ from ..tracking.landmarks import read_places
 from ..tracking.recorded import BUNDLED_PLACES
 
 AZIMUTHS_DEG = tuple(range(-60, 61, 15))
+"""Azimuths of the cameras; 0 is straight ahead."""
 ELEVATIONS_DEG = tuple(range(-45, 46, 15))
+"""Elevations of the cameras; 0 is at the face's height."""
 PICTURE_SIZE_PX = 512
+"""Edge of the square pictures."""
 DISTANCE_M = 1.2
+"""Distance of the cameras from the face's center."""
 FACE_HEIGHT_M = 0.2
-FACE_RATIO = 0.42  # Height of the face in that of the picture
+"""Height of a typical face, from which the focal length follows."""
+FACE_RATIO = 0.42
+"""Height of the face as a fraction of the picture's."""
 
 PEOPLE = 5
 """Heads that are rendered: the neutral one, the others of random identities and expressions."""

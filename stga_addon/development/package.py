@@ -29,7 +29,9 @@ from .wheels import (
 )
 
 ROOT = Path(__file__).resolve().parents[2]
+"""Folder of the checkout."""
 MANIFEST = "blender_manifest.toml"
+"""File that describes the extension to Blender, at the top of the checkout."""
 
 WHEELS = (
     "filelock-4.2.11-py3-none-any.whl",

@@ -26,6 +26,7 @@ EVEN_TOLERANCE_S = 1e-6
 OTHER_RATE = "--recorded-fps, in Blender Recorded At, sets another rate"
 """End of a message about a guessed rate."""
 DAY_S = 86_400.0
+"""Seconds after which clocks begin again at zero."""
 
 DROP_DAY_S = (30 * DAY_S - 2 * 1296) * 1001 / 30_000
 """A day in which 1296 minutes leave out two of 30 frames a second."""
@@ -78,8 +79,10 @@ MAX_NUMBER = 1e300
 MAX_SECONDS = 1e12
 """Largest time: clocks count from 1970, or from the year 1."""
 
-DEFAULT_FPS = 60.0  # Frame rate of files with neither times nor a rate: ARKit's
+DEFAULT_FPS = 60.0
+"""Frame rate of files with neither times nor a rate: ARKit's."""
 RATES = tuple(sorted({rate * ratio for rate in (10, 12, 15, *BASES) for ratio in (1, DROP_RATIO)}))
+"""Standard frame rates per second, each also at the speed of drop-frame timecodes."""
 
 MAX_RATE_DIFFERENCE = 0.02
 """Largest relative difference between a standard rate and that of the times."""

@@ -21,7 +21,9 @@ JAW_SHAPES = ("jawOpen", "jawLeft", "jawRight")
 PRODUCT_SHAPES = tuple(name for name in ARKIT_SHAPES if name.startswith(("jaw", "mouth")))
 """Shapes whose products with jawOpen are features: a jaw that turns carries what they move."""
 PRODUCTS = np.array([COLUMN[name] for name in PRODUCT_SHAPES])
+"""Columns of PRODUCT_SHAPES among ARKit's shapes."""
 FEATURES = COUNT + len(PRODUCTS)
+"""Features of a face (`features`): the weights, then the products."""
 
 GAZE_RAD = 0.61
 """Angle of an eye at weight 1 of an eyeLook shape, the largest in Live Link Face's takes."""

@@ -13,14 +13,18 @@ AXES = {"yaw": 0, "pitch": 1, "roll": 2, "y": 0, "x": 1, "z": 2, "w": 3}
 """Last letters of an angle's name -> its place in (yaw, pitch, roll), or the quaternion's real
 part."""
 _ROTATION = "(?:rotation|rot|quaternion|quat|eulerangles?|euler|angles?|orientation|pose)"
+"""Pattern of the words for a rotation in the names of columns."""
 _UNIT = "(?P<unit>deg(?:ree)?s?|rad(?:ian)?s?)?"
+"""Pattern of an angle's unit at the end of a name, which may be missing."""
 _NAME = re.compile(
     f"(?:(?:head|{_ROTATION})*(yaw|pitch|roll)|head(?:{_ROTATION}+|r|q)([xyzw])){_UNIT}"
 )
+"""Pattern of the columns that are read: angles of the head, or its quaternion's parts."""
 _LIKE_A_ROTATION = re.compile(
     "(?!.*(?:eye|gaze|camera|mouth|jaw|hand))"
     f"(?:head.?.?$|.*(?:{_ROTATION}|matrix|transform|yaw|pitch|roll)|r[xyz]$)"
 )
+"""Pattern of the columns that may rotate a head: those not read are named in a message."""
 
 NECK_RAD = np.radians([100.0, 80.0, 80.0])
 """Yaw, pitch and roll that no neck reaches."""

@@ -15,10 +15,15 @@ from .performance import ARKIT_SHAPES, COLUMN, COUNT, OPTIONAL, Performance
 from .shapes import JAW_OPEN, MOUTH_CLOSE
 
 MAX_SWEEPS = 60
-CONVERGED = 1e-5  # Largest change of a weight in a sweep, below which the descent stops
+"""Sweeps of the descent over all weights, at most."""
+CONVERGED = 1e-5
+"""Largest change of a weight in a sweep, below which the descent stops."""
 NEWTON_STEPS = 12
+"""Projected Newton steps that follow the descent."""
 STEP_FRACTIONS = (1.0, 0.5, 0.2, 0.05, 0.0)
-CHUNK = 256  # Rows whose matrices are held at once
+"""Fractions of a Newton step, of which the best is taken."""
+CHUNK = 256
+"""Rows whose matrices are held at once."""
 
 RIDGE = 1e-9
 """Fraction of the mean squared displacement, for weights that a head cannot distinguish."""

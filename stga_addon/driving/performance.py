@@ -23,11 +23,17 @@ ARKIT_SHAPES = (
 )  # fmt: skip
 """ARKit's shapes, in the order of Live Link Face's CSV files."""
 COUNT = len(ARKIT_SHAPES)
-MAX_WEIGHT = 10.0  # Beyond it, weights of shapes are in percent, or are no weights
+"""Number of ARKit's shapes, 52."""
+MAX_WEIGHT = 10.0
+"""Beyond it, weights of shapes are in percent, or are no weights."""
 COLUMN = {name: column for column, name in enumerate(ARKIT_SHAPES)}
-OPTIONAL = ("tongueOut",)  # Shapes that sources of 51 lack; they stay zero
+"""Shape -> its place in ARKIT_SHAPES."""
+OPTIONAL = ("tongueOut",)
+"""Shapes that sources of 51 lack; they stay zero."""
 PARTS = ("face", "jaw", "eyes")
-MAX_NAMED = 8  # Names that an error lists
+"""Parts of the face (`part_of`), each of which can be amplified."""
+MAX_NAMED = 8
+"""Names that an error lists."""
 
 MIN_SIMILARITY = 0.8
 """Least similarity (`difflib`) of a mistyped name and the shape that it stands for."""

@@ -73,7 +73,9 @@ def parse_packet(data: bytes) -> FacePacket | None:
 
 
 MAX_TEXT_BYTES = 256 << 20
+"""Largest file of a performance that is read."""
 COUNT_COLUMN = "blendshapecount"
+"""Plain name of the column that counts a row's shapes: 0 in rows without a face."""
 
 MAX_OTHERS = 256
 """Columns of JSON frames, besides shapes, that are examined."""

@@ -68,6 +68,7 @@ def effective_weights(weights: np.ndarray) -> np.ndarray:
 
 
 EYE_JOINTS = (JOINTS.index("right_eye"), JOINTS.index("left_eye"))
+"""Places of the right and the left eye in JOINTS."""
 
 MIN_EYE_DISTANCE_M = 0.03
 """Least distance of a head's eyes."""

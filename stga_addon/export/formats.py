@@ -204,6 +204,7 @@ FORMATS: dict[str, Format] = {
         lambda path, item: write_spz(path, item.first_frame(path), item.antialiased),
     ),
 }
+"""Name on the command line -> format."""
 
 
 SPLAT_FORMATS = {

@@ -25,11 +25,14 @@ from ..flame.sequence import FlameSequence, motion_arrays
 from ..progress import Log, warn
 
 MAX_SPLAT_BYTES = 16 << 30
+"""Largest file of splats that is read."""
 READ_FILES = "the folder of a run, an avatar (.npz), or splats (.ply, .spz, .splat)"
+"""What messages expect where splats are read."""
 
 CLOUDCOMPARE_PREFIX = "scalar_"
 """Prefix that CloudCompare writes before the names of other properties."""
 COLOR_NAMES = (("red", "green", "blue"), ("r", "g", "b"))
+"""Names of red, green and blue in point clouds, which stand in for missing f_dc_0 to f_dc_2."""
 
 FRAME_NAME = re.compile(r"(\d{5,}|-\d{4,})\.ply")
 """Name of a frame of a sequence: 00012.ply."""

@@ -20,9 +20,13 @@ BUNDLED_NOTICE = (
     "Contains a head derived from ICT-FaceKit. MIT License, Copyright (c) 2020 USC Institute for "
     "Creative Technologies."
 )
+"""Notice in files with the bundled head, as its MIT License requires."""
 FLAME_LICENCE = ": FLAME's licence (flame.is.tue.mpg.de) decides who may receive them."
+"""End of the notices in files with parts of FLAME."""
 RIG_NOTICE = f"Contains blend shapes and a skeleton derived from a FLAME model{FLAME_LICENCE}"
+"""Notice in files with a rig that was made from a FLAME model."""
 MESH_NOTICE = f"Contains the triangles and the posed meshes of a FLAME head{FLAME_LICENCE}"
+"""Notice in files with the mesh of a FLAME head, without its shapes."""
 
 BAKE_TOLERANCE_M = 5e-6
 """Largest distance of a vertex of a baked mesh from the mesh that was baked."""

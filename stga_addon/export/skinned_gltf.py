@@ -24,12 +24,14 @@ from .spz import smallest_three
 EXTRA = "stga_splats"
 """Key of the splats in the document's `extras`."""
 VERSION = 1
+"""Version of the splats in `extras`, the only one that is read."""
 
 MAX_PLANES = 4
 """Bytes of a number at most, each in a plane of its own."""
 MAX_STEPS = 1 << 31
 """Largest number of steps from zero: what four planes hold."""
 GZIP_LEVEL = 9
+"""Level of gzip's compression: the strongest."""
 
 AXES = "_axes"
 """Suffix of the axes (n, n), columns, along which rows of an array of n numbers are stored."""

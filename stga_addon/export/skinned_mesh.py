@@ -9,6 +9,7 @@ from .gltf import COMPONENTS, VERTICES, Accessors, Json, accessor_of, little_end
 from .rig import Rig
 
 QUANTIZATION = "KHR_mesh_quantization"
+"""Extension of glTF that allows vertices and shapes in short integers."""
 
 SHAPE_STEP_M = 4e-5
 """Step of what a shape moves a vertex by; larger where one moves farther than a short integer

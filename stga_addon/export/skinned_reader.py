@@ -25,8 +25,11 @@ from .skinned_gltf import AXES, EXTRA, VERSION
 from .spz import of_smallest_three
 
 AVATAR_FILE = "avatar.npz"
+"""Name of the unpacked avatar."""
 MODEL_FILE = "flame_model.npz"
+"""Name of the unpacked head model, in FLAME's form."""
 MOTION_FILE = "motion.npz"
+"""Name of the unpacked motion."""
 
 KNOWN_ARRAYS = (
     *("splats_per_face", "unbound", "xyz", "log_scale", "opacity", "rotation", "rotation_largest"),

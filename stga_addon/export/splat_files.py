@@ -16,6 +16,7 @@ from .spz import read_spz
 GAUSSIAN_OUTPUT = "point_cloud/iteration_*/*.ply"
 """Paths at which 3D Gaussian Splatting writes the splats of an iteration."""
 CONVERTED = "are not read; save them as .ply, for example with SuperSplat"
+"""What a message says of files with UNREAD_SUFFIXES."""
 
 UNREAD_SUFFIXES = {
     ".ksplat": "mkkellogg's splats",

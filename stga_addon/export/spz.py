@@ -18,25 +18,32 @@ from ..progress import Log, warn
 from .ply import READ_FILES
 
 MAGIC = b"NGSP"
+"""First bytes of the header, in all versions."""
 
 VERSION = 3
 """The last packed by gzip: version 4 needs Zstandard, a package that may be missing."""
 READ_VERSIONS = 1, 2, 3, 4
+"""Versions that are read."""
 
 STREAM_VERSION = 4
 """First version of streams that Zstandard packs, behind a table of their sizes."""
 HEADER_BYTES = 16
+"""Bytes of the header of versions 1 to 3, with whose fields that of version 4 begins."""
 
 STREAM_HEADER = struct.Struct("<4sIIBBBBI12x")
 """Header of version 4: as before, with the number of streams, and where their table begins."""
 STREAMS = 6
 """Streams of version 4: positions, opacities, colors, scales, rotations, harmonics."""
 GZIP_MAGIC = b"\x1f\x8b"
-# The format's own limits
+"""First bytes of data that gzip has packed (RFC 1952): versions 1 to 3."""
 MAX_SPZ_BYTES = 2 << 30
+"""Largest file, the format's limit."""
 MAX_SPZ_SPLATS = 10_000_000
+"""Most splats, the format's limit."""
 MAX_SPZ_DEGREE = 4
+"""Highest degree of harmonics, the format's limit."""
 ANTIALIASED = 1
+"""Flag of splats that were trained with antialiasing."""
 
 HAS_EXTENSIONS = 2
 """Flag of files with more behind the splats, such as a safe orbit for a viewer's camera."""
@@ -44,6 +51,7 @@ HAS_EXTENSIONS = 2
 MAX_FRACTION_BITS = 16
 """Resolution of positions: 2⁻¹⁶ m = 15 µm, within ±128 m; coarser where splats are farther away."""
 COORDINATE_BITS = 24
+"""Bits of a coordinate, a signed number in fixed point."""
 
 MAX_COORDINATE = (1 << (COORDINATE_BITS - 1)) - 1
 """Largest coordinate in units of its resolution."""

@@ -21,7 +21,9 @@ from ..worker.training_python import own_python
 from .ply import SplatFrames
 
 PRIM_TYPE = "ParticleField3DGaussianSplat"
+"""USD's type of a prim that holds 3D Gaussians."""
 COEFFICIENTS = "radiance:sphericalHarmonicsCoefficients"
+"""Attribute of the spherical harmonics in float32; with an "h" behind it, in float16."""
 
 EXTENT_DEVIATIONS = 3.0
 """Standard deviations that count as a splat's extent, as for USD's Gaussian kernel."""

@@ -11,14 +11,20 @@ from ..files import NpzFile, converted, file_digest, open_npz
 from .unpickle import read_pickled_arrays
 
 Arrays = Mapping[str, np.ndarray]
-Shape = tuple[int | None, ...]  # None: any number of them
+"""Name -> array of a model's or a motion's file."""
+Shape = tuple[int | None, ...]
+"""Expected sizes of an array; None: any number of them."""
 JOINTS = ("root", "neck", "jaw", "left_eye", "right_eye")
+"""FLAME's joints, in its order."""
 POSE_FEATURES = 9 * (len(JOINTS) - 1)
-# FLAME 2020 and 2023: 300 identity then 100 expression components
+"""Numbers that drive FLAME's pose correctives: 3x3 rotations of all joints but the root."""
 FULL_COMPONENTS = 400
+"""Identity and expression components of the published FLAME 2020 and 2023."""
 FULL_IDENTITY = 300
+"""How many of these are identity components, which come first."""
 
 MASK_FILE = "FLAME_masks.pkl"
+"""File of vertex masks that FLAME's authors publish, looked for beside the model."""
 
 MASK_PREFIX = "masks/"
 """Prefix of the vertex masks that an npz model may carry itself."""

@@ -26,13 +26,15 @@ from .model import JOINTS, MIN_TORSO_WEIGHT, Arrays, FlameModel
 from .parts import ADDED_VERTICES
 from .quaternions import from_matrices, to_axis_angle, unit
 
-Identity = tuple[np.ndarray, np.ndarray | None]  # Shape and static offset
+Identity = tuple[np.ndarray, np.ndarray | None]
+"""Shape and static offset."""
 ZERO_POSES = {
     "head": "head rotation, translation and neck; jaw and eyes count as expression",
     "all": "head motion, jaw and eyes",
 }
+"""Choice of the motion that does not count as expression -> what it is (`expression_mesh`)."""
 FRAME_FIELDS = ("expr", "rotation", "neck_pose", "jaw_pose", "translation", "eyes_pose")
-# What trackers other than VHAP call the fields.
+"""Fields that change with the timestep, as VHAP names them."""
 FIELD_ALIASES = {
     "exp": "expr",
     "expression": "expr",
@@ -57,19 +59,23 @@ FIELD_ALIASES = {
 """Field as other programs name it -> as it is read."""
 JOINT_COUNTS = {"rotation": 1, "neck_pose": 1, "jaw_pose": 1, "eyes_pose": 2}
 """Fields that are rotations -> how many of them."""
-# Numbers of a rotation by two rows of its matrix, or the matrix
 ROWS_OF_SIX = 6
+"""Numbers of a rotation that is given as two rows of its matrix."""
 MATRIX_SIZE = 9
-MATRIX_TOLERANCE = 1e-3  # Tolerance for exports with a few decimals
-UNREAD_PARTS = ("eyelids", "eyelid_params")  # Parts of models that extend FLAME
-# Columns of a `pose` that holds several joints -> the fields they are, three columns a joint.
+"""Numbers of a rotation that is given as a matrix."""
+MATRIX_TOLERANCE = 1e-3
+"""Largest difference between R·Rᵀ and the identity, for exports with a few decimals."""
+UNREAD_PARTS = ("eyelids", "eyelid_params")
+"""Parameters of models that extend FLAME, which are not read."""
 POSE_LAYOUTS = {6: ("rotation", "jaw_pose"), 15: ("rotation", "neck_pose", "jaw_pose", "eyes_pose")}
+"""Numbers of a `pose` that holds several joints -> the fields they are, three columns a joint."""
 
 BODY_POSE_SIZE = 165
 """Numbers of SMPL-X's pose, as BEAT2 has it in `poses`."""
 BODY_POSE_PARTS = {"neck_pose": (45, 48), "jaw_pose": (66, 69), "eyes_pose": (69, 75)}
 """Field -> its columns there; the neck is moved as SMPL-X's head."""
-MIN_JOINT_ANGLE_DEG = 0.5  # Least angle of a joint that moves
+MIN_JOINT_ANGLE_DEG = 0.5
+"""Least angle of a joint that moves."""
 
 MAX_OFFSET_BYTES = 256 << 20
 """Offsets of a motion, above which they are left out where they are zero."""

@@ -15,15 +15,16 @@ from .model import JOINTS, FlameModel
 from .quaternions import unit
 
 TEMPLATE_VERTICES = 5023
+"""Vertices of the published FLAME mesh, which has no teeth."""
 TEETH_VERTICES = 120
+"""Vertices that the teeth add."""
 TEETH_FACES = 168
+"""Triangles that the teeth add."""
 TEETH_PER_ROW = 15
-# Index layout. Order of the eight rows among the added vertices: upper, lower; root, edge; B for
-# back. Each row runs from the person's left to the right.
+"""Vertices of each of TEETH_ROWS."""
 TEETH_ROWS = ("UR", "LR", "UE", "LE", "URB", "UEB", "LRB", "LEB")
-# Index layout. Two triangles a column; a corner is (row, 0 or 1 for the column's near or far end).
-# The diagonal flips in the middle of the mouth (the first half and the second half below) so that
-# left and right mirror each other.
+"""Order of the rows among the added vertices, part of the index layout: upper, lower; root, edge; B
+for back. Each row runs from the person's left to the right."""
 TEETH_STRIPS = {
     "upper front": ("UR0 UE1 UE0 UR0 UR1 UE1", "UR0 UR1 UE0 UR1 UE1 UE0"),
     "upper back": ("URB0 UEB0 UEB1 URB0 UEB1 URB1", "URB0 UEB0 URB1 URB1 UEB0 UEB1"),
@@ -32,6 +33,9 @@ TEETH_STRIPS = {
     "lower back": ("LRB0 LEB1 LEB0 LRB0 LRB1 LEB1", "LRB0 LRB1 LEB0 LRB1 LEB1 LEB0"),
     "lower top": ("LEB0 LEB1 LE0 LEB1 LE1 LE0", "LEB0 LE1 LE0 LEB0 LEB1 LE1"),
 }
+"""Strip between two rows -> two triangles a column, part of the index layout; a corner is (row, 0
+or 1 for the column's near or far end). The diagonal flips in the middle of the mouth (the first and
+the second text) so that left and right mirror each other."""
 # Sizes as fractions of the width between the corners of the mouth, about 50 mm.
 ARCH_WIDTH = 0.85
 """Width of the arch as a fraction of the mouth's."""

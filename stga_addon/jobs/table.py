@@ -66,7 +66,9 @@ Request = (
     | Relight
     | MakeExact
 )
+"""Any request that `perform` carries out."""
 Result = Written | Selected | Analyzed
+"""What `perform` returns for a request."""
 
 Work = Callable[..., Result]
 """Called with a request, a `Report` and a `Say`; raises what `perform` does."""
@@ -120,6 +122,7 @@ _NEW_RUN = Job(
     output="run",
     files=avatar_file,
 )
+"""Job of the requests that begin a run."""
 
 JOBS: dict[type[Any], Job] = {
     Train: _NEW_RUN,

@@ -61,7 +61,9 @@ TAKES = {
 MATTES = {"auto": "made for frames without a mask", "none": "only those of the footage"}
 """Values of `Track.mattes` beside a folder of masks."""
 CAPTURE_FOLDER = "capture"
+"""Folder of the capture in the one that `MakeAvatar` writes."""
 RUN_FOLDER = "run"
+"""Folder of the run beside it."""
 
 INPUTS = "inputs.json"
 """File in the folder of `MakeAvatar`: capture, run, and what was asked for when they began, which

@@ -13,8 +13,11 @@ MIN_FACING = np.float32(0.05)
 """Least cosine between a highlight's normal and the direction to the eye; smaller ones are
 raised."""
 SUN = 0
+"""Number of a sun in `values.KINDS`."""
 SPOT = 2
+"""Number of a spot in `values.KINDS`."""
 AREA = 3
+"""Number of an area light in `values.KINDS`."""
 
 # Columns of a table of lights (L, 16) float32.
 KIND = 0

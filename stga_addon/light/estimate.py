@@ -100,6 +100,7 @@ MIN_OPEN_TRANSFER = 0.35 * np.pi * 0.28209479177387814
 LOSS_SCALE = 3.0
 """Residual at which an observation's weight has halved, in medians."""
 RIDGE = 1e-4
+"""Ridge of the light's least squares, as a fraction (`harmonics.least_squares`)."""
 
 MIN_ARRIVING = 0.02
 """Least irradiance that a color is divided by, as a fraction of the mean."""
@@ -110,7 +111,9 @@ HARD_RESIDUAL = 0.12
 VERY_HARD_RESIDUAL = 0.25
 """Residual from which albedo is damped most."""
 MAX_DAMPING = 0.6
+"""Damping of albedo, 0 to 1, at VERY_HARD_RESIDUAL and above."""
 CARD_REFLECTANCE = 0.18
+"""Reflectance of photographers' gray card."""
 
 EYE_ROUGHNESS = 0.2
 """Roughness of eyes, whose highlights are as sharp as splats of half a millimeter can show."""

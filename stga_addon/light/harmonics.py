@@ -5,6 +5,7 @@ import numpy as np
 from ..avatar.splats import SH_C0, harmonics
 
 COUNT = 9
+"""Number of harmonics up to degree 2."""
 
 DARK = 1e-5
 """Radiance up to which there is no light."""

@@ -29,6 +29,7 @@ JPEG_QUALITY = 88
 PICTURE_FORMATS = {".jpg": "JPEG", ".jpeg": "JPEG", ".png": "PNG"}
 """Suffix of a picture -> Pillow's name of its format."""
 NEUTRAL = Act({})
+"""Act without any expression."""
 POSES = (
     Act({"jawOpen": 1.0}),
     Act({"eyeBlink": 1.0}),
@@ -37,6 +38,7 @@ POSES = (
     Act({"mouthPucker": 1.0, "mouthSmile": 0.0}),
     Act({"eyeBlink": 0.0}, gaze=(28.0, 0.0)),
 )
+"""Expressions in which the head is compared from the front; `gaze` in degrees."""
 
 Shot = tuple[Camera, np.ndarray]
 """A camera, and the head's posed mesh (V, 3) that it sees."""

@@ -36,6 +36,7 @@ triangles that the default selection (2 mm) picks in that frame. ±: standard de
 `studio_head`, not in this repository: a path-traced head with 12 training timesteps, 15 training
 cameras at 275×401 and a tracked mesh of 10,696 triangles.
 """
+"""Beginning of the page, with the names of capture and machine to fill in."""
 
 EXTENDING = """
 The training timesteps become two takes. *before* is an avatar of the first, which the arms continue
@@ -44,6 +45,7 @@ on both, three times as long; *refine* trains the mouth (*region*) alone, *all* 
 same*: seconds until the region is as good as *all* leaves it; *s to 98 %*: until both takes have
 98 % of the PSNR of *anew*.
 """
+"""Note that explains the columns of the table on extending an avatar."""
 
 END = "\n<!-- What benchmark.results writes ends here. -->\n"
 """Mark at the end of what is written; the page keeps what follows it."""

@@ -41,7 +41,9 @@ TURN_DEG = 50.0
 NOD_DEG = 12.0
 """Largest nod of the head before one camera, up and down."""
 WIDTH = 320
+"""Width of the pictures in pixels."""
 HEIGHT = 400
+"""Height of the pictures in pixels."""
 
 FOCAL = 3.7
 """Focal length in image widths."""

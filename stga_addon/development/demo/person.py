@@ -39,16 +39,24 @@ EYES_IDENTITY = 10
 EYES = -0.3
 """Coefficient of EYES_IDENTITY."""
 SEED = 7
+"""Seed of the random hairs."""
 
-# Linear RGB.
 SKIN_COLOR = np.array([0.66, 0.41, 0.305])
+"""Color of skin before it is tinted, linear RGB."""
 LIP_COLOR = np.array([0.48, 0.17, 0.155])
+"""Color towards which lips are tinted, linear RGB."""
 FLUSH = np.array([1.04, 0.72, 0.70])
+"""Factor of the skin's linear RGB on cheeks and nose."""
 SHADOW = np.array([0.84, 0.70, 0.68])
+"""Factor of the skin's linear RGB around the eyes."""
 MOUTH_COLOR = np.array([0.30, 0.075, 0.07])
+"""Color of the mouth's lining, linear RGB."""
 GUM_COLOR = np.array([0.42, 0.12, 0.11])
+"""Color of the gums, linear RGB."""
 TOOTH_COLOR = np.array([0.80, 0.75, 0.66])
+"""Color of the teeth, linear RGB."""
 SCALP_COLOR = np.array([0.06, 0.038, 0.025])
+"""Color towards which the scalp is tinted under hair, linear RGB."""
 
 PARTS = (
     ("skin", SKIN),
@@ -62,9 +70,13 @@ PARTS = (
 
 # Heights are above the eyes.
 LIP_LINE_CM = -3.35
+"""Height of the line on which the lips meet."""
 LIP_HALF_WIDTH_CM = 2.35
+"""Distance of the mouth's corners from its middle."""
 UPPER_LIP_CM = 0.98
+"""Height of the upper lip in its middle, without the dip of the Cupid's bow."""
 LOWER_LIP_CM = 1.28
+"""Height of the lower lip in its middle."""
 
 NECKLINE_CM = -10.6
 """Height on the axis of the head above which there is no cloth."""

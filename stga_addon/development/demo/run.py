@@ -37,6 +37,7 @@ from ...training.settings import make_settings
 from .capture import unpack_capture, unpack_takes
 
 SEED = 0
+"""Seed of the demo's tracking and training."""
 
 POSES_PER_SECOND = 1.5
 """Rate at which the web page plays the capture's expressions, which are single poses."""

@@ -22,8 +22,6 @@ from ...scene.display.splat_attributes import write_attributes
 from ..bundled_head import HEAD
 from .person import SURFACES, Person, Strands
 
-# Soft boxes around the head: azimuth and elevation in degrees (0, 0 is straight ahead), watts, and
-# their edge in meters.
 SOFT_BOXES = (
     (-38, 34, 14.0, 0.7),
     (58, 18, 5.0, 0.9),
@@ -31,13 +29,22 @@ SOFT_BOXES = (
     (150, 40, 4.0, 0.5),
     (-140, 30, 3.0, 0.5),
 )
+"""Lamps around the head: azimuth and elevation in degrees (0, 0 is straight ahead), watts, and edge
+in meters."""
 BOX_DISTANCE_M = 1.3
+"""Distance of each lamp from the origin."""
 AMBIENT = 0.30
+"""Strength of the world's white background, Blender's unit."""
 MAX_BOUNCES = 4
+"""Bounces after which Cycles ends a light path."""
 NOISE_THRESHOLD = 0.03
+"""Noise level at which Cycles takes no more samples of a pixel."""
 CLOTH_M = 0.0035
+"""Distance of the cloth from the skin."""
 COLLAR_CM = 1.5
+"""Height of the ribbed collar, below the neckline."""
 CLOTH_COLOR = (0.045, 0.12, 0.13)
+"""Color of the cloth, linear RGB, which its knit makes darker and brighter."""
 
 STRAND_TIP = 0.35
 """Radius of a hair's tip, relative to that of its root."""

@@ -22,7 +22,9 @@ from ..performance import (
 )
 
 VERSION = 6
+"""First byte of Live Link Face's packets."""
 MAX_TEXT_BYTES = 512
+"""Longest name of a device or subject in a packet."""
 
 ROTATIONS = 9
 """Yaw, pitch and roll of the head and of both eyes, after the shapes."""

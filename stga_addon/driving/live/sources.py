@@ -70,9 +70,11 @@ SOURCES = {
         "left out",
     ),
 }
+"""Identifier of a source in Blender -> its protocol."""
 
 
 LOOPBACK = "127.0.0.1"
+"""Address that receives from programs on this computer alone."""
 
 MAX_DATAGRAM_BYTES = 1 << 14
 """Size of a source's frame; larger packets are foreign."""
@@ -149,7 +151,8 @@ def leaves_this_machine(source: Source, address: str, phone: str) -> bool:
     return bool(source.request) and not checked_address("phone's address", phone).is_loopback
 
 
-Sender = tuple[str, str]  # Address and subject: two phones may share either
+Sender = tuple[str, str]
+"""Address and subject: two phones may share either."""
 
 MAX_SENDERS = 8
 """Senders kept in memory; of more, those silent for longest are forgotten."""
