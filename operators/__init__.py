@@ -42,8 +42,9 @@ MODULES = (
     duplicate,
     export,
 )
+"""Modules with operators, in the order in which these are registered."""
 PICK = "stga.pick_avatar"
-
+"""Operator that selects the avatar under the pointer."""
 KEYS = (
     ("Pose", "EMPTY", "stga.turn_jaw", "R", "PRESS", False),
     ("3D View", "VIEW_3D", "stga.stop_live", "ESC", "PRESS", False),

@@ -36,9 +36,9 @@ MAX_REPORT_CHARACTERS = 90
 UNSAVED = "has not been saved yet"
 """Part of messages that saving the file makes obsolete."""
 PARENT_FOLDERS = re.compile(r"(?:[A-Za-z]:)?[\\/](?:[^\\/:;,()]+[\\/])+")
-
+"""Folders in front of a file's name in a sentence."""
 Poll = Callable[[Any, Any], bool]
-
+"""Whether an operator can be called: takes its class and the context."""
 AtEnd = Callable[..., Any]
 """`ExitStack.callback` of the extension: takes a function, with its arguments, that undoes what was
 just registered."""

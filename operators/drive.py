@@ -41,9 +41,11 @@ from .training_python import training_python
 from .windows import redraw
 
 MAX_PORT = 65535
+"""Largest number of a UDP port, which has 16 bits."""
 TICK_S = 1 / 60
+"""Interval at which the head is posed: 60 times a second."""
 MIN_WAIT_S = 0.001
-
+"""Least wait after a tick, so that Blender handles its events."""
 PANEL_INTERVAL_S = 0.2
 """Interval at which the panel's figures are drawn anew."""
 SLOWEST_TICKS = 600

@@ -82,7 +82,7 @@ for."""
 DEMO = Path(__file__).parents[1] / "demo_capture"
 """Demo of the complete edition; the other editions have none."""
 DEMO_MINUTES = 1.0
-
+"""Time for which the demo trains."""
 USER_AVATARS = "stga_avatars"
 """Folder among Blender's user files for the parts of avatars from folders that are read-only."""
 SOURCE_FILE = "source.sha256"

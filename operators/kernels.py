@@ -14,7 +14,7 @@ from .common import AtEnd, package
 from .training_python import training_python
 
 PREPARATION = "stga_addon.jobs.compile_ahead"
-
+"""Module that a process runs to compile the kernels of training."""
 START_DELAY_S = 1.0
 """Delay after the extension was enabled: neither enabling nor Blender's start waits for a
 process."""

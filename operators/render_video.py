@@ -55,7 +55,7 @@ from .request import idle, start
 from .training_python import has_training_python, training_python
 
 RECORDING = "recording.bin"
-
+"""File in the video's temporary folder with the recorded splats of each image."""
 RECORDING_INTERVAL_S = 0.001
 """Interval between two recorded images, so that Blender handles its events."""
 

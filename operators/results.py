@@ -118,14 +118,12 @@ def forget_heads() -> None:
 # Avatars
 
 
-TRACKED_NAME = "Head, being tracked"
-
 MIN_ITERATIONS = 300
 """Below, new splats look like gray fog: neither previews nor a run that was cancelled replace
 another avatar."""
 
 _pool = ThreadPoolExecutor(1, "stga")
-
+"""The thread that reads avatar files, so that Blender does not wait for them."""
 _loading: dict[int, Future[tuple[Avatar, SplatAttributes]]] = {}
 """Session id of a scene -> the avatar file that a thread reads for it."""
 
@@ -367,7 +365,7 @@ def show_tracked(scene: Any, capture: Path, picture: Path) -> None:
         before = tags.find(tags.TRACKED_HEAD, capture)
         if before and before[0].mode == "EDIT":
             return
-        mesh = triangle_mesh(TRACKED_NAME, arrays["vertices"], arrays["faces"])
+        mesh = triangle_mesh("Head, being tracked", arrays["vertices"], arrays["faces"])
         place_tracked(scene, capture, mesh, next(iter(before), None))
 
 

@@ -12,7 +12,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 Item = TypeVar("Item")
-
+"""Type of the items whose iteration is reported."""
 PACE_FRACTION = 0.1
 """Fraction of the work, the last that was done, whose pace gives the time that is left."""
 MAX_OVERRUN_RATIO = 1.25

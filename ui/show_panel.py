@@ -37,11 +37,11 @@ DISPLAY_INPUTS = (
     splat_nodes.SHOW_SELECTION,
     splat_nodes.SELECTED_ONLY,
 )
-
+"""Inputs of the splats' modifier that every avatar has in the panel."""
 UNSEEN_INPUTS = (splat_nodes.SHOW_UNSEEN, splat_nodes.FILMED_ONLY)
 """Inputs of avatars that know what was filmed."""
 POPUP_MARGIN_PX = 60
-
+"""Width of a window that a popup's text leaves free."""
 _is_told = False
 """Whether the render job in progress has said what it does not show."""
 

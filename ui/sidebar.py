@@ -20,7 +20,7 @@ from ..stga_addon.worker.status import WorkerState, WorkerStatus
 LETTER_WIDTH_PX = 7
 """Average, at a resolution scale of 1."""
 WAITING = "Done; shown as soon as Edit Mode or rendering ends"
-
+"""Message on a finished job whose result is not shown yet."""
 SCALE = 8.0
 """Side of the picture in the panel, in heights of a button."""
 

@@ -19,8 +19,9 @@ GPU = "gpu:"
 DEVICES = ("auto", "cpu", "gpu")
 """Choices of `choose_device`, beside "gpu:NAME"."""
 EXPECTED_DEVICE = "auto, cpu, gpu or gpu:NAME"
+"""Devices, as messages about a wrong one list them."""
 MAX_DEVICE_LENGTH = 255
-
+"""Largest number of characters in the name of a device."""
 MIN_ADDRESS_SPACE_GB = 4.0
 """Addresses below which WebGPU's library was seen to wait for ever, at 0.7, for a thread that could
 not be started."""

@@ -28,7 +28,8 @@ MAX_SIDE_PX = 240
 RATES = np.array((0.01, 0.01, 0.01, 0.04), np.float32)
 """Adam's first rates, of colors in sRGB and of logits; they fall to 0."""
 BETAS = 0.9, 0.999
-
+"""Adam's decay rates of the mean gradient and of its mean square: the defaults of Kingma and Ba
+(2015)."""
 FINENESS = 2
 """Parts of a pixel, in each direction, that are averaged in linear light: other renderers average
 samples, and do not blur what is thinner than a pixel, as ours does."""

@@ -18,8 +18,8 @@ from . import arrays, tags
 from .compat import mark_imported
 from .objects import Warn, log_warning, place, remove, set_frames_per_second
 
-UP = (0.0, 0.0, 1.0)  # Blender's scenes are z-up
-
+UP = (0.0, 0.0, 1.0)
+"""Direction against gravity: Blender's scenes are z-up."""
 ORTHOGRAPHIC_DISTANCE = 1000.0
 """An orthographic view is rendered in perspective from this many times its width away."""
 

@@ -11,13 +11,20 @@ import numpy as np
 from . import tags
 
 SLOTTED_ACTIONS = bpy.app.version >= (4, 4, 0)
+"""Whether actions have slots, layers and strips: from 4.4 on."""
 MODIFIER_INPUT_PROPERTIES = bpy.app.version >= (5, 2, 0)
+"""Whether the inputs of a geometry nodes modifier are in `modifier.properties.inputs`: from 5.2
+on."""
 EEVEE = "BLENDER_EEVEE" if bpy.app.version >= (5, 0, 0) else "BLENDER_EEVEE_NEXT"
-NATIVE_SPLATS = hasattr(bpy.types, "GeometryNodePointsSetType")  # from 5.3 on
-WARNING_NODE = hasattr(bpy.types, "GeometryNodeWarning")  # from 4.3 on
-APPENDED: list[Any] = getattr(bpy.app.handlers, "blend_import_post", [])  # from 4.3 on
-SAVE_FAILED: list[Any] = getattr(bpy.app.handlers, "save_post_fail", [])  # from 4.0 on
-
+"""Identifier of EEVEE among render engines, which 4.2 to 4.5 call EEVEE Next."""
+NATIVE_SPLATS = hasattr(bpy.types, "GeometryNodePointsSetType")
+"""Whether Blender draws Gaussian splats itself: from 5.3 on."""
+WARNING_NODE = hasattr(bpy.types, "GeometryNodeWarning")
+"""Whether geometry nodes can show a warning on their modifier: from 4.3 on."""
+APPENDED: list[Any] = getattr(bpy.app.handlers, "blend_import_post", [])
+"""Handlers after an append or link: from 4.3 on, else a list that nobody calls."""
+SAVE_FAILED: list[Any] = getattr(bpy.app.handlers, "save_post_fail", [])
+"""Handlers after a file could not be saved: from 4.0 on."""
 MOTION_BLUR = tuple(
     name
     for name in ("use_motion_blur", "motion_blur_shutter", "motion_blur_position")

@@ -26,9 +26,11 @@ from .rig.keyframes import EYES, Placement, key_value_path, rotation_path
 from .rig.motion import apply_motion
 
 FRAMES = 96
+"""Length of the shot, and its last frame: 4 s."""
 FRAMES_PER_SECOND = 24
+"""Frame rate of the shot, that of cinema films."""
 SIZE_PX = 960, 540
-
+"""Width and height of an image of the shot."""
 SAMPLES = 16
 """Samples of the lens for each image."""
 RINGS = (

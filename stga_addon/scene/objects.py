@@ -17,9 +17,10 @@ from .compat import is_made_by_hand
 from .evaluation import kept_evaluated
 from .record import rebase_file
 
-# Receives one sentence for the user; operators pass their own report.
 Warn = Callable[[str], None]
+"""Receives one sentence for the user; operators pass their own report."""
 log_warning: Warn = logging.getLogger(__name__).warning
+"""Logs the sentence, where no operator reports it."""
 
 
 AVATAR_SUFFIX = re.compile(r" avatar(?=( \d+)?$)")

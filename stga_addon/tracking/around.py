@@ -49,6 +49,7 @@ REMEDY = (
     "film in even light and without blur, in steps of at most 15° around a head that keeps still, "
     "before a room with detail"
 )
+"""Advice at the end of errors in structure from motion."""
 
 # Recognition
 SAMPLES = 8

@@ -41,9 +41,9 @@ inner landmarks are as near to the upper lip."""
 OPEN_JAW_RAD = 0.2
 """Rotation of the jaw joint that parts the lips of heads without this shape."""
 BLINKS = "eyeBlinkLeft", "eyeBlinkRight"
-
+"""ARKit's shapes that close the eyes."""
 EYE_JOINTS = JOINTS.index("left_eye"), JOINTS.index("right_eye")
-
+"""Indices of the joints that turn the eyes, the left one first."""
 SCLERA_RGB = (0.95, 0.93, 0.9)
 """Color of the drawn eyeballs."""
 IRIS_RGB = (0.15, 0.09, 0.05)

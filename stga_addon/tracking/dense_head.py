@@ -37,7 +37,7 @@ HELD_OUT = 8
 STEPS = (1, 2, 2, 3)
 """One point of so many is fitted, for each level."""
 REGIONS = ("lower face", "middle face", "eyes", "brows")
-
+"""Parts of the face from the chin up, whose misfit is reported apart."""
 REGION_EDGES = (0.4, 0.62, 0.735)
 """Edges of the REGIONS, in the landmarks' height on the neutral head."""
 UPPER_FACE = 2

@@ -19,10 +19,11 @@ from ..errors import StgaError
 from ..files import read_bytes
 
 FOLDER = Path(__file__).with_name("networks")
-
+"""Folder with MediaPipe's networks, part of the extension."""
 FACE_FILE = FOLDER / "face_landmarker.task"
+"""Archive of the networks that detect faces and find landmarks."""
 PERSON_FILE = FOLDER / "selfie_segmentation.tflite"
-
+"""Network that segments people."""
 MIN_DETECTION_SCORE = 0.3
 """MediaPipe's default, 0.5, misses near-profile views."""
 MIN_PRESENCE = 0.5
@@ -41,9 +42,11 @@ side: the detector finds faces from an eighth of its input on."""
 MIN_PART_PX = 160
 """Side of a part below which landmarks would be guesses."""
 DETECTOR_SIZE_PX = 128
+"""Side of the face detector's input, as the network is defined."""
 CROP_SIZE_PX = 256
+"""Side of the landmark network's input, as the network is defined."""
 PERSON_SIZE_PX = 256
-
+"""Side of the segmentation's input and output, as the network is defined."""
 ANCHOR_GRIDS = ((16, 2), (8, 6))
 """Cells along a side of the detector's grids, and anchors of each, which are its center."""
 MAX_SMALL_FRACTION = 0.18

@@ -65,8 +65,9 @@ MIN_VISIBILITY = 0.1
 MAX_COMPARED_TIMESTEPS = 40
 """Largest number of timesteps in which cameras are compared."""
 SCALE_ITERATIONS = 8
+"""Iterations in which the scale between points is solved with fewer and fewer outliers."""
 OUTLIER_SCALE = 1.5
-
+"""Distance, in medians, at which a point keeps a quarter of its weight."""
 HERE = Similarity()
 """The camera's world, in meters, in which the head is fitted."""
 

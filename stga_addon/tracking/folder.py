@@ -15,11 +15,15 @@ from ..files import read_json, read_npz, write_npz
 from ..schema import from_json, setting
 
 REPORT_FILE = "tracking.json"
+"""File with what tracking reports: errors, warnings, focal length, motion of the torso."""
 SHEET_FILE = "contact_sheet.png"
+"""Picture of the errors of all views, and of the worst views with the mesh."""
 MATTES_FILE = "mattes.json"
+"""File that describes the footage from which mattes were made."""
 LANDMARKS_FOLDER = "landmarks"
+"""Folder with the landmarks of each camera, from which a correction starts."""
 PLACES_FILE = "head_model.npz"
-
+"""File in LANDMARKS_FOLDER with the places of the landmarks on the head model."""
 FOOTAGE_FILE = f"{LANDMARKS_FOLDER}/footage.json"
 """File that describes the footage in which the landmarks were found."""
 KEPT_FOLDER = "unfinished"
@@ -27,7 +31,7 @@ KEPT_FOLDER = "unfinished"
 LOCK_FILE = "tracking.lock"
 """Held while the capture is written."""
 SPLIT_FILES = ("transforms_train.json", "transforms_val.json", "transforms_test.json")
-
+"""Files with the frames to train on, to validate with and to test with."""
 MOTIONS = {"head": "turns with the head", "still": "keeps its direction", "own": "turns on its own"}
 """Motion of a torso -> its description."""
 TORSO_KEY = "torso"
@@ -49,7 +53,7 @@ FOCAL_SOURCES = {
 """Origin of the focal length of a camera without calibration (`Footage.focal`; "usual" and "solved"
 in captures of earlier versions) -> its description."""
 POINTS_FILE = "torso_points.npz"
-
+"""File with visible points of the torso (`TorsoPoints`)."""
 AVATAR_MISFIT = "avatar"
 """Entry beside the regions of the face in the report's `image_misfit`: what the avatar that tracked
 does not explain."""

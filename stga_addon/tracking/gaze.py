@@ -18,7 +18,7 @@ from .solve import (
 )
 
 ITERATIONS = 4
-
+"""Largest number of Gauss–Newton iterations for the gaze."""
 IRIS_SIGMA_M = 0.0005
 """Standard deviation of the middle of an iris, which images show sharply."""
 MAX_GAZE_RAD = 0.7

@@ -17,8 +17,9 @@ from .glb import read_glb
 IDENTITY_PREFIX = "identity"
 """Begins the names of shapes that make another person; all others are expressions."""
 LINEAR_KEYS = ("mean", "faces")
+"""Arrays that a linear head model needs."""
 LINEAR_MODEL_KEYS = (*LINEAR_KEYS, "identity", "expression", "J_regressor", "weights")
-
+"""Arrays of a linear head model: those that it needs, and those that it may have."""
 MIN_EXTENT_M = 0.1
 """Least extent of a head model along its longest axis; below, the file is in other units."""
 MAX_EXTENT_M = 2.0

@@ -26,30 +26,44 @@ FIRST_CAMERAS = 3
 """Cameras in the picture of the first frame's fit, at most."""
 SHOWN_FRAMES = 4
 """Frames of a picture at most, two in each direction."""
-# Of the contact sheet
 COLUMNS = 4
+"""Views side by side on the contact sheet."""
 ROWS = 5
-PICTURE = 200, 250  # Width and height in pixels of a view; beside it stands the same with the mesh
+"""Largest number of rows of views on the contact sheet."""
+PICTURE = 200, 250
+"""Width and height in pixels of a view; beside it stands the same with the mesh."""
 GAP = 8
+"""Distance between two tiles, in pixels."""
 CAPTION = 18
+"""Height of a line of text, in pixels."""
 MARGIN = 12
+"""Empty border of the contact sheet, and distance of the chart from the tiles, in pixels."""
 TILE_SIZE = 2 * PICTURE[0], PICTURE[1] + CAPTION
+"""Width and height in pixels of a view without and with the mesh, and their caption."""
 NAME_WIDTH = 130
+"""Width of the names to the left of the chart, in pixels."""
 CELL_HEIGHT = 12
+"""Height of a row of the chart, in pixels."""
 MAX_CHART_ROWS = 48
-HEAD_MARGIN = 0.08  # Margin of the head's box in the image, on every side
+"""Largest number of cameras, and of regions, in the chart."""
+HEAD_MARGIN = 0.08
+"""Margin of the head's box in the image on every side, as a fraction of the head."""
 MESH_OPACITY = 0.6
-# Drawn over what lies outside a view's matte
+"""Opacity of the mesh over a picture."""
 MATTE_COLOR = (0, 150, 60)
+"""Color over what lies outside a view's matte, RGB of 255."""
 MATTE_OPACITY = 0.75
+"""Opacity of MATTE_COLOR."""
 BACKGROUND = (24, 26, 30)
+"""Color of the contact sheet, RGB of 255."""
 TEXT = (225, 228, 232)
+"""Color of names and captions, RGB of 255."""
 NO_FACE = (70, 74, 80)
-
+"""Color in the chart of timesteps without a face, RGB of 255."""
 ERROR_COLORS = np.array([(38, 130, 110), (240, 200, 70), (215, 50, 45)], float)
 """Colors of no error, half of the color scale and its end."""
-COLOR_SCALE_END = 3.0  # End of the color scale, in medians of all errors
-
+COLOR_SCALE_END = 3.0
+"""End of the color scale, in medians of all errors."""
 Errors = Mapping[str, Mapping[int, float]]
 """Camera -> timestep -> reprojection error in pixels; without an entry where no face was found."""
 

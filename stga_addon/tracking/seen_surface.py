@@ -34,8 +34,9 @@ NOISE_LEVELS = 2.0
 OCCLUSION_M = 0.004
 """A point this far behind the nearest surface is hidden."""
 DEPTH_IMAGE_SIDE = 300
+"""Larger side in pixels of the depth image that shows which points are hidden."""
 LUMA = np.array([0.299, 0.587, 0.114], np.float32)
-
+"""Weights of red, green and blue in the luma of ITU-R BT.601."""
 POINT_FRACTION = 0.25
 """Weight of a surface point, whose patch has most pixels in common with its neighbors."""
 DIRECTIONS = 6

@@ -51,8 +51,9 @@ MAX_ORDERED_CHANGE = 0.7
 """Largest mean squared change of expression and jaw between neighboring timesteps, relative to that
 between any two, for which timesteps follow each other in time."""
 IDENTITY_ITERATIONS = 12
+"""Iterations for the identity, together with the poses that it is solved from."""
 TAKE_ITERATIONS = 8
-
+"""Largest number of Gauss–Newton iterations for a take."""
 ROUGH_TAKE_ITERATIONS = 2
 """Iterations for a take whose identity is not yet known; it is solved again from their result."""
 CONVERGED_STEP = 1e-3

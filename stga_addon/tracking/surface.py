@@ -65,10 +65,12 @@ FEW_CAMERAS = 3
 dense tracking are nearer to the truth than those of the surface."""
 OFFSET_DENSITY = 1.5e10
 """Weight of SURFACE_POINTS points over a head, in 1/m⁴: the two priors below are relative to it."""
-SMOOTHING_M = 0.009  # Length over which offsets are smoothed
-OFFSET_SIGMA_M = 0.03  # Prior of an offset: how fast offsets vanish where no surface is seen
+SMOOTHING_M = 0.009
+"""Length over which offsets are smoothed."""
+OFFSET_SIGMA_M = 0.03
+"""Prior of an offset: how fast offsets vanish where no surface is seen."""
 OFFSET_ITERATIONS = 5
-
+"""Iterations of reweighted least squares: points that the last one missed count less."""
 MAX_COTANGENT = 5.0
 """Largest cotangent of an angle, 11°: needles would outweigh all other triangles."""
 SURFACE_SIGMA_M = 0.0005

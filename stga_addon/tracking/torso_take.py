@@ -24,8 +24,9 @@ from .posed_points import PosedPoints, SurfacePoints, head_rotation, split
 from .stages import Stage, Workers
 
 ROOT = JOINTS.index("root")
+"""Index of FLAME's first joint, which turns the whole model."""
 NECK = JOINTS.index("neck")
-
+"""Index of the joint that turns the head over the shoulders."""
 HEAD_MARGIN = 0.03
 """Margin around the head, where hair and chin may be, as a fraction of the image's height."""
 PLAIN_LEVEL = 128

@@ -37,8 +37,9 @@ RELIGHT = "relight"
 WORLD = "world"
 """The static background becomes splats of its own, after training."""
 _SHAPES = "shape keys and drivers in Blender"
+"""Part of the cost of joints that Blender's rig turns."""
 _STRAIN = "and the strain of every frame"
-
+"""Part of the cost of offsets that strain drives."""
 _LIMITS = {"scale_limit": 1.5, "stray_limit": 0.5, "stray_reset_interval": 20, "adam_epsilon": 0.03}
 """Settings with which splats stay small and near their triangles."""
 _EFFECTS = (
@@ -143,7 +144,7 @@ _EFFECTS = (
         "tracking",
     ),
 )
-
+"""Every effect, in display order."""
 EFFECTS = {effect.name: effect for effect in _EFFECTS}
 """Effects by name, in display order."""
 CHOICES = ("auto", "on", "off")

@@ -18,7 +18,7 @@ ACQUIRE_TIMEOUT_S = 0.3
 PROBE_TIMEOUT_S = 0.03
 """The same between processes that only query, as Blender's timer does."""
 RETRY_INTERVAL_S = 0.002
-
+"""Interval between two attempts to take a lock that another process holds."""
 NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP)
 """Errors of a file system without working locks: some NFS and parallel file systems."""
 BEAT_S = 5.0

@@ -23,14 +23,15 @@ from .elementary import prefetch
 from .layout import PIXELS, PROJECTED, TILE
 from .threads import call_helpers, parallel, pieces
 
-ZERO = np.float32(0.0)
-HALF = np.float32(0.5)
-ONE = np.float32(1.0)
 MAX_ALPHA = np.float32(0.999)
+"""Largest alpha of a splat at a pixel, as in gsplat."""
 MIN_ALPHA = np.float32(1 / 255)
+"""Alpha of one step of 8 bits: below, a splat adds nothing to a pixel."""
 MIN_TRANSMITTANCE = np.float32(1e-4)
+"""A pixel is finished before the splat after which it would have no more transmittance than
+this."""
 LOG2E = np.float32(1.4426950408889634)
-
+"""log₂ e, which makes e^x a power of 2: e^x = 2^(x · log₂ e)."""
 SIDE = 4
 """Side of a block in pixels."""
 BLOCK_PIXELS = SIDE * SIDE
@@ -39,6 +40,22 @@ BLOCKS_ALONG = TILE // SIDE
 """Blocks along the side of a tile."""
 BLOCKS = BLOCKS_ALONG * BLOCKS_ALONG
 """Blocks of a tile, stored column by column."""
+PAIRS_PER_GROUP = 8
+"""Splats whose blocks are listed together; after each group, the forward pass drops the blocks that
+are behind something opaque."""
+LISTED = PAIRS_PER_GROUP * BLOCKS
+"""Largest number of blocks in a list."""
+FORWARD_SIZE = 8 * PIXELS + LISTED * BLOCK_PIXELS
+"""Values in a tile's flat array in the forward pass."""
+BACKWARD_SIZE = 8 * PIXELS + 7 * LISTED * BLOCK_PIXELS
+"""Values in a tile's flat array in the backward pass."""
+BATCH_PAIRS = 32
+"""Splats of a tile that are copied at a time, while memory is asked for the next ones, which lie
+all over it."""
+BATCH_SIZE = 13 * BATCH_PAIRS
+"""Values in a batch's flat array."""
+RUN_TILES = 4
+"""Tiles that the same thread renders one after the other: neighbors share splats."""
 
 # Where a pixel's values lie in the tile's flat array. Unsigned, because a signed index that may be
 # negative wraps around in Python, and the test for it keeps LLVM from vectorizing (12 times
@@ -48,30 +65,19 @@ SUM_RED, SUM_GREEN, SUM_BLUE, LAST, X, Y, BEHIND = (np.uint64(n * PIXELS) for n 
 V_RED = SUM_RED
 V_GREEN = SUM_GREEN
 V_BLUE = SUM_BLUE
-
-PAIRS_PER_GROUP = 8
-"""Splats whose blocks are listed together; after each group, the forward pass drops the blocks that
-are behind something opaque."""
-LISTED = PAIRS_PER_GROUP * BLOCKS
-"""Largest number of blocks in a list."""
 # Behind the tile's values, those of the listed blocks; the forward pass has only the first.
 (ALPHA, DX, DY, V_POWER, PART_RED, PART_GREEN, PART_BLUE) = (
     np.uint64(8 * PIXELS + n * LISTED * BLOCK_PIXELS) for n in range(7)
 )  # fmt: skip
-FORWARD_SIZE = 8 * PIXELS + LISTED * BLOCK_PIXELS
-BACKWARD_SIZE = 8 * PIXELS + 7 * LISTED * BLOCK_PIXELS
-
-# A tile's splats are copied a batch at a time, while memory is asked for the next ones, which lie
-# all over it. The blocks that a batch reaches are computed in vectors. Column c of splat q lies at
-# c·BATCH_PAIRS + q of a flat array.
-BATCH_PAIRS = 32
+# Column c of a batch's splat q lies at c·BATCH_PAIRS + q of a flat array. The blocks that the batch
+# reaches are computed in vectors.
 (AT_MEAN_X, AT_MEAN_Y, AT_PRECISION_X, AT_SHEAR, AT_PRECISION_Y, AT_OPACITY, AT_RED, AT_GREEN,
  AT_BLUE, AT_EXTENT_Y, AT_RATE_X, AT_RATE_Y, AT_BLOCKS) = (
     np.uint64(n * BATCH_PAIRS) for n in range(13))  # fmt: skip
-BATCH_SIZE = 13 * BATCH_PAIRS
 
-RUN_TILES = 4
-"""Tiles that the same thread renders one after the other: neighbors share splats."""
+ZERO = np.float32(0.0)
+HALF = np.float32(0.5)
+ONE = np.float32(1.0)
 
 
 @inline_jit

@@ -15,7 +15,12 @@ from numba.extending import intrinsic
 from . import inline_jit
 
 LOG2E = np.float32(1.4426950408889634)
+"""log₂ e: e^x = 2^(x · log₂ e)."""
 LN2 = np.float32(0.6931471805599453)
+"""ln 2: 2^x = e^(x · ln 2)."""
+SQRT_HALF_BITS = np.int32(0x3F3504F3)
+"""The bits of √½ in float32: subtracted from those of a number, they leave its exponent above those
+of its fraction."""
 # Coefficients of p in e^r = 1 + r + r²·p(r), |r| ≤ ln(2) / 2, by least squares in Chebyshev's
 # nodes.
 E2 = np.float32(4.999998791e-1)
@@ -23,10 +28,6 @@ E3 = np.float32(1.666651248e-1)
 E4 = np.float32(4.166964626e-2)
 E5 = np.float32(8.369628373e-3)
 E6 = np.float32(1.374882306e-3)
-
-SQRT_HALF_BITS = np.int32(0x3F3504F3)
-"""The bits of √½ in float32: subtracted from those of a number, they leave its exponent above those
-of its fraction."""
 
 
 @inline_jit

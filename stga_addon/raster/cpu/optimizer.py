@@ -9,9 +9,6 @@ from . import jit, part_jit
 from .elementary import exponential
 from .threads import call_helpers, end_stages, parallel, pieces, stage
 
-ZERO = np.float32(0.0)
-ONE = np.float32(1.0)
-
 ROWS_PER_BLOCK = 256
 """Rows that a thread steps at a time."""
 ROWS_PER_SUM = 1024
@@ -20,6 +17,8 @@ are."""
 MAX_GRADIENT = np.float32(1e18)
 """A row with a larger gradient is skipped: its square would make the second moment infinite, and
 the row NaN."""
+ZERO = np.float32(0.0)
+ONE = np.float32(1.0)
 
 
 class AdamTables(NamedTuple):

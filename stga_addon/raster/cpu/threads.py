@@ -29,9 +29,9 @@ from .elementary import acquire, exchange, fetch_add, latest, pause, release, yi
 
 NEXT, UNITS, PIECE, FAILED, STAGES = range(5)
 """Indices in a kernel's `work` int64 of its next unit, the number of units, the size of a piece,
-whether a worker has failed; from STAGES on, each stage's next unit and number of finished units.
-Workers see nothing else of it."""
+whether a worker has failed; from STAGES on, each stage's next unit and number of finished units."""
 SEEN = STAGES + 2 * 14
+"""Number of words of `work` that workers see: those above, for up to 14 stages."""
 # The caller sees all of the words. Those that many threads write lie apart, because a
 # processor's core takes over 64 or 128 bytes at a time.
 LIMIT, ENTRY = range(SEEN, SEEN + 2)

@@ -24,13 +24,17 @@ from .adapters import adapters, is_software
 from .layout import MAX_GROUPS, UNIFORMS, WORKGROUP, prelude_wgsl
 
 POLL_INTERVAL_S = 2e-4
+"""Interval at which wgpu's thread looks for results that are waited for."""
 LOST_CHECK_S = 0.5
-
+"""Interval at which a thread that waits for a result looks whether the device failed."""
 _TABLE = re.compile(r"^var<(uniform|storage)> (\w+)(.*)$", re.M)
+"""Declaration of a table in WGSL: its kind, its name, and the rest of the line."""
 _FUNCTION = re.compile(r"(?:^@compute[^\n]*\n)?^fn (\w+)(.*?)^\}", re.M | re.S)
+"""Function in WGSL: its name, and its text from the parameters on."""
 _WRITTEN = re.compile(r"^\s*(\w+)\[[^=;\n]*\][.\w]* [-+*|]?=\s|&(\w+)", re.M)
+"""Table in WGSL that is assigned to, or whose address is taken."""
 NONE: Mapping[str, Any] = {}
-
+"""Tables of `Recording.dispatch` where all are the device's buffers of the same names."""
 Groups = tuple[int, int, int] | tuple[Any, int]
 """Workgroups of a dispatch; or the buffer that holds them as three u32, and the offset in bytes."""
 

@@ -19,7 +19,7 @@ WANTED = 0x80000000
 MAX_GROUPS = 65535
 """Workgroups along one dimension of a dispatch."""
 DIGIT_BITS = 11
-
+"""Bits of a key by which one pass of the radix sort sorts."""
 SORT_BLOCK = 1024
 """Keys that a workgroup sorts."""
 SEGMENT_PAIRS = 512

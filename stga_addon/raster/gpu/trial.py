@@ -20,7 +20,7 @@ SIZE = 20_000, 400
 SOFTWARE_SIZE = 1_000, 80
 """The same for adapters that compute on the CPU, whose speed is known to be low."""
 DEGREE = 1
-
+"""Degree of the trial's spherical harmonics."""
 MAX_ERROR = 1e-3
 """Error of a wrong device's gradient, as a fraction of the gradient's length; rounding makes 1e-5
 of it, a lost pair 1e-2."""

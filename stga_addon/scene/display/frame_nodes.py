@@ -121,9 +121,8 @@ PLACED: dict[str | None, NodeGroup] = {
     name: _meshes(f"Place Splats ({name})", partial(_placed_splats, name), "Splats", "Frames")
     for name in CONVENTIONS
 }
-
-PLACED[None] = _meshes("Place Splats (world)", partial(_placed_splats, None), "Splats")
 """Splats (and the mesh with frames) -> splats in object space; None: in world space."""
+PLACED[None] = _meshes("Place Splats (world)", partial(_placed_splats, None), "Splats")
 
 
 # Temporary attributes on the faces of the deformed neutral mesh.
@@ -246,8 +245,9 @@ def _in_range(nodes: Nodes, vector: Any, ends: tuple[str, str]) -> Any:
 
 
 POSED = _meshes("Posed Triangles", _posed, "Head", "Neutral")
+"""Head and neutral mesh -> the head with the faces that splats are bound to."""
 FOLLOWING = _meshes("Splats of a Head", _following, "Splats", "Head", "Neutral")
-
+"""Splats, head and neutral mesh -> the splats; none where the head has lost their vertices."""
 DEFORMED = _meshes("Triangle Deformation", _deformed, "Posed", "Neutral")
 """Posed and neutral mesh -> the mesh with its triangles' deformation."""
 SIGNALS = {

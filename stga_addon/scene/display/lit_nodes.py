@@ -7,9 +7,9 @@ from . import splat_attributes as stored
 from .node_builder import NodeGroup, Nodes, Socket, kept_material
 
 RECORDED = "Recorded"
-
+"""Light in which native splats keep the colors of the images that they were trained on."""
 SCENE_LIGHT = "Scene Light"
-
+"""Light of the Blender scene on the splats' albedo."""
 LIGHTS = {
     RECORDED: "Native splats shine in the colors of the capture",
     SCENE_LIGHT: "Native splats are lit by the scene's lights and world, and shadowed",
@@ -18,7 +18,7 @@ LIGHTS = {
 ALBEDO = "albedo"
 """Attribute of native splats; roughness is its fourth channel."""
 NORMAL = "surface_normal"
-
+"""Attribute of native splats: smooth normal of the head's mesh, in object space."""
 SHRINKAGE_M = 0.006
 """Depth of the shadow-casting mesh below the head's mesh: splats would lie in the shadow of the
 latter."""

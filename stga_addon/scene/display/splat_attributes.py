@@ -22,19 +22,31 @@ from ..arrays import flat_floats, read_values
 
 # On the vertices of a splat object.
 XYZ = "stga_xyz"
+"""Center in the frame of the splat's triangle; without one, in world space in meters."""
 ROTATION = "stga_rotation"
-SCALE = "stga_scale"  # standard deviations, linear
-OPACITY = "stga_opacity"  # 0 to 1
-COLOR = "stga_color"  # constant part, scene-linear
-RELIT_COLOR = "stga_relit_color"  # scene-linear, of one frame: where it is there, it counts
-SH = "stga_sh_{}"  # sRGB coefficients, by index
-LINEAR_SH = "stga_linear_sh"  # the first of these, and opacity, for linear light (`linear_base`)
+"""Unit quaternion wxyz, in the frame of the splat's triangle."""
+SCALE = "stga_scale"
+"""Standard deviations along the axes, linear, in the unit of XYZ."""
+OPACITY = "stga_opacity"
+"""Opacity, 0 to 1."""
+COLOR = "stga_color"
+"""Constant part of the color, scene-linear."""
+RELIT_COLOR = "stga_relit_color"
+"""Scene-linear color of one frame; where it is there, it counts."""
+SH = "stga_sh_{}"
+"""sRGB coefficients of the spherical harmonics, by index."""
+LINEAR_SH = "stga_linear_sh"
+"""Coefficient 0 in place of that in SH, fitted for linear light (`Avatar.linear_base`)."""
 LINEAR_OPACITY = "stga_linear_opacity"
-ALBEDO = "stga_albedo"  # linear, and roughness, where the capture's light is known
+"""Opacity in place of OPACITY, fitted for linear light."""
+ALBEDO = "stga_albedo"
+"""Linear albedo and, as alpha, roughness; only where the capture's light is known."""
 FACE = "stga_face"
-UNSEEN = "stga_unseen"  # on a triangle of `UNSEEN_REGION`, where the avatar knows it
-NEUTRAL_AREA = "stga_neutral_area"  # of its triangle, m²; also on faces with driven offsets
-
+"""Index of the triangle that the splat is bound to."""
+UNSEEN = "stga_unseen"
+"""Whether the splat is on a triangle of `UNSEEN_REGION`; only where the avatar knows it."""
+NEUTRAL_AREA = "stga_neutral_area"
+"""Area of the splat's neutral triangle, m²; also on faces with driven offsets."""
 DISPLAY_COLOR = "stga_display_color"
 """Scene-linear color, stored by the nodes."""
 WORLD_ROTATION = "rotation"
@@ -59,18 +71,25 @@ _FIELDS = {
 }
 """Data type of an attribute -> name and width of its element's field."""
 
-# On the faces of the neutral mesh, from `StrainBasis`. A symmetric tensor is two vectors: xx yy zz
-# and xy yz zx.
+# On the faces of the neutral mesh, from `StrainBasis`.
 TENSOR_HALVES = ("stga_strain_squares", "stga_strain_products")
+"""Halves of a symmetric tensor, a vector each: xx yy zz, and xy yz zx."""
 GRAM = "stga_gram"
+"""Squared lengths and product of the neutral edges, `StrainBasis.gram`."""
 TENSOR = "stga_tensor_{}_{}"
+"""`StrainBasis.to_tensor`, by component of the Gram matrix's change and half of the tensor."""
 PLANE = "stga_plane_{}_{}"
+"""`StrainBasis.to_plane`, by component of strain and half of the tensor."""
 NEUTRAL_NORMAL = "stga_neutral_normal"
+"""Unit normal of the neutral mesh; 0 without area."""
 STRAIN_RANGE = "stga_strain_lowest", "stga_strain_highest"
+"""Lowest and highest strain that splats follow."""
 NORMAL_RANGE = "stga_normal_lowest", "stga_normal_highest"
+"""Lowest and highest change of the normal that splats follow."""
 _RANGE = tuple(name for ends in zip(STRAIN_RANGE, NORMAL_RANGE, strict=True) for name in ends)
-DRIVEN_OFFSET = "stga_{}_{}"  # by name and component of the signal, as in `Avatar.driven_offsets`
-
+"""Both ranges, in the order of `StrainBasis.range`: the lowest ends, then the highest."""
+DRIVEN_OFFSET = "stga_{}_{}"
+"""Coefficients of `Avatar.driven_offsets`, by the offset's name and component of its signal."""
 Attributes = dict[str, tuple[str, str, np.ndarray]]
 """Name -> (data type, name of the element's field, flat values)."""
 

@@ -114,11 +114,14 @@ def _band(degree: int, nodes: Nodes, direction: Any) -> Any:
 
 
 SRGB_TO_LINEAR = NodeGroup("STGA sRGB to Linear", {"sRGB": "Vector"}, "Color", _srgb_to_linear)
+"""Vector in sRGB -> linear color."""
 LINEAR_TO_SRGB = NodeGroup("STGA Linear to sRGB", {"Color": "Color"}, "Vector", _linear_to_srgb)
+"""Linear color from 0 on -> vector in sRGB."""
 SH_BANDS = tuple(
     NodeGroup(f"STGA Spherical Harmonics {n}", {"Direction": "Vector"}, "Vector", partial(_band, n))
     for n in (1, 2, 3)
 )
+"""Unit direction -> sum of the coefficients of degree 1, 2 or 3 times their harmonics."""
 
 
 DISK = 0.7
@@ -178,10 +181,13 @@ def _emission(nodes: Nodes, attribute_type: str, density: Any) -> Any:
 
 
 AS_TRAINED = "As Trained"
+"""Display that blends splats as training does: in viewports, and by the engine STGA Splats."""
 POINTS = "Points"
+"""Display as dots, one for each splat."""
 QUADS = "Camera Quads"
+"""Display as rectangles that face the scene's camera."""
 NATIVE = "Native Splats"
-
+"""Display as the splats that Blender has itself (`compat.NATIVE_SPLATS`)."""
 LIMITS = {
     AS_TRAINED: "Exact in viewports and by the engine STGA Splats; "
     "EEVEE and Cycles render camera quads",
@@ -309,12 +315,14 @@ def _native(degree: int, nodes: Nodes, *sockets: Any) -> Socket:
 
 
 _INPUTS = {"Splats": "Geometry", "Visible": "Bool", "Size": "Float"}
+"""Inputs of the groups in MODES -> their types."""
 MODES = {
     POINTS: NodeGroup("STGA Points", _INPUTS, "Geometry", _points),
     QUADS: NodeGroup("STGA Camera Quads", _INPUTS, "Geometry", _quads),
 }
+"""Display of any Blender -> node group that makes its geometry."""
 _NATIVE_INPUTS = _INPUTS | {"Added": "Vector", "View-Dependent": "Bool", "Painted": "Bool"}
-
+"""Inputs of NATIVE_GROUPS, as in _NativeInputs -> their types."""
 NATIVE_GROUPS = tuple(
     NodeGroup(f"STGA Native Splats {n}", _NATIVE_INPUTS, "Geometry", partial(_native, n))
     for n in range(4)
@@ -323,7 +331,7 @@ NATIVE_GROUPS = tuple(
 
 
 _FROZEN = "stga_frozen"
-
+"""Attribute of splats on triangles that the frame's selection leaves out."""
 MENUS = {DISPLAY: AS_TRAINED, NATIVE_LIGHT: RECORDED}
 """Inputs that are menus -> what is chosen in a new file."""
 

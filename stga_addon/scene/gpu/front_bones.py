@@ -7,7 +7,7 @@ import numpy as np
 from mathutils import Vector
 
 NO_BONES = np.zeros((0, 2, 4), np.float32)
-
+"""What `front_bones` returns where no bone is in front."""
 MAX_SHAPES = 256
 """Bones looked for in each pixel; splats cover those of a larger rig."""
 WIDTH_FRACTION = 0.15

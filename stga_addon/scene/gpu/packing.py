@@ -20,9 +20,13 @@ from ..layers import SceneLayer, random_percentage
 NEAR_M = 0.01
 """Splats nearer to the camera than this are dropped, as by the rasterizer."""
 CLIP_PLANES = 6
+"""Largest number of clip planes: that of Blender's `RegionView3D.clip_planes`."""
 VIEW_TEXELS = 2 + CLIP_PLANES
+"""Texels of the view: focal lengths and principal point; size and number of clip planes; these
+planes."""
 LAYER_TEXELS = 5
-
+"""Texels of a layer: where its coefficients and splats begin and how many coefficients there are;
+antialiasing, size and opacity threshold; rotation to the axes of training, in three."""
 MAX_INDEX = 1 << 24
 """float32, in which the shader reads indices, holds whole numbers up to here exactly."""
 

@@ -19,7 +19,7 @@ from .relit_textures import RelitTextures
 from .shaders import PROJECTED_TEXTURES
 
 CLEAR = (0.0, 0.0, 0.0, 0.0)
-
+"""Premultiplied RGBA of an image without splats."""
 OUTSIDE = 0
 """Part of the composite that is not near bones, as `composite_shader` numbers it."""
 NEAR_BONES = 1
@@ -29,7 +29,7 @@ BEHIND = 2
 COMPACT = "RGBA16F"
 """Format of the color target, beside EXACT."""
 DEPTH_FORMAT = "RG32F"
-
+"""Format of the depth target: depth · alpha, and alpha."""
 _problems: dict[str, str] = {}
 """Format of the color target -> what was wrong with the first picture, "" where nothing was."""
 

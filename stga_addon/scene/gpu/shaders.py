@@ -47,8 +47,10 @@ from . import packing
 from .buffers import TEXTURE_WIDTH
 
 PACKED_TEXTURES = ("orders", "centers", "axes", "colors", "frames", "table")
+"""Samplers of the first pass: `drawing_order`, `StaticSplats.texels`, `PosedFrames.texels` and
+`packing.table`."""
 PROJECTED_TEXTURES = ("places", "sides", "shades")
-
+"""Textures that the first pass writes and the second reads, a texel for each splat."""
 BLOCK_SPLATS = 128
 """Splats drawn by one instance: GPUs are slow at instances of four vertices. A divisor of
 TEXTURE_WIDTH: the last instance then reads no further than the last row."""

@@ -15,12 +15,17 @@ from ..layers import SceneLayer
 from .packing import View
 
 CAMERA = Camera(40, 24, 30.0, 26.0, 21.0, 11.0, np.eye(4))
+"""Camera of the small image in which the splats are drawn."""
 POSITIONS_M = np.array([[-0.3, 0.1, 3.0], [-0.12, 0.05, 0.9], [0.1, -0.06, 1.2]])
+"""Centers of the three splats in the camera's space, not in the order of their depth."""
 ROTATIONS = np.array([[1.0, 0, 0, 0], [0.9, 0.1, -0.2, 0.4], [0.8, -0.3, 0.1, -0.5]])
+"""Quaternions wxyz of the three, not normalized."""
 DEVIATIONS_M = np.array([[0.5, 0.4, 0.3], [0.03, 0.14, 0.08], [0.15, 0.05, 0.09]])
+"""Standard deviations along the axes of the three."""
 OPACITIES = np.array([0.5, 0.8, 0.7])
+"""Opacities of the three, 0…1."""
 COLORS = np.array([[0.9, 0.5, 0.1], [0.2, 0.9, 0.4], [0.3, 0.2, 0.8]])
-
+"""Colors of the three, sRGB in 0…1."""
 HIDDEN_DEPTH_M = 2.0
 """Depth of invisible splats behind the first of the three, so that the second instance of the
 shader draws the others."""

@@ -36,11 +36,13 @@ from ..compat import (
 from ..objects import Warn, log_warning
 
 IDENTITY_SLIDERS = 10
-# Prefixes of shape keys; the number after one is the component, or the timestep.
+"""Components of identity, the first ones, that have a shape key."""
 EXPRESSION_KEY = "expr_"
+"""Prefix of an expression's shape key, before the number of its component."""
 IDENTITY_KEY = "identity_"
+"""Prefix of an identity's shape key, before the number of its component."""
 OFFSET_KEY = "offset_t"
-
+"""Prefix of the shape key of tracked vertex offsets, before the timestep."""
 EXPRESSION_NAMES = "stga_expressions"
 """Property of a head whose expressions have ARKit's names: these, separated by commas."""
 # The joints that each part of a motion (`PARTS`) rotates.

@@ -15,8 +15,9 @@ from .sources import natural_order
 FACE_KEYS = ("expression", "exp_path", "mesh_path", "flame_path")
 """Keys of each frame of NeRFace, IMavatar and INSTA: a head that moves before one camera."""
 MARKS = b'"frames"', b'"transform_matrix"'
+"""Keys that every transforms file has."""
 HEAD_BYTES = 1 << 16
-
+"""Bytes from the beginning of a file in which MARKS are looked for."""
 HEAD_FIXED = (
     "its frames hold a face's expressions: they are moments of one camera, and its poses are "
     "relative to the head, which tracking finds itself"

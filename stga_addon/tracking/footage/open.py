@@ -43,7 +43,7 @@ from .sources import (
 from .video import Video, VideoFrames, first_frames
 
 ALL_FRAMES = FrameRange()
-
+"""Range without ends: every frame is used."""
 MAX_MEASURED_MASKS = 6
 """Masks, evenly spread over cameras and timesteps, that show what 255 means."""
 TYPICAL_VIEW_DEG = 65.0

@@ -15,8 +15,9 @@ from .shots import Calibrated, ImageSize, Shot, numbers, pinhole, read_xml
 FILM_WIDTH_MM = 36.0
 """Width of the 35 mm film to which focal lengths refer; it stands for the image's longer side."""
 REQUIRED_COLUMNS = ("name", "x", "y", "alt", "heading", "pitch", "roll", "f")
+"""Columns without which a table is refused: name, position, angles and focal length."""
 LENS_COLUMNS = ("k1", "k2", "k3", "k4", "t1", "t2")
-
+"""Columns of Brown's lens distortion: radial, then tangential."""
 OTHER_SPELLINGS = {
     "yaw": "heading",
     "f_35mm": "f",

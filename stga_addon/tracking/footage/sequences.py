@@ -16,10 +16,10 @@ from .shots import Shot
 from .sources import Sources, frame_number
 from .video import Video, VideoFrames, opened_video, read_video
 
-# Sound is compared by its loudness every 2 ms
 SOUND_RATE_HZ = 16000
+"""Rate at which sound is resampled."""
 SOUND_HOP = 32
-
+"""Samples of each value of loudness, by which sound is compared: 2 ms."""
 MIN_OVERLAP_S = 1.0
 """Common time below which two recordings are not compared."""
 MOTION_SIZE = 32

@@ -19,8 +19,8 @@ UNREAD_SUFFIXES = (
 CONTAINERS = ("images", "frames", "videos", "input")
 """Folders that gather those of the cameras; their names are no part of a camera's. Of pictures of
 the same names in several, the first are used."""
-ORIGINALS = "input"  # Container of the images before undistortion, by 3DGS's convert.py
-
+ORIGINALS = "input"
+"""Container of the images before undistortion, by 3DGS's convert.py."""
 MASK_FOLDERS = ("masks", "fg_masks", "alpha_map", "alpha_maps")
 """Folders of masks at the top of the footage, or beside the folders of images, as NeRSemble has one
 in each timestep's folder; a frame rate may follow (alpha_map-73fps)."""

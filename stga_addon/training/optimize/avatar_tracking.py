@@ -74,8 +74,6 @@ TRACKED_FRACTION = 0.2
 a long take must not track for longer than it trains."""
 MIN_TRACKED_TIMESTEPS = 12
 """Timesteps that are tracked however few iterations there are."""
-ROOT = JOINTS.index("root")
-
 CACHED_TIMESTEPS = 12
 """FLAME frames kept in memory, with their dynamic offsets."""
 POINTS = 6000
@@ -369,7 +367,7 @@ class _Tracker:
         whole = replace(settings, backdrop="masked") if self._cuts else settings
         self._prepare = image_preparation(capture, whole)
         person = with_identity(sequence).model
-        root = person.j_regressor[ROOT] @ person.v_template
+        root = person.j_regressor[JOINTS.index("root")] @ person.v_template
         grown = (person.v_template - root)[:, :, None][:, :, : int(other.scales)]
         # what is sought beside the expressions, as if they were some
         shapes = [person.shapedirs, torso_shapes(person), grown]

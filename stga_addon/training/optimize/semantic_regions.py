@@ -61,10 +61,6 @@ LEAST_SHADE = 0.02
 SMOOTHED = 24
 """Triangles around one over which a decision or color is smoothed."""
 
-EYEBALLS = ("left_eyeball", "right_eyeball")
-
-TEETH = ("teeth",)
-
 LINING_REACH = 1.3
 """Distance from the mouth's middle within which its lining and throat lie."""
 LINING_LEVEL = -0.4
@@ -266,12 +262,12 @@ def lining_of(capture: Capture) -> np.ndarray:
 
 def teeth_of(capture: Capture) -> np.ndarray:
     """(F,) bool: teeth, where the head model marks them."""
-    return _in_masks(capture, TEETH)
+    return _in_masks(capture, ("teeth",))
 
 
 def eyeballs_of(capture: Capture) -> np.ndarray:
     """(F,) bool: eyeballs, where the head model marks them."""
-    return _in_masks(capture, EYEBALLS)
+    return _in_masks(capture, ("left_eyeball", "right_eyeball"))
 
 
 def _in_masks(capture: Capture, names: Collection[str]) -> np.ndarray:

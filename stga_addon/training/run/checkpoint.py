@@ -28,7 +28,7 @@ from ..settings import TrainingSettings
 from .folder import AVATAR, CHECKPOINT, SELECTION, Continuation, Run
 
 VERSION = 4
-
+"""Version of the format of checkpoints: those of other versions are refused."""
 TRACKING = "tracking/parameters"
 """Prefix of the arrays of the tracking's parameters."""
 IDENTITY = "identity"

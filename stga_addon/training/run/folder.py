@@ -33,15 +33,23 @@ from ..settings import TrainingSettings
 from .identity import RunIdentity, difference, identity_of
 
 FORMAT = "stga-run"
+"""Format that run.json names."""
 VERSION = 8
+"""Version of the format of runs."""
 RUN = "run.json"
+"""File with settings, identity and source of the run (`Run`)."""
 AVATAR = "avatar.npz"
+"""File with the trained avatar."""
 CHECKPOINT = "checkpoint.npz"
+"""File with the state that an interrupted training continues from."""
 SELECTION = "selection.npz"
+"""File with the triangles that train at each timestep."""
 WORLD_FILE = "world.ply"
+"""File with the splats of the static background."""
 TRACKING = "tracking.npz"
+"""File with the motion that was refined during training, and the tracked one."""
 RESIDUALS = "residuals.npz"
-
+"""File with the mean error of each triangle."""
 MAX_FOLDERS_UP = 2
 """Levels of folders from the folder of a run, or of a .blend file, up to that of its project."""
 

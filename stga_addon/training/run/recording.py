@@ -55,7 +55,7 @@ ROUNDS = 2
 """Rounds of tracking, each from the motion that the round before led to, smoothed in takes in
 order."""
 IDENTITY = Similarity()
-
+"""Similarity that leaves the world of a capture where it is."""
 PART_TIMESTEPS = 16
 """Timesteps that a helping process tracks at a time."""
 Source = tuple[Path, int, Path, float, int]

@@ -65,7 +65,7 @@ from .metrics_log import (
 )
 
 _log = logging.getLogger(__name__)
-
+"""Log of warnings during training."""
 CHECKPOINT_S = 30.0
 """Seconds of training between checkpoints: what a crash may cost."""
 CHECKPOINT_VARIABLE = "STGA_CHECKPOINT_S"
