@@ -13,6 +13,10 @@ from ..capture.color import srgb_to_linear
 from ..capture.glb import DTYPES, JSON_KIND, MAGIC, VERSION
 from ..files import replacing
 
+Json = dict[str, Any]
+"""A glTF document, or a part of one."""
+Arrays = dict[str, np.ndarray]
+"""Arrays by their names in a file."""
 EXTENSION = "KHR_gaussian_splatting"
 GENERATOR = "STGA for Blender"
 _BINARY_CHUNK = b"BIN\0"
@@ -21,12 +25,6 @@ _POINTS = 0
 VERTICES = 34962
 TYPES = {1: "SCALAR", 3: "VEC3", 4: "VEC4", 16: "MAT4"}
 COMPONENTS = {np.dtype(kind).name: number for number, kind in DTYPES.items()}
-
-
-Json = dict[str, Any]
-"""A glTF document, or a part of one."""
-Arrays = dict[str, np.ndarray]
-"""Arrays by their names in a file."""
 
 
 class Accessors:
