@@ -26,7 +26,9 @@ def test_furniture_beside_the_head_is_nobody() -> None:
     hair = np.asarray(head.vertices) * [0.1, 0.13, 0.12] + [0.0, 0.03, -0.02]
     cameras = [camera(number) for number in range(CAMERAS)]
     rng = np.random.default_rng(3)
-    people, mattes, boxes = [], [], []
+    people = []
+    mattes = []
+    boxes = []
     for number, each in enumerate(cameras):
         person = silhouette(mesh, head.faces, each) | silhouette(hair, head.faces, each)
         box = np.zeros_like(person)
