@@ -6,7 +6,11 @@ from ..raster.shader_constants import printed_constants
 from . import lamps, relight, values
 
 _CONSTANTS = {"MAP_SIZE": lamps.MAP_SIZE, "LIFT": lamps.LIFT_M, "BIAS": lamps.BIAS_M}
-_CONSTANTS |= {"MAX_BIAS": lamps.MAX_BIAS_M, "TAP_STEP": lamps.TAP_STEP, "PI": 3.14159265358979}
+_CONSTANTS |= {
+    "MAX_BIAS": lamps.MAX_BIAS_M,
+    "TAP_STEP": float(lamps.TAP_STEP),
+    "PI": 3.14159265358979,
+}
 _FRACTIONS = "HIGHLIGHT_FRACTION", "WET_HIGHLIGHT_FRACTION", "MIN_DIFFUSE_FRACTION"
 for _name in ("REFLECTANCE", *_FRACTIONS, "ALIKE_AT_SPLAT", "UNLIKE_AT_SPLAT"):
     _CONSTANTS[_name] = getattr(relight, _name)
