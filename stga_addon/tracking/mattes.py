@@ -239,7 +239,7 @@ def find_matte(image: np.ndarray, probability: np.ndarray, head: np.ndarray) -> 
     matte = np.where(person, np.uint8(255), np.uint8(0))
     near = box_of(person, math.ceil(band) + 2)
     outline = person[near]
-    outside = ~_grown(cv2, outline, band)
+    outside = ~grown(cv2, outline, band)
     narrow = _shrunk(cv2, outline, band)
     is_hair = narrow & ~_shrunk(cv2, outline, HAIR_BAND_FRACTION * size)
     is_hair &= _may_be_hair(cv2, head, band)[near]
@@ -279,7 +279,7 @@ def _may_be_hair(cv2: Any, head: np.ndarray, margin: float) -> np.ndarray:
     rows = np.flatnonzero(head.any(axis=1))
     if not len(rows):
         return np.zeros_like(head)
-    found = ~_grown(cv2, head, margin)
+    found = ~grown(cv2, head, margin)
     found[int(rows[0] + HAIR_ROWS_FRACTION * np.ptp(rows)) :] = False
     return np.asarray(found)
 
@@ -300,11 +300,11 @@ def _cut(
     """(H, W) bool: the person; size: of the head in pixels."""
     core = _shrunk(cv2, head, HEAD_MARGIN_FRACTION * size)
     margin = max(2.0, CUT_MARGIN_FRACTION * size)
-    reach = _grown(cv2, head, REACH_FRACTION * size)  # of hair; the body's is all below
+    reach = grown(cv2, head, REACH_FRACTION * size)  # of hair; the body's is all below
     if head.any():
         reach[int(np.flatnonzero(head.any(axis=1)).mean()) :] = True
     surely = core | _shrunk(cv2, probability > SURE, margin)
-    possibly = _grown(cv2, (probability > UNLIKELY) | head, 2 * margin) & reach
+    possibly = grown(cv2, (probability > UNLIKELY) | head, 2 * margin) & reach
     marks = np.where(probability > LIKELY, cv2.GC_PR_FGD, cv2.GC_PR_BGD).astype(np.uint8)
     marks[~possibly] = cv2.GC_BGD
     marks[surely] = cv2.GC_FGD
@@ -334,5 +334,6 @@ def _shrunk(cv2: Any, where: np.ndarray, pixels: float) -> np.ndarray:
     return distance > pixels
 
 
-def _grown(cv2: Any, where: np.ndarray, pixels: float) -> np.ndarray:
+def grown(cv2: Any, where: np.ndarray, pixels: float) -> np.ndarray:
+    """(H, W) bool: `where` (H, W) bool, and the pixels up to so many beside it."""
     return ~_shrunk(cv2, ~where, pixels)

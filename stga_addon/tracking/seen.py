@@ -149,7 +149,7 @@ def with_torso(fitted: FittedHead, workers: Workers, bends: bool) -> SeenHead:
         footage, unseen = with_mattes(footage, pixels, opened.out, source, workers)
         warnings += unseen
         mesh = posed_mesh(fitted.fit, parameters[footage.timesteps[0]])
-        cut_to_visual_hull(footage, fitted.fit.to_capture.camera, mesh)
+        warnings += cut_to_visual_hull(footage, fitted.fit.to_capture.camera, mesh)
     torso = follow_torso(fitted.fit, parameters, footage, workers, bends)
     return SeenHead(fitted, errors, footage, torso, warnings)
 
