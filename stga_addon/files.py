@@ -496,11 +496,16 @@ def read_text(path: Path, limit: int = MAX_FILE_BYTES) -> str:
         raise StgaError(f"{path}: is not UTF-8 text ({error})") from error
 
 
+class TooManyValuesError(ValueError):
+    """A text would be parsed to more values than a large file has."""
+
+
 def check_values(text: str) -> str:
-    """The text. Raises ValueError where it would be parsed to more values than a large file has."""
+    """The text. Raises TooManyValuesError."""
     values = sum(map(text.count, SEPARATORS))
     if values > MAX_TEXT_VALUES:
-        raise ValueError(f"{values} values, more than the {MAX_TEXT_VALUES} allowed")
+        problem = f"holds about {values} values, more than the {MAX_TEXT_VALUES} allowed"
+        raise TooManyValuesError(problem)
     return text
 
 
@@ -522,7 +527,7 @@ def table_rows(where: str, text: str) -> list[tuple[int, list[str]]]:
     spreadsheets write them in many countries. Raises StgaError, beginning with `where`."""
     try:
         lines = check_values(text).splitlines()
-    except ValueError as error:
+    except TooManyValuesError as error:
         raise StgaError(f"{where}: {error}") from error
     if lines and lines[0].lower().startswith("sep="):  # of spreadsheets, which hide that line
         lines[0] = ""
@@ -575,13 +580,15 @@ def _parsed(path: Path, form: str, limit: int, parse: Callable[[bytes], Any]) ->
     data = read_bytes(path, limit)
     try:
         return parse(data)
+    except TooManyValuesError as error:
+        raise StgaError(f"{path}: {error}") from error
     except (ValueError, RecursionError) as error:
         raise StgaError(f"{path}: is not valid {form} ({error})") from error
 
 
 def parse_json(data: bytes) -> Any:
     """Parse JSON, as `decoded_text`. Raises ValueError where it is malformed, or holds lone
-    surrogates."""
+    surrogates, or too many values (TooManyValuesError)."""
     text = check_values(decoded_text(data))
     value = json.loads(text)
     if "\\u" in text:  # the only way to write a lone surrogate
