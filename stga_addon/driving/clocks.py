@@ -123,7 +123,8 @@ def find_times(
     are not used; and what was guessed of the used one.
 
     columns  name -> texts or numbers (T,) of what is no shape. Used is the first that ascends at a
-             plausible rate; names with a unit and without other words go first
+             plausible rate; names with a unit and without other words go first, names that are
+             not of times are used where there is no rate either (`_times_by_contents`)
     fps      rate at which whole numbers count frames; None: `DEFAULT_FPS`
     Raises StgaError, beginning with `where`, where none is used and a plain one cannot be read.
     """

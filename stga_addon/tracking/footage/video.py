@@ -259,7 +259,8 @@ def first_frames(path: Path) -> Video:
         problems = _unheard(path, first)
     for width, height in (stored, size):
         if not is_image_size(width, height):
-            raise StgaError(f"{path}: has {width} x {height} pixels, more than are read")
+            pixels = f"{width} x {height} pixels"
+            raise StgaError(f"{path}: has {pixels}, more than are read ({MAX_IMAGE_PIXELS})")
     warnings = tuple(f"{path}: {text}" for text in problems)
     return Video(path, times, (), 0.0, size, stored, aspect, warnings=warnings)
 
@@ -311,7 +312,7 @@ def opened_video(path: Path) -> Iterator[Any]:
             context = container.streams.video[0].codec_context
             if context.width * context.height > MAX_IMAGE_PIXELS:
                 size = f"{context.width} x {context.height} pixels"
-                raise StgaError(f"{path}: has {size}, more than are read")
+                raise StgaError(f"{path}: has {size}, more than are read ({MAX_IMAGE_PIXELS})")
             yield container
     except (av.FFmpegError, ValueError) as error:
         raise StgaError(f"{path}: is not a readable video ({_reason(error)})") from error
