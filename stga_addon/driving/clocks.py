@@ -10,11 +10,12 @@ import numpy as np
 from ..errors import StgaError, shorten
 
 TIMECODE = re.compile(
-    r"(?:\d{1,4}[-/.]\d\d?[-/.]\d{1,4}[T ])?(?:(\d{1,3}):)?(\d{1,2}):(\d{1,2})"
-    r"(?:([:;.,])(\d{1,9})(?:[.,](\d{1,6}))?)?(?:Z|[+-]\d\d:?\d\d)?",
-    re.ASCII,
+    r"(?:\d{1,4}[-/.]\d\d?[-/.]\d{1,4}(?:T|,? ))?(?:(\d{1,3}):)?(\d{1,2}):(\d{1,2})"
+    r"(?:([:;.,])(\d{1,9})(?:[.,](\d{1,6}))?)?"
+    r"(?: ?([AP])\.?M\.?)?(?: ?(?:Z|UTC|GMT|[+-]\d\d:?\d\d))?",
+    re.ASCII | re.IGNORECASE,
 )
-"""Also behind a date, as in ISO 8601; hours may be missing."""
+"""Also behind a date, as in ISO 8601, and before AM or PM; hours may be missing."""
 Columns = Mapping[str, Sequence[object]]
 """Columns of a table by their names."""
 BASES = (24, 25, 30, 48, 50, 60, 100, 120, 240)
@@ -43,10 +44,27 @@ UNITS_S = {
     **dict.fromkeys(("ns", "nsec", "nanos", "nanosecond", "nanoseconds"), 1e-9),
     **dict.fromkeys(("tick", "ticks"), 1e-7),  # of .NET and Unreal Engine
     **dict.fromkeys(("min", "mins", "minute", "minutes"), 60.0),
+    **dict.fromkeys(("h", "hr", "hrs", "hour", "hours"), 3600.0),
+    **dict.fromkeys(("day", "days"), 86_400.0),
 }
 """Units as NFKC spells them, which makes the micro sign a Greek letter -> seconds."""
+LETTER_UNITS = ("s", "h")
+"""Units that name one only at the end of a heading of several words."""
 UNIT_NAMES = {1e-3: "milliseconds", 1e-6: "microseconds", 1e-9: "nanoseconds"}
 """Seconds of a unit -> its name in messages."""
+CALENDARS = {
+    "milliseconds since 1970": (1e-3, 1970),
+    "microseconds since 1970": (1e-6, 1970),
+    "nanoseconds since 1970": (1e-9, 1970),
+    "ticks of Windows since 1601": (1e-7, 1601),
+    "ticks of .NET since the year 1": (1e-7, 1),
+    "days since 1900": (86_400.0, 1900),
+}
+"""What a column holds -> seconds of its unit, and the year that it counts from."""
+YEAR_S = 31_556_952.0
+"""Mean year of the calendar."""
+RECORDED_YEARS = (1995, 2100)
+"""Years in which a number that counts from a calendar's beginning may lie."""
 TIME_WORDS = (
     *("timecode", "time", "timestamp", "elapsed", "t", "pts"),
     *("ts", "clock", "datetime", "date", "epoch", "unix", "utc"),
@@ -168,9 +186,10 @@ def _time_columns(columns: Columns) -> list[_Column]:
     found = []
     for name, cells in columns.items():
         words = _words(name)
-        unit = next((UNITS_S[word] for word in words if word in UNITS_S and word != "s"), None)
-        if unit is None and len(words) > 1 and words[-1] == "s":
-            unit = UNITS_S["s"]
+        named = [word for word in words if word in UNITS_S and word not in LETTER_UNITS]
+        if not named and len(words) > 1 and words[-1] in LETTER_UNITS:
+            named = words[-1:]
+        unit = UNITS_S[named[0]] if named else None
         rank = next((rank for rank, word in enumerate(TIME_WORDS) if word in words), None)
         others = [w for w in words if w not in UNITS_S and w not in TIME_WORDS + BESIDE_TIMES]
         has_cells = any(cell not in (None, "") for cell in cells)
@@ -275,8 +294,12 @@ def seconds_of_numbers(
     if unit is not None or not len(steps):
         return values * (unit or 1.0), None
     step = float(np.median(steps))
+    for name, (unit, year) in CALENDARS.items():
+        since, until = (YEAR_S * (each - year) / unit for each in RECORDED_YEARS)
+        if _is_of_rows(step * unit) and ((values > since) & (values < until)).all():
+            return values * unit, Guess(f"{column} holds {name}, by its size and its steps")
     for unit in (1.0, *UNIT_NAMES):
-        if 1 / MAX_ROWS_PER_S <= step * unit <= 1 / MIN_ROWS_PER_S:
+        if _is_of_rows(step * unit):
             guess = f"{column} holds {UNIT_NAMES.get(unit)}, by its steps of {step:g}"
             return values * unit, Guess(guess) if unit in UNIT_NAMES else None
     if step <= MAX_FRAME_STEP and np.isfinite(values).all() and (values % 1 == 0).all():
@@ -284,6 +307,11 @@ def seconds_of_numbers(
         counts = f"{column} counts frames; they are taken as {rate:g} a second"
         return values / rate, Guess(counts) if fps else Guess(f"{counts}; {OTHER_RATE}", rate)
     return values, None
+
+
+def _is_of_rows(step_s: float) -> bool:
+    """Whether recordings of faces have rows so far apart."""
+    return 1 / MAX_ROWS_PER_S <= step_s <= 1 / MIN_ROWS_PER_S
 
 
 def seconds_of(where: str, texts: list[str], fps: float | None) -> tuple[np.ndarray, float | None]:
@@ -296,13 +324,16 @@ def seconds_of(where: str, texts: list[str], fps: float | None) -> tuple[np.ndar
     digits = []
     marks = set()
     for row, text in enumerate(texts):
-        found = TIMECODE.fullmatch(text.strip())
+        found = TIMECODE.fullmatch(" ".join(text.split()))
         if found is None:
             raise StgaError(
                 f"{where}: row {row + 1}: Timecode is {shorten(text)}, expected HH:MM:SS:FF.sub"
             )
-        hours, minutes, whole, mark, frame, part = found.groups()
-        clock = int(hours or 0), int(minutes), int(whole)
+        hours, minutes, whole, mark, frame, part, half = found.groups()
+        hour = int(hours or 0)
+        if half:  # 12:05 AM is five past midnight
+            hour = hour % 12 + (12 if half in "pP" else 0)
+        clock = hour, int(minutes), int(whole)
         fields.append((*clock, int(frame or 0), float(f"0.{part or 0}")))
         marks.add(mark)
         if part is None:

@@ -118,6 +118,25 @@ CLOCKS = {
         "column TC is taken as seconds, though",
     ),
     "minutes": ("time (min)", lambda n: n / 25 / 60, 25, None),
+    "hours": ("time (h)", lambda n: n / 25 / 3600, 25, None),
+    "Windows' file times": (
+        "time",
+        lambda n: 133_800_000_000_000_000 + n * 400_000,
+        25,
+        "holds ticks of Windows since 1601",
+    ),
+    "slower than milliseconds": ("time", lambda n: 1_780_000_000_000 + n * 100, 10, "milliseconds"),
+    "a spreadsheet's dates": ("Date", lambda n: 46_356.25 + n / 25 / 86_400, 25, "days since 1900"),
+    "morning and afternoon": (
+        "time",
+        lambda n: (
+            f'"11/30/2026, {(time := 86_399_500 // 2 + 20 * n) // 3_600_000 % 12 or 12}:'
+            f"{time // 60_000 % 60:02d}:{time // 1000 % 60:02d}.{time % 1000:03d}\u202f"
+            f'{"AP"[time >= 43_200_000]}M"'
+        ),
+        50,
+        None,
+    ),
     "ticks of 100 ns": ("ticks", lambda n: 638 * 10**15 + n * 400_000, 25, None),
     "another clock's ticks": (
         "hostTime",
