@@ -177,14 +177,28 @@ def is_capture(path: Path) -> bool:
     if not is_folder(path):
         return False
     files = transforms_files(path)
-    tracked = any(
-        key in read_bytes(file) for file in files for key in (b'"mesh_path"', b'"flame_param_path"')
-    )
+    tracked = _names(files, "mesh_path", "flame_param_path")
     is_listed = is_folder(path / PARAMETERS) or bool(matching(path / "meshes", "mesh_*.json"))
     if tracked or is_listed or is_file(path / CANONICAL_NAME):
         return True
     bare = any(own.suffix.lower() in meshes.MESH_SUFFIXES for own in matching(path, "[!.]*"))
     return bare and not files and not is_gaussian_output(path)
+
+
+def needs_no_flame(path: Path) -> bool:
+    """Whether a path looks like a capture that is read without a FLAME model file: its meshes are
+    files, or of the bundled head, whose model is in the folder."""
+    if not is_capture(path):
+        return False
+    if is_file(path / BUNDLED_MODEL):
+        return True
+    is_flame = is_folder(path / PARAMETERS) or is_file(path / CANONICAL_NAME)
+    return not is_flame and not _names(transforms_files(path), "flame_param_path")
+
+
+def _names(files: Sequence[Path], *keys: str) -> bool:
+    """Whether one of these transforms has one of the keys."""
+    return any(f'"{key}"'.encode() in read_bytes(file) for file in files for key in keys)
 
 
 def repair_capture(

@@ -16,7 +16,7 @@ from ..avatar.file import read_avatar
 from ..avatar.filmed import filmed_sides
 from ..capture.filmed import filmed
 from ..capture.model import Capture, summarize_capture
-from ..capture.open import is_capture, open_capture
+from ..capture.open import is_capture, needs_no_flame, open_capture
 from ..capture.other_input import other_input
 from ..errors import StgaError, printable
 from ..export.formats import FORMATS
@@ -183,6 +183,9 @@ class Command:
                     problem = f"has no effect with {flag_of(specs[mode])}"
                     raise StgaError(f"{flag_of(spec)}: {problem}")
         refuse_useless(options, *self.kinds)
+        given = getattr(options, "flame", None) and getattr(options, "capture", None)
+        if given is not None and getattr(options, "motion", None) is None and needs_no_flame(given):
+            raise StgaError(f"--flame: has no effect on {given}, which is read without a model")
 
 
 def _about(kind: Any) -> str:

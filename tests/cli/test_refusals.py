@@ -65,6 +65,8 @@ $ track {root} --out {o} --take around --cameras {cameras}
 --take around: does not go with --cameras
 $ track {root} --out {o} --take around
 --take around: {root} has a calibration already
+$ info {root} --flame {model}
+--flame: has no effect on {root}, which is read without a model
 # A resumed run goes on as it began
 $ train {root} --out {run} --resume --stop-when-flat
 --stop-when-flat: this run began with
