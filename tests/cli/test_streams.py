@@ -140,8 +140,9 @@ def test_a_tight_limit_of_addresses_is_said(capture):
 
 @pytest.mark.skipif(sys.platform != "linux", reason="names there are Unicode")
 def test_folders_that_no_path_reaches(capture, tmp_path):
-    """Catches a run that cannot read its own run.json, or a traceback, where a folder's name is not
-    UTF-8, or the working folder was removed; and what is written before that is found."""
+    """Catches a run or a capture that cannot be read back, or a traceback, where a folder's or a
+    photo's name is not UTF-8, or the working folder was removed; and what is written before that is
+    found."""
     latin = os.path.join(os.fsencode(tmp_path), b"caf\xe9")
     os.makedirs(os.path.join(latin, b"gone"))
     shutil.copytree(os.fsencode(capture), os.path.join(latin, b"ball"))
@@ -155,6 +156,12 @@ def test_folders_that_no_path_reaches(capture, tmp_path):
         assert done.returncode == 2
         assert re.search("^stga .*not UTF-8; rename it[)]$", done.stderr, re.MULTILINE)
     assert sorted(os.listdir(latin)) == [b"ball", b"gone"]
+    os.mkdir(tmp_path / "photos")
+    image = next((capture / "images").glob("*.png"))
+    shutil.copy(image, os.path.join(os.fsencode(tmp_path), b"photos", b"Andr\xe9.png"))
+    done = shell(f"stga track {tmp_path}/photos --out {tmp_path}/tracked")
+    assert "photos/Andr\\udce9.png: is not a usable path" in done.stderr
+    assert not (tmp_path / "tracked").exists()
     removed = f"mkdir {tmp_path}/gone; cd {tmp_path}/gone; rmdir {tmp_path}/gone"
     done = shell(f"{removed}; PYTHONPATH={ROOT} stga train {capture} --out run")
     assert done.returncode == 2

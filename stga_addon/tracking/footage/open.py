@@ -16,7 +16,7 @@ from ...capture.lens import Lens, Undistortion, undistortion
 from ...capture.model import View, evenly_spread
 from ...capture.transforms import IMAGE_SUFFIXES, VIDEO_SUFFIXES
 from ...errors import StgaError, listed
-from ...files import is_file, is_folder
+from ...files import check_encodable, is_file, is_folder
 from .calibrations import EXPECTED, calibration_above, find_calibration, read_calibration
 from .colmap import is_distorted, model_suffix
 from .focal_tags import photo_focal, video_focal
@@ -340,6 +340,7 @@ def _camera(name: str, shot: Shot, frames: Frames) -> tuple[FootageCamera, tuple
         both = f"{first[0]} x {first[1]} pixels, the calibration of {width} x {height}"
         messages += (f"images are of {both}, which is scaled by {first[0] / width:.4g}",)
     for path, size in sizes.items():
+        check_encodable(path)
         if size != (shot.camera.width, shot.camera.height):
             raise StgaError(
                 f"{path}: has {size[0]} x {size[1]} pixels, but {shot.where} has {width} x {height}"
