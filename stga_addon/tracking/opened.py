@@ -129,7 +129,7 @@ def _stored(footage: Footage, out: Path) -> Footage:
     the capture's images. A file that exists is that of the frame."""
     cameras = []
     for number, camera in enumerate(footage.cameras):
-        if camera.undistortion is None and camera.file(camera.timesteps[0]) is None:
+        if camera.file(camera.timesteps[0]) is None:
             kept = {t: out / folder.image_name(t, number) for t in camera.timesteps}
             camera = replace(camera, kept=kept)
         cameras.append(camera)
