@@ -232,7 +232,7 @@ class MakeAvatar:
 
 OF_ONE_TAKE = ("cameras", "landmarks", "focal", "start", "stop", "offset", "sync")
 """Fields of `Track` that are of one take, and have no meaning for several."""
-QUICK: Mapping[str, Any] = {"most": 24, "size": 0.5}
+QUICK: Mapping[str, Any] = {"most": 16, "size": 0.5}
 """Fields of `Track` for a first look at an avatar, as soon of a long video as of a short one."""
 QUICK_S = 30.0
 """Seconds of training for a quick look."""
