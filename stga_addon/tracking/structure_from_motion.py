@@ -4,6 +4,7 @@ calibration.
 Runs in a helping process: COLMAP has threads, and cannot be interrupted.
 """
 
+import itertools
 import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -31,8 +32,9 @@ EDGE_THRESHOLD = 20.0
 MAX_FEATURES = 4096
 """Largest number of features of an image, the largest ones: comparing two images takes a time that
 is quadratic in it."""
-NEAR_IMAGES = 10
-"""Images of a video that are compared with one before them."""
+NEAR_IMAGES = 6
+"""Images of a video that are compared with one before them. Of 40 around a head, images that are
+farther apart share no features: cameras are the same without."""
 LOOP_STEP = 4
 """Every LOOP_STEP-th image is compared with all others of them: a camera may come back."""
 MODEL_GROWTH = 1.3
@@ -178,7 +180,8 @@ class _Search:
         self._extract(masked, step)
         self._match(step)
         best = self._mapped(step)
-        if best is not None and not self._options.keeps_focal:
+        is_lacking = best is not None and best.num_reg_images() < len(self._names)
+        if is_lacking and not self._options.keeps_focal:
             best = self._mapped_again(best)
         if best is None:
             none = np.zeros((0, 3, 4))
@@ -297,8 +300,8 @@ class _Search:
 
     def _mapped_again(self, found: Any) -> Any:
         """The model, or the one that COLMAP finds from its focal length, whichever observes points
-        more often. From a wrong focal length, images are lost or misplaced; so are the first pairs,
-        which determine the points."""
+        more often: from a wrong focal length, images are lost. Where none is, cameras are the same
+        after the last adjustment."""
         database = self._colmap.Database.open(self._folder / DATABASE)
         (camera,) = database.read_all_cameras()
         (known,) = found.cameras.values()
@@ -312,12 +315,12 @@ class _Search:
         """The model after a last, robust bundle adjustment, with a radial distortion where the
         residuals clearly require one."""
         colmap = self._colmap
+        self._adjust(model)
         radial = colmap.Reconstruction(model)
         (camera,) = radial.cameras.values()
         camera.model = colmap.CameraModelId.SIMPLE_RADIAL
         camera.params = [*camera.params.tolist(), 0.0]
-        for own in (model, radial):
-            self._adjust(own)
+        self._adjust(radial)
         (focal, cx, cy, k) = camera.params.tolist()
         shift_px = abs(k) * np.hypot(cx, cy) ** 3 / focal**2
         before = model.compute_mean_reprojection_error()
@@ -351,13 +354,11 @@ class _Search:
             box = self._faces.get(image.name)
             if not image.has_pose or box is None:
                 continue
-            for point in image.points2D:
-                if (
-                    point.has_point3D()
-                    and (box[0] <= point.xy).all()
-                    and (point.xy <= box[1]).all()
-                ):
-                    views[point.point3D_id] = views.get(point.point3D_id, 0) + 1
+            found = [point for point in image.points2D if point.has_point3D()]
+            places = np.array([point.xy for point in found]).reshape(-1, 2)
+            is_inside = ((box[0] <= places) & (places <= box[1])).all(axis=1)
+            for point in itertools.compress(found, is_inside):
+                views[point.point3D_id] = views.get(point.point3D_id, 0) + 1
         return sum(count >= MIN_FACE_VIEWS for count in views.values())
 
     def _found_faces(self) -> dict[str, np.ndarray]:
