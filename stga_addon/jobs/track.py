@@ -123,7 +123,7 @@ class Track:
     stop: int | None = option("timestep to stop before (default: all)", None, 1)
     step: int = option("use every nth timestep", 1, 1)
     most: int | None = option(
-        "use at most so many of these, evenly spread (default: all)",
+        "use at most so many of these, evenly spread, of a head that moves (default: all)",
         None,
         1,
         flag="--timesteps",
@@ -334,14 +334,20 @@ def _open(request: Track, steps: "_Steps") -> tuple["Footage", tuple[str, ...]]:
         request.start, request.stop, request.step, offset, request.sync, request.most
     )
     mattes = None if request.mattes in MATTES else Path(request.mattes)
-    cameras = request.cameras
-    footage = open_footage(request.footage, cameras, frames, request.focal, mattes=mattes)
+    opened = partial(
+        open_footage, request.footage, request.cameras, focal=request.focal, mattes=mattes
+    )
+    footage = opened(frames=frames)
     messages: tuple[str, ...] = ()
     if footage.focal == "calibration":
         if request.take == "around":
             raise StgaError(f"--take around: {request.footage} has a calibration already")
     elif request.landmarks is None:
-        footage, messages = _with_found_cameras(footage, request, steps)
+        # a few frames do not tell how the room moves, and are too far apart for cameras
+        whole = footage if request.most is None else opened(frames=replace(frames, most=None))
+        found, messages = _with_found_cameras(whole, request, steps)
+        is_found = found.finds_cameras or request.most is None
+        footage = found if is_found else replace(footage, warnings=found.warnings)
     steps.plan(footage)
     return (footage if request.size == 1 else sized(footage, request.size)), messages
 

@@ -66,7 +66,7 @@ def test_it_is_the_request_of_the_command_line(extension, asked, video, tmp_path
     ops.avatar_from_video(filepath=video, folder=look, quick=True)
     assert main.main(["avatar", str(video), "--out", str(look), "--quick", "--no-blend"]) == 0
     assert asked == made
-    assert (made[1].track.most, made[1].track.size) == (24, 0.5)
+    assert (made[1].track.most, made[1].track.size) == (16, 0.5)
     begin(asked)
     ops.avatar_from_video(folder=look)  # continues
     assert asked[2] == asked[1]

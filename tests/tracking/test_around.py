@@ -12,8 +12,9 @@ from scipy.spatial.transform import Rotation
 from stga_addon.capture.lens import Lens
 from stga_addon.capture.mesh_geometry import similarity
 from stga_addon.development.demo.capture import unpack_takes
+from stga_addon.jobs import track
 from stga_addon.tracking import around, structure_from_motion
-from stga_addon.tracking.around import Recognition, take_of, with_found_cameras
+from stga_addon.tracking.around import Recognition, take_of
 from stga_addon.tracking.footage.open import open_footage
 from stga_addon.tracking.sharp_frames import sharpest
 from stga_addon.tracking.stages import Workers
@@ -51,9 +52,9 @@ def pictures():
     return [picture(camera) for camera in walk(COUNT)]
 
 
-def found(folder, out, take="auto"):
-    with Helpers(1) as helpers:
-        footage, lines = with_found_cameras(open_footage(folder), out, take, Workers(helpers))
+def found(folder, out, take="auto", most=None):
+    asked = track.Track(folder, None, out, take=take, most=most)
+    footage, lines = track._open(asked, track._Steps(lambda progress: None))
     return footage, " ".join(lines)
 
 
@@ -61,7 +62,8 @@ def found(folder, out, take="auto"):
 @pytest.mark.parametrize("k", [0.0, -0.3])
 def test_cameras_are_those_that_filmed(tmp_path, pictures, k):
     """Catches poses, a lens or a principal point of another convention, a distortion that is left
-    in, or made of noise, and a walk that is taken for a talk; photos, and a video with a lens."""
+    in, or made of noise, and a walk that is taken for a talk, also for a quick look, whose frames
+    of a walk are not fewer; photos, and a video with a lens."""
     pytest.importorskip("pycolmap")
     cameras = walk(COUNT)
     source = tmp_path / "walk.mp4"
@@ -70,7 +72,7 @@ def test_cameras_are_those_that_filmed(tmp_path, pictures, k):
         encode(source, images, options={"crf": "8"}, rate=2)
     else:
         source = write_pictures(tmp_path / "photos", pictures)
-    footage, line = found(source, tmp_path / "out", "around" if k else "auto")
+    footage, line = found(source, tmp_path / "out", "around" if k else "auto", most=4)
     assert re.search(rf"around a still head.*cameras of {COUNT} of {COUNT} images found", line)
     assert ("distortion" in line) == bool(k)
     assert footage.timesteps == (0,)
