@@ -70,7 +70,7 @@ def test_one_run(toy, tmp_path, monkeypatch):
     assert "nowhere" in json.loads(replies.getvalue())["error"]
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_a_slice_is_stopped_and_goes_on(toy, tmp_path, monkeypatch):
     """Catches training lost to Ctrl-C or done twice, and files that are missing at the end."""
     monkeypatch.setattr(variants, "MAIN_VARIANTS", VARIANTS)
