@@ -169,7 +169,7 @@ def test_variants():
     assert list(select_variants(MAIN_VARIANTS, ["final", "draft"])) == ["draft", "final"]
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_slices_are_jobs_of_a_batch(toy_root, tmp_path, capsys, monkeypatch):
     """Catches seeds that are no jobs, a finished one trained again, and no word of one."""
     out = str(tmp_path / "out")
