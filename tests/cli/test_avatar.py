@@ -16,7 +16,8 @@ from stga_addon.tracking.torso import FollowedTorso
 
 def make(take, out, *more):
     files = f"{take}/footage --model {take}/head.npz --landmarks {take}/points --out {out}"
-    return stga("avatar", files, "--iterations 6 --effect relight=off --effect tracking=off", *more)
+    quick = "--mattes none --iterations 6 --effect relight=off --effect tracking=off"
+    return stga("avatar", files, quick, *more)
 
 
 @pytest.fixture(scope="module")
