@@ -36,8 +36,8 @@ def stored_path(owner: Any, tag: str) -> str:
     value = str(owner.get(tag, ""))
     if owner.library is None or not value:
         return value
-    file = bpy.path.abspath(owner.library.filepath)
-    return _found(value, owner.get(tags.STORED_IN, file), file, moved_first=True)
+    file = _other_file(owner)
+    return _found_for(tag, value, owner.get(tags.STORED_IN, file), file, moved_first=True)
 
 
 def store_path(owner: Any, tag: str, value: str) -> None:
@@ -68,23 +68,46 @@ def rebase(owners: Iterable[Any], file: str, moved_first: bool = True, source: s
     """
     pasted = os.path.basename(source) == COPIED
     for owner in owners:
-        if owner.library is not None:
+        is_scene = owner.id_type == "SCENE"
+        if other := _other_file(owner):  # here only, until the owner is made local
+            if not is_scene:
+                _rebase_stored(owner, owner.get(tags.STORED_IN, other), other, moved_first=True)
             continue
         before = owner.get(tags.STORED_IN, source or file)
         now = (before if pasted else source) or file
-        is_scene = owner.id_type == "SCENE"
-        stored = [tag for tag in PATH_TAGS if tag in owner]
-        for tag in stored:
-            owner[tag] = _found(str(owner[tag]), before, now, moved_first)
+        _rebase_stored(owner, before, now, moved_first)
         for name in SCENE_PATHS if is_scene and hasattr(owner, "stga") else ():
             setattr(owner.stga, name, _found(getattr(owner.stga, name), before, now, moved_first))
-        if stored or is_scene:
+        if is_scene or tags.STORED_IN in owner:
             owner[tags.STORED_IN] = file
+
+
+def _other_file(owner: Any) -> str:
+    """The file of what is linked or overridden; "" of what the open file has."""
+    override = owner.override_library
+    reference = owner if override is None else override.reference
+    library = None if reference is None else reference.library
+    return "" if library is None else os.path.normpath(bpy.path.abspath(library.filepath))
+
+
+def _rebase_stored(owner: Any, before: str, now: str, moved_first: bool) -> None:
+    stored = [tag for tag in PATH_TAGS if tag in owner]
+    for tag in stored:
+        owner[tag] = _found_for(tag, str(owner[tag]), before, now, moved_first)
+    if stored:
+        owner[tags.STORED_IN] = now
 
 
 def rebase_file(file: str, moved_first: bool = False) -> None:
     """`rebase` all that the open file holds."""
     rebase([*bpy.data.objects, *bpy.data.scenes], file, moved_first)
+
+
+def _found_for(tag: str, value: str, before: str, now: str, moved_first: bool) -> str:
+    """`_found`; a capture, by which objects are found, without links of the file system."""
+    found = _found(value, before, now, moved_first)
+    is_capture = tag == tags.CAPTURE and os.path.exists(found)
+    return os.path.realpath(found) if is_capture else found
 
 
 def _found(value: str, before: str, now: str, moved_first: bool) -> str:
@@ -106,13 +129,17 @@ def _absolute(value: str, file: str) -> str:
 
 
 def _beside(place: str, before: str, now: str) -> list[str]:
-    """Where what lay beside one file, or at most `MAX_FOLDERS_UP` above it, lies beside another."""
+    """Where what lay beside one file, or at most `MAX_FOLDERS_UP` above it, lies beside another;
+    also where only one of their paths goes through a link of the file system."""
     if not (before and now and os.path.isabs(place)) or before == now:
         return []
-    try:
-        relative = os.path.relpath(place, os.path.dirname(before))
-    except ValueError:  # on another drive
-        return []
-    if relative.split(os.sep).count(os.pardir) > MAX_FOLDERS_UP:
-        return []
-    return [os.path.normpath(os.path.join(os.path.dirname(now), relative))]
+    found = list[str]()
+    folder = os.path.dirname(before)
+    for each in dict.fromkeys((folder, os.path.realpath(folder))):
+        try:
+            relative = os.path.relpath(place, each)
+        except ValueError:  # on another drive
+            continue
+        if relative.split(os.sep).count(os.pardir) <= MAX_FOLDERS_UP:
+            found.append(os.path.normpath(os.path.join(os.path.dirname(now), relative)))
+    return found

@@ -114,7 +114,7 @@ def test_jobs_of_killed_nodes_resume_elsewhere(tmp_path, trained_here):
         assert splats_of(there, f"train-seed{seed}") == splats_of(here, f"train-seed{seed}")
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_a_cluster_of_this_machine_is_its_users(tmp_path):
     """Catches a cluster that anyone on this machine may use, and jobs not carried out there."""
     write_mesh_capture(tmp_path / "capture")

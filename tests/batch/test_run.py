@@ -389,7 +389,7 @@ cost(20)  # loads what is loaded late
 for count in map(int, sys.argv[1:]):
     print(*cost(count))
 """
-JOBS = int(os.environ.get("STGA_BATCH_JOBS", 2000))
+JOBS = int(os.environ.get("STGA_BATCH_JOBS", 1000))
 """Jobs of the larger batch; a measurement had 10,000."""
 
 

@@ -74,7 +74,7 @@ def interrupt_batch(base, *options):
             f'"opencv"\nminutes = 0.1\n'
             f'capture = "{capture}"\n'
             'settings = { strategy = "selective", iterations = 100000, hull_points = false }\n'
-            for name, capture in (("good", "capture"), ("bad", "bad"))
+            for name, capture in (("bad", "bad"), ("good", "capture"))
         )
     )
     command = [sys.executable, "-m", "stga_addon", "batch", str(base / "plan.toml"), *options]

@@ -21,6 +21,7 @@ from .test_panel import draw
 @pytest.fixture
 def chosen(head):
     """The settings of a scene with a head."""
+    panel().device = "cpu"
     return panel()
 
 
@@ -53,7 +54,8 @@ def test_effect_choices(chosen, extension, tmp_path):
     chosen.preset = "draft"
     assert chosen.minutes == pytest.approx(seconds["draft"] / 60)
     out = tmp_path / "run"
-    ops.train(directory=out, iterations=3, effects=effects, preset=chosen.preset)
+    made = {"iterations": 3, "effects": f"{effects} relight=off", "device": "cpu"}
+    ops.train(directory=out, preset=chosen.preset, **made)
     run = read_run(out)
     assert "strain_color" in run.settings.driven_offsets
     assert run.settings.preset == "draft"
@@ -67,9 +69,10 @@ def test_a_capture_that_is_repaired(extension, tmp_path, monkeypatch):
     repair that leaves the scene as it was, and one that takes the shot away."""
     source = write_capture(tmp_path / "capture", **FILES["z-up"])
     ops.import_capture(directory=source)
+    panel().device = "cpu"
     bpy.context.scene.frame_end = 7
     with failure(r".*one has z up, by which they fit: with --repair, it is read so"):
-        ops.train(directory=tmp_path / "run", iterations=3)
+        ops.train(directory=tmp_path / "run", iterations=3, device="cpu", effects="relight=off")
     monkeypatch.setattr(extension.ui.next_step, "has_training_python", lambda context: True)
     assert "Repair Capture" in draw(extension, "next_step")
     ops.analyze_capture()
@@ -84,7 +87,7 @@ def test_a_capture_that_is_repaired(extension, tmp_path, monkeypatch):
     shows_box(capture)
     z_up = capture.mesh(0)[:, [0, 2, 1]] * [1, -1, 1]
     np.testing.assert_allclose(found, z_up, atol=1e-5)
-    ops.train(directory=tmp_path / "run", iterations=3)
+    ops.train(directory=tmp_path / "run", iterations=3, device="cpu", effects="relight=off")
 
 
 @pytest.fixture

@@ -1,6 +1,7 @@
 """Avatar from Video: its request, its folder, and its way to splats on a head."""
 
 import sys
+from functools import partial
 from importlib import import_module
 
 import bpy
@@ -114,13 +115,17 @@ def test_mistakes_are_sentences(extension, video, tmp_path, monkeypatch):
 
 
 @pytest.mark.slow
-def test_from_a_video_to_splats_on_the_head(extension, tmp_path):
+def test_from_a_video_to_splats_on_the_head(extension, tmp_path, monkeypatch):
     """Catches a head, splats, picture or run that does not arrive, or is another's; and what was
     not filmed, which is not shown once, or again at every result."""
     pytest.importorskip("torch")
+    tracks = extension.operators.track
+    effects = {"relight": "off", "tracking": "off"}  # which take longer than the training
+    quick = partial(tracks.make_settings, "global", seconds=1.0, effects=effects)
+    monkeypatch.setattr(tracks, "make_settings", lambda *_, **__: quick())
     video = tmp_path / "head.mp4"
-    write_head_video(video, 3)
-    ops.avatar_from_video(filepath=video, minutes=0.05, python=sys.executable)
+    focal = write_head_video(video, 3)
+    ops.avatar_from_video(filepath=video, focal=focal, python=sys.executable)
     settings = panel()
     out = tmp_path / "head avatar"
     assert settings.head[tags.CAPTURE] == str(out / "capture")
@@ -134,7 +139,7 @@ def test_from_a_video_to_splats_on_the_head(extension, tmp_path):
     pixels, *_ = extension.operators.monitor.curves[out / "run"]
     assert pixels.shape == (256, 256, 4)
     # Again: nothing is left to do but to show it
-    ops.avatar_from_video(filepath=video, minutes=0.05, python=sys.executable)
+    ops.avatar_from_video(filepath=video, focal=focal, python=sys.executable)
     heads = [thing for thing in bpy.data.objects if thing.get(tags.KIND) == tags.HEAD]
     assert heads == [settings.head]
     assert not get_input(settings.splats, splat_nodes.SHOW_UNSEEN)

@@ -133,10 +133,11 @@ def test_training_is_the_panels(stga, here, head, tmp_path):
     head.vertex_groups.new(name="stga_0").add(list(range(40)), 1.0, "REPLACE")
     painted = read_selection(head)
     save_and_open(tmp_path / "head.blend")
-    options = {"iterations": 8, "strategy": "selective", "seed": 3}
-    by_worker = {"wait": True, "python": sys.executable}
+    options = {"iterations": 8, "strategy": "selective", "seed": 3, "device": "cpu"}
+    by_worker = {"wait": True, "python": sys.executable, "effects": "relight=off"}
     ops.train(directory=tmp_path / "panel", **by_worker, **options)
     arguments = [item for name, value in options.items() for item in (f"--{name}", value)]
+    arguments += ["--effect", "relight=off"]
     assert here("train", "--out", tmp_path / "headless", *arguments) == 0
     assert stga("train", "--out", tmp_path / "delegated", *arguments) == 0
     runs = ("panel", "headless", "delegated")
@@ -154,7 +155,7 @@ def test_training_is_the_panels(stga, here, head, tmp_path):
 def test_an_avatar_from_footage(stga, take, tmp_path, capfd):
     """Catches a missing .blend file where the training Python has no Blender, or no links."""
     given = [take / "footage", "--model", take / "head.npz", "--landmarks", take / "points"]
-    more = ["--iterations", "4", "--effect", "tracking=on"]
+    more = ["--iterations", "4", "--effect", "tracking=on", "--effect", "relight=off"]
     assert stga("avatar", *given, "--out", tmp_path / "out", *more) == 0
     assert capfd.readouterr().out.splitlines()[-1] == f"blender: {tmp_path / 'out/avatar.blend'}"
     open_file(tmp_path / "out/avatar.blend")

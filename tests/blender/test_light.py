@@ -280,7 +280,7 @@ def test_estimate_light(extension, tmp_path):
     run = tmp_path / "run"
     scene = bpy.context.scene
     ops.import_capture(directory=write_mesh_capture(tmp_path / "capture"))
-    ops.train(directory=run, iterations=6)
+    ops.train(directory=run, iterations=6, device="cpu")
     trained = read_avatar(run / "avatar.npz")
     write_avatar(run / "avatar.npz", replace(trained, light=None))
     ops.show_avatar(filepath=run / "avatar.npz")

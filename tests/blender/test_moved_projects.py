@@ -46,17 +46,49 @@ def try_all(folder):
     ops.export_avatar(filepath=folder / "pair", format="gaussian-avatars")
 
 
+@pytest.mark.parametrize("home", ["", "link"])
 @pytest.mark.parametrize(("blend", "run"), [("head.blend", "//run"), ("shots/head.blend", None)])
-def test_a_project_is_moved_as_a_whole(tmp_path, blend, run):
+def test_a_project_is_moved_as_a_whole(tmp_path, blend, run, home):
     """Catches "OLD/capture: is not a folder" in Apply Motion, Measure, Select and exports of
-    motion; and a panel that offers no more training of a run that is there."""
-    old = make_project(tmp_path / "old", blend)
-    shutil.move(old, tmp_path / "new")
-    open_file(tmp_path / "new" / blend)
-    assert places(panel().head) == expected(tmp_path / "new")
-    assert panel().run_folder == (run or str(tmp_path / "new/run"))
+    motion; a panel that offers no more training of a run that is there; and another head, or a
+    lost capture, where a folder above is a link of the file system."""
+    (tmp_path / "link").symlink_to(tmp_path / "disk")
+    (tmp_path / "disk").mkdir()
+    new = tmp_path / home / "new"
+    shutil.move(make_project(tmp_path / home / "old", blend), new)
+    open_file(new / blend)
+    capture, *others = expected(new)
+    assert places(panel().head) == [capture.resolve(), *others]
+    assert panel().run_folder == (run or str(new / "run"))
     assert panel().holds_run
-    try_all(tmp_path / "new")
+    objects = set(bpy.data.objects.keys())
+    ops.import_capture(directory=new / "capture", flame=new / "flame.npz")
+    assert set(bpy.data.objects.keys()) == objects
+    try_all(new)
+
+
+@pytest.mark.parametrize("how", ["make local", "override"])
+def test_a_linked_head_leaves_a_file_that_has_moved(tmp_path, how):
+    """Catches the places of before the move in a head that was linked, and is now local or
+    overridden."""
+    project = make_project(tmp_path / "old")
+    name = panel().head.users_collection[0].name
+    shutil.move(project, tmp_path / "new")
+    bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
+    save(tmp_path / "film.blend")
+    bring(tmp_path / "new/shots/head.blend", "link", name)
+    if how == "override":
+        where = bpy.context.scene, bpy.context.view_layer
+        bpy.data.collections[name].override_hierarchy_create(*where, do_fully_editable=True)
+    for each in list(bpy.data.objects) if how == "make local" else ():
+        each.make_local()
+    own = [each for each in bpy.data.objects if tags.is_head(each) and each.library is None]
+    name = own[0].name
+    for _ in range(2):
+        assert places(own[0]) == expected(tmp_path / "new")
+        bpy.ops.wm.save_mainfile()
+        open_file(tmp_path / "film.blend")
+        own = [each for each in bpy.data.objects if each.name == name and each.library is None]
 
 
 def test_a_capture_that_was_moved_away_is_found_by_importing_it(tmp_path):

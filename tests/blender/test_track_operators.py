@@ -24,7 +24,8 @@ HEAD = HeadModel(small_head(0), "flame")
 
 def track(take, out, **more):
     paths = {"footage": "footage", "landmarks": "points", "model": "head.npz"}
-    paths = {name: str(take / path) for name, path in paths.items()} | {"directory": out}
+    paths = {name: str(take / path) for name, path in paths.items()}
+    paths |= {"directory": out, "mattes": "none"}
     return ops.track_footage(**paths | more, python=sys.executable)
 
 

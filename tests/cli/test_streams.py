@@ -17,6 +17,8 @@ from stga_addon.development.package import ROOT
 from stga_addon.progress import Progress
 
 STGA = f'"{sys.executable}" -m stga_addon'
+INFO = "stga info --device cpu"
+"""Without a look for graphics adapters, which takes as long as the rest of the command."""
 
 
 @pytest.fixture(scope="module")
@@ -37,7 +39,7 @@ def shell(command, **environment):
     )
 
 
-@pytest.mark.parametrize("command", ["info", "select", "presets --help"])
+@pytest.mark.parametrize("command", ["info --device cpu", "select", "presets --help"])
 def test_closed_pipe(capture, command):
     """Catches a traceback, or "Exception ignored", where the reader of a pipe has gone."""
     done = shell(f"stga {command} {capture} | head -c0")
@@ -47,11 +49,11 @@ def test_closed_pipe(capture, command):
 @pytest.mark.skipif(not os.path.exists("/dev/full"), reason="no /dev/full on this system")
 def test_full_device(capture):
     """Catches a traceback, and success although nothing could be printed."""
-    done = shell(f"stga info {capture} > /dev/full")
+    done = shell(f"{INFO} {capture} > /dev/full")
     assert done.returncode == 2
     assert done.stderr == "stga: standard output cannot be written (No space left on device)\n"
-    assert shell(f"stga info {capture} 2> /dev/full").returncode == 0
-    assert shell("stga info /none 2> /dev/full").returncode == 2
+    assert shell(f"{INFO} {capture} 2> /dev/full").returncode == 0
+    assert shell(f"{INFO} /none 2> /dev/full").returncode == 2
 
 
 @pytest.mark.parametrize(
@@ -60,10 +62,10 @@ def test_full_device(capture):
 def test_ascii_streams(tmp_path, environment):
     """Catches a UnicodeEncodeError for a folder's name, in the output and in an error."""
     capture = factory.write_mesh_capture(tmp_path / "Käthe−²")
-    done = shell(f"stga info {capture}", PYTHONUTF8="0", **environment)
+    done = shell(f"{INFO} {capture}", PYTHONUTF8="0", **environment)
     assert (done.returncode, done.stderr) == (0, "")
     assert "320 triangles" in done.stdout
-    done = shell(f"stga info {capture / 'none'}", PYTHONUTF8="0", **environment)
+    done = shell(f"{INFO} {capture / 'none'}", PYTHONUTF8="0", **environment)
     assert done.returncode == 2
     assert done.stderr.startswith("stga: ")
     assert "Traceback" not in done.stderr
@@ -76,9 +78,9 @@ import os, sys
 from stga_addon.cli.main import main
 capture, out = sys.argv[1:]
 train = ["train", capture, "--out", f"{out}/run", "--iterations", "2", "--strategy",
-    "gaussian-avatars"]
+    "gaussian-avatars", "--device", "cpu"]
 render = ["render", f"{out}/run", "--cameras", f"{capture}/transforms_val.json", "--out",
-    f"{out}/pictures"]
+    f"{out}/pictures", "--device", "cpu"]
 codes = [main(arguments) for arguments in (train, render, ["info", "/none"])]
 null = os.stat(os.devnull)
 assert codes == [0, 0, 2] and all(os.path.samestat(os.fstat(number), null) for number in range(3))
@@ -92,7 +94,7 @@ def test_closed_descriptors(capture, tmp_path):
     assert (tmp_path / "run/avatar.npz").exists()
     assert list((tmp_path / "pictures").glob("*.png"))
     for closed, folder, code in (("<&-", "/none", 2), (">&-", capture, 0), ("2>&-", "/none", 2)):
-        assert shell(f"stga info {folder} {closed}").returncode == code, closed
+        assert shell(f"{INFO} {folder} {closed}").returncode == code, closed
 
 
 def test_interrupted_training_keeps_its_exit_code(capture, tmp_path):
@@ -100,7 +102,7 @@ def test_interrupted_training_keeps_its_exit_code(capture, tmp_path):
     out = tmp_path / "run"
     command = [sys.executable, "-m", "stga_addon", "train", str(capture), "--out", str(out)]
     how = {"cwd": ROOT, "stdout": subprocess.DEVNULL, "stderr": subprocess.PIPE, "text": True}
-    process = subprocess.Popen([*command, "--budget", "60s"], **how)
+    process = subprocess.Popen([*command, "--budget", "60s", "--device", "cpu"], **how)
     end = time.monotonic() + 60
     while not (out / "run.json").exists() and time.monotonic() < end:
         time.sleep(0.1)
@@ -135,7 +137,7 @@ def test_a_tight_limit_of_addresses_is_said(capture):
     assert tight.returncode == 0
     said = "stga: warning: this process may have 3.1 GB of addresses (ulimit -v); expected 4 GB"
     assert tight.stderr.startswith(said)
-    assert "ulimit" not in shell(f"stga info {capture}").stderr
+    assert "ulimit" not in shell(f"{INFO} {capture}").stderr
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="names there are Unicode")

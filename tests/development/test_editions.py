@@ -166,7 +166,7 @@ def test_wheels_are_known_by_their_hash(tmp_path, monkeypatch, lock):
         collect_wheels(folder, LINUX)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.skipif(sys.platform != "linux", reason="only PyPI's torch for Linux needs CUDA")
 def test_only_when_told_to_does_a_zip_have_cuda(tmp_path, monkeypatch, capsys, lock):
     """Catches gigabytes that nothing uses, silent minutes, and a bare refusal."""

@@ -108,7 +108,7 @@ def test_a_head_without_eyeballs_has_its_pupils_before_the_eyes_joints(demo):
     assert np.median(norm(points[0] - points[1], axis=1)[used]) < 0.0005
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_points_agree_with_the_detector(shared_data):
     """Catches a registration that slides along the face: the networks' landmarks on pictures."""
     pytest.importorskip("cv2")
@@ -148,7 +148,7 @@ def test_directions(demo):
         assert sign * moved[axis] > 0.003, name
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_combinations_against_a_free_fit(rich):
     """Catches a map that adds up shapes wrongly: closed lips on an open jaw are among the poses."""
     sequence, found = rich

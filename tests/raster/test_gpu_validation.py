@@ -30,7 +30,7 @@ assert "libVkLayer_khronos_validation" in Path("/proc/self/maps").read_text()
 """
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.needs("adapter", "vulkan-validation")
 def test_vulkan_validation_has_nothing_to_say(device, toy_root, tmp_path):
     """Catches a race between dispatches, or a buffer's use, that one driver forgives and another

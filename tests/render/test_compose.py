@@ -112,7 +112,7 @@ def test_software_renders_by_name_only(adapter):
     assert Composer("gpu").choose() == f"gpu:{adapter}"
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.needs("adapter")
 def test_the_server_renders_on_the_wanted_device(adapter, monkeypatch):
     """Catches a server that renders on something else, or goes on with the device of before."""

@@ -123,6 +123,7 @@ def test_images_that_a_wrong_focal_length_loses(tmp_path, pictures, monkeypatch)
     assert begun[1:] == pytest.approx([walk(1)[0].fl_x], rel=0.05)
 
 
+@pytest.mark.nightly
 def test_many_photos_from_behind_ear_to_ear(tmp_path):
     """Catches photos in small steps, of which those that are looked at share no room."""
     photos = write_pictures(tmp_path / "photos", [picture(own) for own in walk(32, 200.0)])

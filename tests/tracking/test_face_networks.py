@@ -200,7 +200,7 @@ def test_a_known_head_seen_from_above_is_not_tilted(tmp_path, monkeypatch):
     def draw_nothing(vertices, seen_by):
         return np.zeros((512, 512, 3), np.uint8)
 
-    places = calibrate(head.model, FaceNetworks(), "head")
+    places = read_places(BUNDLED_PLACES, len(faces))
     monkeypatch.setattr(recorded, "calibrate", lambda *_: places)  # as both would find them
     fit = HeadFit(head, np.zeros(0), {}, HERE)
     tilts_deg = []

@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 from stga_addon.capture.camera import camera_from_gl
 from stga_addon.files import read_json, write_json
 from stga_addon.flame.forward import FlameFrame, flame_forward
+from stga_addon.tracking import focal_length
 from stga_addon.tracking.fit import HeadFit, RecordedTake, TimestepLandmarks
 from stga_addon.tracking.focal_length import estimated_focal
 from stga_addon.tracking.folder import describe_focal_length
@@ -139,6 +140,12 @@ def test_damaged_metadata(tmp_path):
     assert open_footage(tmp_path / "photo").focal == "usual"
 
 
+@pytest.fixture
+def few_landmarks(monkeypatch):
+    """Half as many landmarks are compared, which takes a quarter of the time."""
+    monkeypatch.setattr(focal_length, "LANDMARKS", 40)
+
+
 def turning(head, focal, turn_deg, size=(1080, 1920), count=30):
     """Places, and landmarks of a head that turns that far to either side 0.6 m before a camera.
 
@@ -201,6 +208,7 @@ def film(folder, head, turn_deg):
     write_points(folder / "points", places, {"phone": points})
 
 
+@pytest.mark.usefixtures("few_landmarks")
 def test_a_lens_that_nothing_tells_is_that_of_the_avatars_camera(tmp_path, head):
     """Catches the perspective of a phone where the person was filmed before, and another
     resolution taken for another lens."""
@@ -216,6 +224,7 @@ def test_a_lens_that_nothing_tells_is_that_of_the_avatars_camera(tmp_path, head)
     assert any("focal length is an estimate" in warning for warning in found.warnings)
 
 
+@pytest.mark.usefixtures("few_landmarks")
 def test_a_phones_video_is_decoded_once_and_its_lens_is_told(tmp_path, head, monkeypatch):
     """Catches a video that is decoded for each stage, backwards or by seeking, and an estimated
     focal length that the capture does not have."""

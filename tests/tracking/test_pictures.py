@@ -11,12 +11,12 @@ from PIL import Image
 from stga_addon.capture.camera import look_at
 from stga_addon.capture.model import View
 from stga_addon.tracking import pictures
-from stga_addon.tracking.correspondence import calibrate
 from stga_addon.tracking.face_networks import FaceNetworks
 from stga_addon.tracking.fit import RecordedTake
 from stga_addon.tracking.footage.model import Footage, FootageCamera, ImageFrames
 from stga_addon.tracking.footage.open import open_footage
 from stga_addon.tracking.head_model import read_head_model
+from stga_addon.tracking.landmarks import read_places
 from stga_addon.tracking.pictures import (
     COLUMNS,
     MESH_OPACITY,
@@ -24,6 +24,7 @@ from stga_addon.tracking.pictures import (
     PosedHead,
     write_contact_sheet,
 )
+from stga_addon.tracking.recorded import BUNDLED_PLACES
 
 from .head_video import write_head_video
 from .test_surface import rays_of
@@ -136,7 +137,7 @@ def test_first_frame_shows_the_head_where_it_is(tmp_path, monkeypatch):
     write_head_video(tmp_path / "head.mp4", 2)
     head = read_head_model(None)
     networks = FaceNetworks()
-    take = RecordedTake(*calibrate(head.model, networks, "head"), {})
+    take = RecordedTake(*read_places(BUNDLED_PLACES, len(head.model.faces)), {})
     shown = []
     draw = pictures.with_mesh
     for with_mesh in (draw, lambda picture, *_: picture):

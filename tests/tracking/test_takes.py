@@ -140,7 +140,7 @@ def test_a_talk_has_the_head_of_the_capture(tmp_path, head, without_surface, mon
     """Catches a take that makes a head of its own, so that the takes do not train together."""
     monkeypatch.setattr("stga_addon.tracking.seen.fit_dense", lambda *_, **__: None)
     meshes = record(tmp_path, head)
-    given = {"footage": tmp_path / "footage", "landmarks": tmp_path / "points"}
+    given = {"footage": tmp_path / "footage", "landmarks": tmp_path / "points", "mattes": "none"}
     rig, again = (tmp_path / name for name in ("rig", "again"))
     model = tmp_path / "head.npz"
     jobs.track(Track(model=model, out=rig, **given), ignore, lambda line: None)

@@ -50,8 +50,10 @@ def take(tmp_path_factory, head):
 
 
 @pytest.fixture
-def recorded(tmp_path, take, without_surface):
-    """A copy of the take that a test may change, and its meshes."""
+def recorded(tmp_path, take, without_surface, monkeypatch):
+    """A copy of the take that a test may change, and its meshes; contact sheets stay empty."""
+    sheet = "stga_addon.tracking.track.write_contact_sheet"
+    monkeypatch.setattr(sheet, lambda path, *_: path.touch())
     folder, meshes = take
     return shutil.copytree(folder, tmp_path, dirs_exist_ok=True), meshes
 
@@ -65,7 +67,7 @@ def command(folder, *more):
         "--landmarks",
         folder / "points",
     )
-    return stga("track", folder / "footage", *paths, *more)
+    return stga("track", folder / "footage", *paths, "--mattes none", *more)
 
 
 def assert_projects_as(capture, meshes, vertices, skipped=2):
@@ -385,6 +387,7 @@ def use_detector(monkeypatch, detector, places):
     monkeypatch.setattr("stga_addon.tracking.recorded.calibrate", lambda *_: calibrated)
 
 
+@pytest.mark.usefixtures("without_surface")
 def test_a_canceled_run_ends_as_an_unbroken_one(tmp_path, head, monkeypatch):
     """Catches landmarks in another precision on disk than in memory: the same track, with other
     numbers."""
@@ -503,6 +506,7 @@ def test_a_face_that_is_hardly_ever_found_is_no_capture(tmp_path, head, monkeypa
     assert any("no face at 3 of 5 timesteps" in warning for warning in found.warnings)
 
 
+@pytest.mark.usefixtures("without_surface")
 def test_pictures_of_a_head_are_tracked(tmp_path, head):
     """Catches a correspondence or a detector's convention that is off: everything from pixels,
     nothing given."""

@@ -14,7 +14,7 @@ from stga_addon.training.optimize.trainer import Trainer
 from stga_addon.training.schedule import view_order
 
 from .heads import write_head
-from .toys import quick_settings
+from .toys import few_renderings, quick_settings
 
 
 @pytest.fixture(autouse=True, scope="session")
@@ -34,6 +34,12 @@ def outsides():
     shared.__set_name__(Surface, "outside")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Surface, "outside", shared)
+        yield
+
+
+@pytest.fixture
+def hasty():
+    with few_renderings():
         yield
 
 

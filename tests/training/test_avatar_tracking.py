@@ -47,7 +47,7 @@ from stga_addon.training.run.metrics_log import read_metrics
 from stga_addon.training.run.session import train_run
 
 from .heads import TIMESTEPS, parameters_of, tracked_as, write_head
-from .toys import assert_same_run, quick_settings, run_of, stop_at
+from .toys import assert_same_run, few_renderings, quick_settings, run_of, stop_at
 
 NAMES = ("origin", "rotation", "scale")
 WHITE = np.ones(3, np.float32)
@@ -348,7 +348,8 @@ def test_the_gradient_from_splats_to_parameters(lost):
 def run_folder(lost, tmp_path_factory):
     """An unbroken run."""
     out = tmp_path_factory.mktemp("tracked") / "run"
-    train_run(lost[0], out, make_run(lost[0]))
+    with few_renderings():
+        train_run(lost[0], out, make_run(lost[0]))
     return out
 
 
@@ -364,7 +365,7 @@ def test_what_it_brings(lost, tmp_path):
     capture, true = lost
     quality = {}
     for on in (True, False):
-        train_run(capture, tmp_path / str(on), make_run(capture, tracking=on, iterations=300))
+        train_run(capture, tmp_path / str(on), make_run(capture, tracking=on, iterations=180))
         quality[on] = read_metrics(tmp_path / str(on))[-1]["psnr"]
     refined = with_refined_tracking(capture, tmp_path / "True")
     before = millimeters(capture, true)
@@ -441,6 +442,7 @@ def stop_in_tracking(turn):
     return report
 
 
+@pytest.mark.usefixtures("hasty")
 @pytest.mark.parametrize(
     "stops",
     [stop_at(31), stop_in_tracking(1), stop_in_tracking(2)],

@@ -352,13 +352,13 @@ def test_renders_with_the_average(toy):
 def test_stopped_and_resumed_is_the_unbroken_run(toy, tmp_path):
     """Catches coefficients, moments, averages or ages that a checkpoint of a GPU forgets, and sums
     in the order of chance: every bit must agree, across density control."""
-    effects = {"driven_offsets": tuple(OFFSETS)}
-    run = replace(make_run(squeezed(toy), "selective", iterations=10, **effects), device="gpu")
+    effects = {"driven_offsets": tuple(OFFSETS), "density_interval": 3}
+    run = replace(make_run(squeezed(toy), "selective", iterations=6, **effects), device="gpu")
     broken = tmp_path / "broken"
     whole = tmp_path / "whole"
     train_run(squeezed(toy), whole, run)
-    train_run(squeezed(toy), broken, run, report=stop_at(6))
-    assert read_checkpoint(broken).iteration == 6
+    train_run(squeezed(toy), broken, run, report=stop_at(4))
+    assert read_checkpoint(broken).iteration == 4
     train_run(squeezed(toy), broken, run, resume=True)
     assert_same_state(broken, whole)
     assert following(read_checkpoint(whole).state)["strain_color/steps"].max() > 3

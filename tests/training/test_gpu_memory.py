@@ -74,6 +74,7 @@ def per_item(measured):
     return np.linalg.solve(counts, [size for _, size in measured])[:3]
 
 
+@pytest.mark.nightly
 def test_memory_is_the_cpus_and_as_documented(toy, monkeypatch):
     """Catches a table added to the GPU's iterations, and figures in the documentation that no
     longer hold."""

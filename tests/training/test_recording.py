@@ -26,7 +26,6 @@ from stga_addon.tracking.folder import (
 )
 from stga_addon.training.effects.facts import CaptureFacts
 from stga_addon.training.effects.plan import depth_limits
-from stga_addon.training.optimize import avatar_tracking
 from stga_addon.training.optimize.avatar_tracking import (
     normal_images,
 )
@@ -107,6 +106,7 @@ def test_another_recording_is_tracked(recording, lost):
     assert len(fit.shape) == 4
 
 
+@pytest.mark.usefixtures("hasty")
 @pytest.mark.parametrize(("light_turns", "keeps_world"), [(0, False), (1, False), (0, True)])
 def test_the_world_is_turned_as_the_avatars_was(light_turns, keeps_world, recording, lost, person):
     """Catches colors that are looked up in other directions than training saw them from, a world
@@ -153,19 +153,13 @@ def test_the_world_is_turned_as_the_avatars_was(light_turns, keeps_world, record
     assert_allclose(found[:3, :3], expected, atol=1e-5)
 
 
-@pytest.fixture
-def hasty(monkeypatch):
-    """Searches of two renderings, for what does not depend on where they lead."""
-    for name in ("RENDERINGS", "RENDERINGS_AGAIN", "PYRAMID_RENDERINGS"):
-        monkeypatch.setattr(avatar_tracking, name, 2)
-
-
 def test_another_person_is_missed(recording, hasty):
     """Catches a misfit that is small whatever the images show."""
     run, root = recording
     for path in (root / "images").iterdir():
         Image.fromarray(np.asarray(Image.open(path))[..., [1, 2, 0]]).save(path)
-    assert np.median(track_recording(run, root, Helpers(1), ignore).misfit) > 0.4
+    found = track_recording(run, root, Helpers(1), ignore, keeps_world=True)
+    assert np.median(found.misfit) > 0.4
 
 
 def test_parts_of_another_avatar_are_not_taken(recording, tmp_path, monkeypatch):
@@ -188,7 +182,7 @@ def test_parts_of_another_avatar_are_not_taken(recording, tmp_path, monkeypatch)
         shutil.copytree(tmp_path / "start", root)
         os.utime(run / AVATAR, ns=(trained_ns, trained_ns))
         calls.clear()
-        track_recording(run, root, Helpers(1, tmp_path / "kept"), ignore)
+        track_recording(run, root, Helpers(1, tmp_path / "kept"), ignore, keeps_world=True)
         assert calls == expected
 
 

@@ -2,14 +2,17 @@
 
 import json
 import math
+from contextlib import contextmanager
 from dataclasses import replace
 
 import numpy as np
+import pytest
 from avatar.conftest import random_splats as random_avatar_splats
 from numpy.testing import assert_array_equal
 
 from stga_addon.files import read_npz
 from stga_addon.render.render import render
+from stga_addon.training.optimize import avatar_tracking
 from stga_addon.training.optimize.cpu_backend import CpuBackend
 from stga_addon.training.optimize.state import arrays_of, new_state
 from stga_addon.training.optimize.step_hook import Schedule
@@ -70,6 +73,15 @@ def one_camera(capture):
 
 def iteration_of(progress):
     return progress.figures().get("iteration", 0)
+
+
+@contextmanager
+def few_renderings():
+    """Searches of two renderings, for what does not depend on where tracking leads."""
+    with pytest.MonkeyPatch.context() as patch:
+        for name in ("RENDERINGS", "RENDERINGS_AGAIN", "PYRAMID_RENDERINGS"):
+            patch.setattr(avatar_tracking, name, 2)
+        yield
 
 
 def stop_at(iteration):

@@ -70,7 +70,7 @@ def test_one_run(toy, tmp_path, monkeypatch):
     assert "nowhere" in json.loads(replies.getvalue())["error"]
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_a_slice_is_stopped_and_goes_on(toy, tmp_path, monkeypatch):
     """Catches training lost to Ctrl-C or done twice, and files that are missing at the end."""
     monkeypatch.setattr(variants, "MAIN_VARIANTS", VARIANTS)
@@ -169,7 +169,7 @@ def test_variants():
     assert list(select_variants(MAIN_VARIANTS, ["final", "draft"])) == ["draft", "final"]
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_slices_are_jobs_of_a_batch(toy_root, tmp_path, capsys, monkeypatch):
     """Catches seeds that are no jobs, a finished one trained again, and no word of one."""
     out = str(tmp_path / "out")

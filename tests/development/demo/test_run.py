@@ -49,7 +49,7 @@ def test_demo(tmp_path, monkeypatch):
     plays another performance than its file, or without the keyframes over it."""
     monkeypatch.setattr(run, "unpack_capture", unpack_few)
     demo = tmp_path / "demo"
-    run.run_demo(demo, {"iterations": 60}, with_shot=True)
+    run.run_demo(demo, {"iterations": 24}, with_shot=True)
     metrics = json.loads((demo / "metrics.json").read_text())
     assert metrics["blender_position_error_m"] < 1e-5
     # Far above what the untrained gray lattice reaches on these images (about 15 dB).

@@ -30,14 +30,15 @@ pytestmark = pytest.mark.needs("node")
 COLORS = {name for name, offset in OFFSETS.items() if offset.target == COLOR}
 
 
-def evaluated(data, folder):
-    """What evaluate.mjs makes of a data file."""
-    (folder / "a.glb").write_bytes(data)
-    script = Path(__file__).with_name("evaluate.mjs")
-    command = ["node", script, PLAYER, folder / "a.glb"]
+def evaluated(folder, *files):
+    """What evaluate.mjs makes of data files, in one process."""
+    paths = [folder / f"{number}.glb" for number in range(len(files))]
+    for path, data in zip(paths, files, strict=True):
+        path.write_bytes(data)
+    command = ["node", Path(__file__).with_name("evaluate.mjs"), PLAYER, *paths]
     done = subprocess.run(command, capture_output=True, timeout=120)
     assert not done.stderr, done.stderr.decode()
-    return dict(json.loads(done.stdout))
+    return [dict(json.loads(line)) for line in done.stdout.splitlines()]
 
 
 def colors(result):
@@ -51,7 +52,7 @@ def test_pose_is_flames(head, baked, tmp_path):
     """Catches a joint, corrective, offset or rotation of the player that is not FLAME's, and splats
     blended in the wrong order, left out or drawn twice."""
     rig = baked_rig(list(head.meshes)) if baked else head.rig
-    results = evaluated(head.data(rig, exact=True), tmp_path)["results"]
+    results = evaluated(tmp_path, head.data(rig, exact=True))[0]["results"]
     for mesh, result in zip(head.meshes, results, strict=True):
         assert np.abs(np.reshape(result["vertices"], (-1, 3)) - mesh).max() < 6e-6
         splats = head.avatar.splats.rows(np.argsort(head.avatar.splats.face, kind="stable"))
@@ -69,7 +70,7 @@ def test_a_head_at_rest_stays_where_it_is(tmp_path):
         faces = head.avatar.faces
         avatar = replace(head.avatar, strain_range=trained_range(len(faces)))
         data = skinned_glb(RiggedAvatar(avatar, baked_rig([neutral])), Playback(), exact=True)
-        [result] = evaluated(data, tmp_path)["results"]
+        [result] = evaluated(tmp_path, data)[0]["results"]
         assert np.abs(colors(result)).max() < 1e-5
         assert np.abs(np.reshape(result["vertices"], (-1, 3)) - neutral).max() < 1e-6
         origin = np.reshape(result["frames"], (-1, 3, 4))[..., 3]
@@ -81,7 +82,7 @@ def test_a_head_at_rest_stays_where_it_is(tmp_path):
 def test_frames_and_signals_are_the_embedding(convention, offsets, tmp_path):
     """Catches another axis, scale, sliver rule, strain or light than splats were trained with."""
     head = make_head(convention, offsets=offsets)
-    results = evaluated(head.data(exact=True), tmp_path)["results"]
+    results = evaluated(tmp_path, head.data(exact=True))[0]["results"]
     for mesh, result in zip(head.meshes, results, strict=True):
         expected = head.avatar.frames(mesh)
         found = np.reshape(result["frames"], (-1, 3, 4))
@@ -116,7 +117,7 @@ def test_smoothed_strain_where_edges_have_any_number_of_triangles(tmp_path):
     meshes = [neutral, neutral * [0.9, 1.0, 1.1], neutral + rng.normal(0, 0.01, neutral.shape)]
     meshes.append(0 * neutral)
     data = skinned_glb(RiggedAvatar(avatar, baked_rig(meshes)), Playback(), exact=True)
-    for mesh, result in zip(meshes, evaluated(data, tmp_path)["results"], strict=True):
+    for mesh, result in zip(meshes, evaluated(tmp_path, data)[0]["results"], strict=True):
         origin = np.reshape(result["frames"], (-1, 3, 4))[..., 3]
         frames = avatar.frames(mesh)
         assert np.abs(origin - frames.origin).max() < 1e-5 or not mesh.any()
@@ -179,8 +180,9 @@ def test_damaged_files_are_refused_in_one_sentence(head, tmp_path):
     ]:
         sentence = f"damaged: {field} is missing or malformed."
         altered.append((with_header(whole, *keys, value=value), sentence))
-    for data, sentence in altered:
-        error = evaluated(data, tmp_path).get("error", "")
+    results = evaluated(tmp_path, *(data for data, _ in altered))
+    for result, (_, sentence) in zip(results, altered, strict=True):
+        error = result.get("error", "")
         assert error.startswith("DataError: ")
         assert sentence in error
         assert error.endswith(".")
