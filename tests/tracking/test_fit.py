@@ -236,7 +236,7 @@ def test_one_camera_keeps_the_size_of_the_head(head):
         assert np.median(norm(away, axis=1)) < 12  # of a face of 300 pixels
 
 
-@pytest.mark.parametrize("focal", [900.0, 5500.0])
+@pytest.mark.parametrize("focal", [900.0, 2000.0, 3500.0, 5500.0])
 def test_one_camera_keeps_the_distance_between_the_eyes(focal):
     """Catches an identity that makes the head smaller, so that it passes nearer to the rays of
     landmarks that a detector misses by 1.5 mm in all timesteps alike: a real man's eyes were 38 mm
