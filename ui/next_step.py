@@ -35,8 +35,8 @@ from .train_panel import (
 )
 
 FILM_MORE = (
-    "Blue was not filmed, but is plausible. To have it as it is: film once around the person, who "
-    "keeps still, and make the avatar from both videos"
+    "Blue parts were not filmed; their colors are guesses. To capture them, film once around the "
+    "person, who keeps still, and make the avatar from both videos"
 )
 GO_ON = "Go on working, save, or quit Blender"
 
@@ -50,7 +50,7 @@ class NextStepPanel(SidebarPanel, bpy.types.Panel):
         scene = context.scene
         _draw_message(layout, context)
         if draw_running(layout, context, Kind.AVATAR):
-            draw_text(layout, context, f"Head, then splats appear. {GO_ON}", "INFO")
+            draw_text(layout, context, f"The head appears first, then splats. {GO_ON}", "INFO")
             return
         making = monitor.state_of(scene, Kind.AVATAR)
         if making.subject is not None:
@@ -62,7 +62,7 @@ class NextStepPanel(SidebarPanel, bpy.types.Panel):
         tracking = monitor.state_of(scene, Kind.TRACKING)
         if tracking.is_running:
             done = f"Tracking, {100 * tracking.snapshot.status.progress:.0f} %"
-            draw_text(layout, context, f"{done}: the head is imported when it is done. {GO_ON}")
+            draw_text(layout, context, f"{done}: the head is imported at the end. {GO_ON}")
         elif not is_head(settings.head) and settings.splats is None:
             tracked = "a tracked head, its cameras and their images"
             has_demo = OpenDemo.poll(context)
@@ -81,7 +81,7 @@ class NextStepPanel(SidebarPanel, bpy.types.Panel):
                 shot.shot = True
         elif monitor.state_of(scene, Kind.TRAINING).is_running:
             appear = "splats appear on the head soon"
-            done = appear if settings.splats is None else "the splats follow as it goes on"
+            done = appear if settings.splats is None else "the splats improve as it goes on"
             draw_text(layout, context, f"Training: {done}. {GO_ON}")
         elif settings.splats is not None:
             _draw_what_to_try(layout, context, settings)
@@ -97,7 +97,7 @@ class NextStepPanel(SidebarPanel, bpy.types.Panel):
 
 
 def _draw_training(layout: Any, context: Any, settings: Any) -> None:
-    """Draw the button that trains; where the last training was refused, why."""
+    """Draw why the last training failed, then the button that repairs or trains."""
     last = monitor.state_of(context.scene, Kind.TRAINING).snapshot
     if last.state.failed:
         draw_text(layout, context, last.status.error, "ERROR")

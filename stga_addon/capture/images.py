@@ -22,10 +22,10 @@ from .model import View
 
 WHITE_LEVEL = 247
 """Level of all channels from which a pixel without a mask counts as a white background."""
-MIN_LEFT_OUT = 0.02
-"""Fraction of the pixels that an inverted mask leaves out at least."""
-MIN_BORDER_INSIDE = 0.95
-"""Fraction of the image's upper border that lies in an inverted mask."""
+MIN_DARK_FRACTION = 0.02
+"""Least fraction of dark pixels in an inverted mask."""
+MIN_BRIGHT_BORDER = 0.95
+"""Least fraction of bright pixels along an inverted mask's upper border."""
 FORMATS = ("PNG", "JPEG", "WEBP", "TIFF", "BMP")
 """Pillow opens more than these, some by running other programs."""
 ORIENTATION_TAG = 0x0112
@@ -138,15 +138,15 @@ def is_labeled(mask: np.ndarray) -> bool:
     return bool(is_two and (level == 1 or is_background.any()))
 
 
-def is_inside_out(mask: np.ndarray) -> bool:
-    """Whether a stored mask (H, W) is inverted. An inverted mask is bright along the top and the
-    upper half of the sides of the image, and dark in the middle of its dark region."""
-    inside = mask > mask.max(initial=0) // 2
-    rows, columns = np.nonzero(~inside)
-    if len(rows) < MIN_LEFT_OUT * inside.size:
+def is_inverted(mask: np.ndarray) -> bool:
+    """Whether a stored mask (H, W) is inverted: bright along the top and the upper half of the
+    sides, and dark at the median row and column of its dark pixels."""
+    bright = mask > mask.max(initial=0) // 2
+    rows, columns = np.nonzero(~bright)
+    if len(rows) < MIN_DARK_FRACTION * bright.size:
         return False
-    middle = inside[int(np.median(rows)), int(np.median(columns))]
-    return bool(upper_border(inside).mean() >= MIN_BORDER_INSIDE and not middle)
+    middle = bright[int(np.median(rows)), int(np.median(columns))]
+    return bool(upper_border(bright).mean() >= MIN_BRIGHT_BORDER and not middle)
 
 
 def upper_border(mask: np.ndarray) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""When the rows of a recording are: timecodes, and numbers of seconds, their parts, or frames."""
+"""Times of a recording's rows: timecodes, or numbers of seconds, their parts or frames."""
 
 import re
 from collections.abc import Mapping, Sequence
@@ -430,10 +430,10 @@ def _unevenness(times: np.ndarray) -> float:
 
 
 def evened(times: np.ndarray) -> tuple[np.ndarray, float]:
-    """Ascending times (T,) from 0, and how many rows a second there are where none is missing.
+    """Times (T,) in seconds, ascending from 0, and the rate in rows a second, gaps ignored.
 
-    Where rows come evenly but for rounding, as whole milliseconds are, times are those of even
-    rows, at a standard rate where that agrees as well.
+    Rows that are even but for rounding, as to milliseconds, get even times, at a standard rate if
+    that fits.
     """
     if len(times) < 2:
         return times, DEFAULT_FPS

@@ -25,7 +25,7 @@ from ..files import CHANGED_LINE_ENDS, line_ends_changed, read_bytes
 MAX_FILE_BYTES = 2 << 30
 MAX_DENSE_ELEMENTS = 1 << 22  # Elements of a sparse matrix; FLAME's joint regressor has 25,115
 MAX_LISTED = 1 << 18  # Values in lists; FLAME has 29,928 corners of triangles
-MAX_OPCODES = 1 << 20  # FLAME has some 200,000; an opcode of a byte may make an object of 216
+MAX_OPCODES = 1 << 20  # FLAME has some 200,000; one of a byte may make an object of 216 bytes
 MAX_DEPTH = 32  # Largest depth of nested tuples, and of nested lists
 SPARSE_CLASS = re.compile(
     r"scipy\.sparse(\._?(csc|csr|coo))?\.(?P<format>csc|csr|coo)_(matrix|array)"
@@ -240,8 +240,8 @@ def _dense(value: Any) -> np.ndarray:
 
 
 def _leaf(value: Any) -> np.ndarray:
-    """The array that a value stores itself. Parts of matrices are such: what refers to others that
-    refer to others could take for ever."""
+    """The array in a value that refers to no other value. Parts of matrices must be such: chains of
+    references could take for ever."""
     source = value.source if isinstance(value, _Inert) else type(value).__name__
     if source == ARRAY:
         if not isinstance(value.state, tuple) or len(value.state) < 4:

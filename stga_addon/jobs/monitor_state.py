@@ -76,12 +76,12 @@ class RequestState:
 
     @property
     def place(self) -> Path:
-        """Where what the request makes is now."""
+        """Folder of what the request makes."""
         return self.folder_path.parent
 
     @property
     def run(self) -> Path:
-        """Where the run of one that trains is now."""
+        """Folder of the run that it trains."""
         return self.place / RUN_FOLDER if self.kind == Kind.AVATAR else self.place
 
     @property
@@ -137,7 +137,7 @@ class Dismissed:
 
 @dataclass(frozen=True)
 class SceneRead:
-    """What is stored in the scene now: an undo step may have taken it back."""
+    """What the scene stores. What an undo step took back is stored again."""
 
     subject: Path | None
     result_shown: bool
@@ -156,7 +156,7 @@ class StatusRead:
 
 @dataclass(frozen=True)
 class SceneFree:
-    """What the result changes can be changed: no rendering, nothing of it in Edit Mode."""
+    """The result can be shown: nothing renders, and none of its objects is in Edit Mode."""
 
 
 @dataclass(frozen=True)
@@ -275,8 +275,8 @@ def transition(state: RequestState, event: Event) -> Outcome:
         case Dismissed():
             return _forgotten(state)
         case SceneRead(subject, result_shown):
-            in_step = (subject, result_shown) == (state.subject, state.result_shown)
-            return state, () if in_step else _stored(state)
+            is_stored = (subject, result_shown) == (state.subject, state.result_shown)
+            return state, () if is_stored else _stored(state)
         case StatusRead():
             return _status_read(state, event)
         case SceneFree():

@@ -39,8 +39,8 @@ GAP_M = 0.1
 
 
 def frame_head(head: Any, camera: Any, screens: Iterable[Any]) -> None:
-    """Let 3D viewports look at the head from the side of `camera`, or from the front where it is
-    None; not those that look through a camera. The dashed lines to parents are hidden."""
+    """Turn 3D viewports to the head, in the direction of `camera` or, if None, from the front;
+    viewports through a camera stay. All hide the dashed lines to parents."""
     matrix = head.matrix_world
     vertices = evaluated_vertices(head)
     low = matrix @ Vector(vertices.min(0))
@@ -54,7 +54,7 @@ def frame_head(head: Any, camera: Any, screens: Iterable[Any]) -> None:
         if region.view_perspective == "CAMERA":
             continue
         region.view_perspective = "PERSP"
-        # Without a turn, a camera looks along -z with +y up: at the front of FLAME's heads.
+        # Unrotated, a camera looks along -z with +y up: at the front of FLAME's heads.
         region.view_rotation = (camera or head).matrix_world.to_quaternion()
         region.view_location = center
         region.view_distance = DISTANCE * radius

@@ -1,4 +1,4 @@
-"""Appearance of a head's surface points: sampled in image pyramids, without lighting, averaged."""
+"""Texture of a head's surface points: sampled in image pyramids, averaged without lighting."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -20,9 +20,9 @@ COLORS = np.array([[0.299, 0.587, 0.114], [0.8, -0.8, 0.0]], np.float32)
 CHANNEL_WEIGHTS = np.array([0.5, 1.5, 0.7])
 """Weights of luma, detail and redness."""
 NOISE_LEVELS = 6.0
-"""Standard deviation, of 255, of a pixel from the texture on skin that is followed exactly."""
+"""Standard deviation, of 255, of skin's pixels from the texture where tracking is exact."""
 LIGHT_PRIOR = 0.02
-"""Weight of the camera's mean lighting in a view's, as a fraction of the points' information."""
+"""Weight of the prior light, as a fraction of that of the points."""
 LIGHT_ITERATIONS = 2
 """Reweighted least squares fits of the light."""
 TEXTURE_ITERATIONS = 4
@@ -34,7 +34,7 @@ ALBEDO_SCALE = 6 * NOISE_LEVELS
 TEXTURE_SCALE = 4 * NOISE_LEVELS
 """The same for the difference from the texture while it is being averaged."""
 LIGHT_SCALE = 2 * NOISE_LEVELS
-"""The same for the difference from the texture where the light is fitted."""
+"""Difference from what the fitted light predicts, in levels, beyond which pixels are outliers."""
 MEAN_SCALE = 3 * NOISE_LEVELS
 """The same for the difference from a mean."""
 MIN_SHADING = 0.2
@@ -269,8 +269,8 @@ def fitted_light(
     expected: np.ndarray,
     scale: float = LIGHT_SCALE,
 ) -> np.ndarray:
-    """(9,) lighting under which the texture's luma (N, 3) gives that of a view (N, 3): values ≈
-    texture · basis light.
+    """(9,) lighting with which a texture has a view's luma, each column 0 of (N, 3): values ≈
+    texture · (basis @ light).
 
     basis (N, 9), weight (N,); expected (9,): the prior. Robust beyond `scale` levels.
     """

@@ -1,12 +1,12 @@
 """The torso's surface as it bends: cloth wrinkles and slides, which a rigid torso cannot follow.
 
-FLAME ends in a ring of shoulders of a hand's width. Splats on clothes that hang on such a ring can
-only move as one. Its end is drawn out over the torso as far as cameras see it: then its triangles
-lie where the splats are, and its vertices can bend them.
+FLAME's mesh ends in shoulders that are a hand wide, on which splats of clothes could only move as
+one. Its edge is stretched over the torso as far as cameras see it: then triangles lie where the
+splats are, and vertices can bend them.
 
-Each image is brought back to where one timestep shows the torso. Optical flow between the two shows
-what its motion so far misses, and the vertices of its sheet move by that, of all cameras together
-and smoothly.
+Each image is warped to a reference timestep. Optical flow between the two measures what the torso's
+motion so far misses, and the vertices of its sheet move by that, of all cameras together and
+smoothly.
 """
 
 from collections.abc import Mapping, Sequence
@@ -58,7 +58,7 @@ DEPTH_SIGMA_M = 0.02
 MIN_WEIGHT = 0.5
 """Sum of weights from which the surface is observed."""
 DIRECTIONS_RAD = np.radians(np.arange(-80, 81, 5))
-"""Directions from the base of the neck, seen from the front: from straight down to the person's
+"""Directions from the base of the neck, seen from the front: 0 is down, positive the person's
 left."""
 SLOPE = 0.8
 """Factor on the angle around the neck, because shoulders slope down."""
@@ -119,9 +119,10 @@ def draped(sheet: TorsoSheet, at: np.ndarray, points: np.ndarray) -> np.ndarray:
     """Where the sheet's vertices (N, 3) lie when it is drawn over the surface that points (P, 3)
     show.
 
-    Both in the torso's axes, from the base of the neck: x to the person's left, y up, z forward.
-    What lies around the neck, from its front to its sides, is unrolled as seen from the front, from
-    straight down to the shoulders. Vertices where nothing is seen, as at the back, stay.
+    Both in meters along the torso's axes, from the base of the neck: x to the person's left, y up,
+    z forward. The ring around the neck is unrolled into the plane of these x and y: its front
+    straight down, its sides toward the shoulders. Vertices where nothing is seen, as at the back,
+    stay.
     """
     from scipy.ndimage import gaussian_filter1d
 
@@ -138,10 +139,11 @@ def draped(sheet: TorsoSheet, at: np.ndarray, points: np.ndarray) -> np.ndarray:
     sure = gaussian_filter1d(seen, DIRECTION_SIGMA, mode="constant")
     found = gaussian_filter1d(found, DIRECTION_SIGMA, mode="constant") / np.maximum(sure, 1e-6)
     around = SLOPE * np.arctan2(at[:, 0], at[:, 2])
-    directions = (np.interp(around, DIRECTIONS_RAD, own, 0, 0) for own in (seen, found, sure))
-    known, farthest, fraction = directions
-    trust = np.where(known > 0.5, fraction, 0.0)
-    outer = farthest[:, None] * np.stack([np.sin(around), -np.cos(around)], axis=1)
+    is_seen, reach_m, certainty = (
+        np.interp(around, DIRECTIONS_RAD, own, 0, 0) for own in (seen, found, sure)
+    )
+    trust = np.where(is_seen > 0.5, certainty, 0.0)
+    outer = reach_m[:, None] * np.stack([np.sin(around), -np.cos(around)], axis=1)
     flat = at[:, :2] + sheet.height[:, None] * (outer - at[:, :2])
     near = np.exp(-((flat[:, None] - points[:, :2]) ** 2).sum(2) / (2 * DEPTH_SIGMA_M**2))
     weight = near.sum(1)

@@ -17,10 +17,10 @@ pixels show too little."""
 
 
 def view_order(views: Sequence[View], per_visit: int, seed: int, start: int = 0) -> Iterator[View]:
-    """Endless random order of views, from position `start` on.
+    """Endless random order of views, without the first `start`.
 
-    Views of a frame are visited in groups of `per_visit` (0: all of them, the paper's batches; 1:
-    fully shuffled), and the groups in random order. Epoch e depends on (seed, e) alone, so a
+    Views of a timestep are visited in groups of `per_visit` (0: all of them, the paper's batches;
+    1: fully shuffled), and the groups in random order. Epoch e depends on (seed, e) alone, so a
     resumed run continues the same order.
     """
     frames = views_by_timestep(views)
@@ -65,7 +65,8 @@ def learning_rates(rates: Rates, progress: float) -> dict[str, float]:
 
 
 def image_scales(settings: TrainingSettings, views: Sequence[View]) -> tuple[float, float]:
-    """Size of images during `coarse_share` of the budget and afterwards, of the captured."""
+    """Image scales during `coarse_share` of the budget and afterwards, as fractions of the captured
+    size."""
     least = min(min(view.camera.width, view.camera.height) for view in views)
     is_large = COARSE_SCALE * settings.scale * least >= MIN_COARSE_SIDE_PX
     return settings.scale * (COARSE_SCALE if is_large else 1.0), settings.scale

@@ -68,15 +68,15 @@ PARTS = (
 )
 """(surface, first and last vertex of ICT-FaceKit's)"""
 
-# Heights are above the eyes.
+# Heights are in ICT-FaceKit's axes.
 LIP_LINE_CM = -3.35
 """Height of the line on which the lips meet."""
 LIP_HALF_WIDTH_CM = 2.35
 """Distance of the mouth's corners from its middle."""
 UPPER_LIP_CM = 0.98
-"""Height of the upper lip in its middle, without the dip of the Cupid's bow."""
+"""Thickness of the upper lip in its middle, without the dip of the Cupid's bow."""
 LOWER_LIP_CM = 1.28
-"""Height of the lower lip in its middle."""
+"""Thickness of the lower lip in its middle."""
 
 NECKLINE_CM = -10.6
 """Height on the axis of the head above which there is no cloth."""

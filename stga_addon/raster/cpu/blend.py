@@ -1,8 +1,8 @@
 """Alpha blending of the splats of each 16×16 tile, forward and backward.
 
-A pixel takes splats front to back and stops before the one whose transmittance would be ≤ 1e-4. The
-forward stores each pixel's last contributing pair and the backward obeys it, so transmittance never
-underflows behind many opaque splats.
+A pixel takes splats front to back and stops before the one that would leave ≤ 1e-4 transmittance.
+The forward stores each pixel's last contributing pair and the backward obeys it, so transmittance
+never underflows behind many opaque splats.
 
 The unit of work is a block of 4×4 pixels that a splat reaches. The blocks of several splats are
 listed first, and each step then is one loop over the list: loops over the pixels of one splat are
@@ -28,8 +28,7 @@ MAX_ALPHA = np.float32(0.999)
 MIN_ALPHA = np.float32(1 / 255)
 """Alpha of one step of 8 bits: below, a splat adds nothing to a pixel."""
 MIN_TRANSMITTANCE = np.float32(1e-4)
-"""A pixel is finished before the splat after which it would have no more transmittance than
-this."""
+"""Least transmittance of a pixel: it stops before the splat that would leave no more."""
 LOG2E = np.float32(1.4426950408889634)
 """log₂ e, which makes e^x a power of 2: e^x = 2^(x · log₂ e)."""
 SIDE = 4
@@ -70,7 +69,7 @@ V_BLUE = SUM_BLUE
     np.uint64(8 * PIXELS + n * LISTED * BLOCK_PIXELS) for n in range(7)
 )  # fmt: skip
 # Column c of a batch's splat q lies at c·BATCH_PAIRS + q of a flat array. The blocks that the batch
-# reaches are computed in vectors.
+# reaches are found in vectors for that.
 (AT_MEAN_X, AT_MEAN_Y, AT_PRECISION_X, AT_SHEAR, AT_PRECISION_Y, AT_OPACITY, AT_RED, AT_GREEN,
  AT_BLUE, AT_EXTENT_Y, AT_RATE_X, AT_RATE_Y, AT_BLOCKS) = (
     np.uint64(n * BATCH_PAIRS) for n in range(13))  # fmt: skip
@@ -168,7 +167,7 @@ def rows_within(outline, left, width, rows):
 
 @part_jit
 def _find_blocks(count, batch):
-    """Which blocks of the tile a batch's splats reach, a bit each."""
+    """Set AT_BLOCKS to the blocks of the tile that each splat of a batch reaches, a bit each."""
     rows = np.float32(TILE)
     side = np.float32(SIDE)
     one = np.int32(1)

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from ...capture.camera import camera_from_gl, scaled_to
-from ...capture.images import image_size, is_inside_out, is_turned, stored_mask
+from ...capture.images import image_size, is_inverted, is_turned, stored_mask
 from ...capture.lens import Lens, Undistortion, undistortion
 from ...capture.model import View, evenly_spread
 from ...capture.transforms import IMAGE_SUFFIXES, VIDEO_SUFFIXES
@@ -120,7 +120,7 @@ def _masks_as_meant(footage: Footage) -> Footage:
     ]
     measured = evenly_spread(masks, MAX_MEASURED_MASKS)
     try:
-        if not measured or not all(is_inside_out(stored_mask(view)) for view in measured):
+        if not measured or not all(is_inverted(stored_mask(view)) for view in measured):
             return footage
     except StgaError:  # what needs the file says so
         return footage

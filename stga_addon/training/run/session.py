@@ -78,12 +78,12 @@ LEFT_OUT_INTERVAL = 12
 """Every how many timesteps one is left out of that tracking where no camera is held out."""
 LEFT_OUT_VIEWS = 24
 """Views that decide whether the tracking is kept."""
-MIN_NEIGHBORS = 3
-"""Tracked timesteps around a left-out one without which it decides nothing."""
+MIN_TIMESTEPS_TO_LEAVE_OUT = 3
+"""Timesteps of the training from which on some are left out."""
 UNCHECKED = (
-    "no held-out view shows a timestep that is trained, and none of these lies between others"
+    "no held-out view shows a trained timestep, and no trained timestep lies between two others"
 )
-"""Why a tracking that nothing checked is not kept."""
+"""Why a tracking is kept unchecked."""
 SET_ASIDE = {AVATAR: "avatar_to_resume.npz", TRACKING: "tracking_to_resume.npz"}
 """Files of a stopped run that belong to its evaluation -> those that an unbroken run would have,
 put back when it is resumed."""
@@ -295,7 +295,7 @@ class _Session:
                         self.losses.append(loss)
                 if tracking is not None and self._refinement_is_due():
                     begin = perf_counter()
-                    self._refine(tracking)
+                    self._track_training_timesteps(tracking)
                     self.elapsed_s += perf_counter() - begin
                     if not tracking.rounds:
                         break
@@ -406,9 +406,9 @@ class _Session:
         limits = DEFAULT_LIMITS._replace(readers=image_readers(self.run.device))
         return ViewLoader(order, scale, settings.background_levels, limits, prepare, mesh=mesh)
 
-    def _refine(self, tracking: RefinedTracking) -> None:
-        """Let the avatar track the training timesteps; undone where views that are left out of it
-        do not gain."""
+    def _track_training_timesteps(self, tracking: RefinedTracking) -> None:
+        """Let the avatar track the training timesteps; undo it where views that are left out of the
+        tracking gain nothing."""
         views = self.capture.views["train"]
         before = tracking.parameters
         timesteps = sorted({view.timestep for view in views})
@@ -416,12 +416,12 @@ class _Session:
             view for view in self.capture.views.get("val", ()) if view.timestep in timesteps
         ]
         tracked = timesteps
-        has_neighbors = len(timesteps) >= MIN_NEIGHBORS
-        if not left_out and has_neighbors and is_in_order(self.capture.root) is not False:
+        has_enough = len(timesteps) >= MIN_TIMESTEPS_TO_LEAVE_OUT
+        if not left_out and has_enough and is_in_order(self.capture.root) is not False:
             middle = min(LEFT_OUT_INTERVAL, len(timesteps)) // 2
-            between = timesteps[middle::LEFT_OUT_INTERVAL]
-            left_out = [view for view in views if view.timestep in between]
-            tracked = [timestep for timestep in timesteps if timestep not in between]
+            unused = timesteps[middle:-1:LEFT_OUT_INTERVAL]  # each between two others
+            left_out = [view for view in views if view.timestep in unused]
+            tracked = [timestep for timestep in timesteps if timestep not in unused]
         left_out = evenly_spread(left_out, LEFT_OUT_VIEWS)
         error = self._squared_error(left_out)
         capture = replace(self.capture, views={"train": views})
