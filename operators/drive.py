@@ -90,7 +90,7 @@ class MeasureRange(Edit, bpy.types.Operator):
     on"""
 
     bl_label = "Measure Trained Range"
-    needs = (common.needs_rig,)
+    needs = (common.needs_rig, common.needs_own_head)
 
     def run(self, context: Any) -> None:
         head = head_of(context)

@@ -486,7 +486,8 @@ class ExportCameras(Action, bpy.types.Operator, FileExport):
         objects = context.selected_objects if self.selected_only else context.scene.objects
         cameras = [thing for thing in objects if thing.type == "CAMERA"]
         path = file_path(self.filepath, "export")
-        count = export_cameras(path, cameras, context.evaluated_depsgraph_get())
+        with kept_evaluated(cameras):
+            count = export_cameras(path, cameras, context.evaluated_depsgraph_get())
         self.inform(f"Exported {count} cameras to {path}")
 
 

@@ -214,6 +214,15 @@ def check_keyable(owner: Any) -> None:
         raise StgaError(f"{owner.name}: is in tweak mode in the NLA editor; leave tweak mode first")
 
 
+def check_own_action(owner: Any) -> None:
+    """Raise StgaError where keyframes cannot be added to the action of `owner`."""
+    check_keyable(owner)
+    action = owner.animation_data.action if owner.animation_data is not None else None
+    if owner.library is not None or (action is not None and action.library is not None):
+        remedy = "Apply Motion gives it keyframes of this file"
+        raise StgaError(f"{owner.name}: has its keyframes in another file; {remedy}")
+
+
 class Placement(NamedTuple):
     """Where keyframes of a motion go. start: the first frame; name: of the motion, which new
     actions get; parts: of PARTS, those that are replaced; as_strip: into a strip of the NLA editor,
