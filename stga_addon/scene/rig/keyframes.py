@@ -236,9 +236,10 @@ class Placement(NamedTuple):
     blend: float = 0.0
 
 
-def push_down_own(owner: Any) -> None:
+def push_down_own(owner: Any, blend: float = 0.0) -> None:
     """Turn the action of rig or shape keys into a strip with effect only where it lasts: beside it
-    the face is neutral, and the head stays where it was."""
+    the face is neutral, and the head stays where it was. blend: of a performance, as of
+    `Placement`."""
     animation = owner.animation_data
     if animation is None or animation.action is None:
         return
@@ -256,7 +257,17 @@ def push_down_own(owner: Any) -> None:
         animation.action[tags.HELD] = True
         push_down_action(owner)
         assign_action(animation, action, slot)
+    is_performance = tags.PERFORMANCE in animation.action
     push_down_action(owner, "NOTHING")
+    if is_performance:
+        _blend_ends(animation.nla_tracks[-1].strips[0], blend)
+
+
+def _blend_ends(strip: Any, blend: float) -> None:
+    """Both ends, also where the motion is too short for the two."""
+    limited = min(blend, (strip.frame_end - strip.frame_start) / 2)
+    strip.blend_in = limited
+    strip.blend_out = limited
 
 
 def hold_beside_strips(owner: Any, values: Mapping[str, float]) -> None:
@@ -289,7 +300,7 @@ def new_actions(
     for owner in owners:
         title = f"{owner.name} {placement.name}"
         if placement.as_strip:
-            push_down_own(owner)
+            push_down_own(owner, placement.blend)
             animation = owner.animation_data_create()
             animation.action = bpy.data.actions.new(title)
             continue
@@ -305,11 +316,7 @@ def new_actions(
                 paths = [each.data_path for each in action_curves(owner)]
                 hold_beside_strips(owner, {path: owner.path_resolve(path) for path in paths})
             push_down_action(owner, extrapolation="NOTHING")
-            strip = owner.animation_data.nla_tracks[-1].strips[0]
-            # both, also where the motion is too short for the two
-            blend = min(placement.blend, (strip.frame_end - strip.frame_start) / 2)
-            strip.blend_in = blend
-            strip.blend_out = blend
+            _blend_ends(owner.animation_data.nla_tracks[-1].strips[0], placement.blend)
 
 
 def key_tracked_offsets(
