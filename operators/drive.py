@@ -27,7 +27,12 @@ from ..stga_addon.jobs.convert_motion import SHAPES_SUFFIX, ConvertMotion
 from ..stga_addon.jobs.table import Kind
 from ..stga_addon.scene import tags
 from ..stga_addon.scene.avatar_scene import shown_screens, viewports
-from ..stga_addon.scene.objects import Identity, frames_per_second, show_progress
+from ..stga_addon.scene.objects import (
+    Identity,
+    after_render,
+    frames_per_second,
+    show_progress,
+)
 from ..stga_addon.scene.record import capture_of, stored_path
 from ..stga_addon.scene.rig.keyframes import check_sliders
 from ..stga_addon.scene.rig.motion import LivePose, stored_range
@@ -90,7 +95,7 @@ class MeasureRange(Edit, bpy.types.Operator):
     on"""
 
     bl_label = "Measure Trained Range"
-    needs = (common.needs_rig,)
+    needs = (common.needs_rig, common.needs_own_head)
 
     def run(self, context: Any) -> None:
         head = head_of(context)
@@ -246,8 +251,12 @@ class LiveSession:
         self._show_said()  # also in the window of a file that was opened
 
     def stop(self) -> None:
-        """Stop listening and give the head back to its own animation."""
+        """Stop listening and give the head back to its own animation, after a render that goes
+        on."""
         self.close()
+        after_render(self._give_back)
+
+    def _give_back(self) -> None:
         if self._pose.is_there:
             self._pose.restore()
             scene = self.scene.find()

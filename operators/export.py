@@ -45,6 +45,7 @@ from ..stga_addon.scene.objects import (
     SceneView,
     Warn,
     frames_per_second,
+    is_rendering,
     iterate_frames,
 )
 from ..stga_addon.scene.render.scene_splats import SplatCache, evaluated_splats, with_heads
@@ -147,6 +148,9 @@ class SplatExport(Stepwise, FileExport):
             posing = ends.enter_context(closing(iterate_frames(frames)))
             try:
                 while not writer.has_ended:
+                    while is_rendering():  # which sets frames itself, and would get ours
+                        _show_status("Waiting for the render   Esc: Cancel")
+                        yield
                     if writer.takes_frames:
                         with view.shown():
                             frame = next(posing, None)
@@ -486,7 +490,8 @@ class ExportCameras(Action, bpy.types.Operator, FileExport):
         objects = context.selected_objects if self.selected_only else context.scene.objects
         cameras = [thing for thing in objects if thing.type == "CAMERA"]
         path = file_path(self.filepath, "export")
-        count = export_cameras(path, cameras, context.evaluated_depsgraph_get())
+        with kept_evaluated(cameras):
+            count = export_cameras(path, cameras, context.evaluated_depsgraph_get())
         self.inform(f"Exported {count} cameras to {path}")
 
 

@@ -44,6 +44,7 @@ from ..stga_addon.scene.objects import (
     COLLECTIONS,
     Warn,
     capture_root,
+    is_rendering,
     leave_edit_mode,
     mover_of,
     remove,
@@ -115,6 +116,8 @@ class HeadImport(Edit):
         it has no head yet; another import of the same keeps the shot. Raises StgaError."""
         warn = self.warn
         scene = context.scene
+        if is_rendering():
+            raise StgaError("Blender renders, and would get other meshes; wait until it has ended")
         has_model = not flame and any((source / name).is_file() for name in OWN_MODELS)
         model = None if has_model else flame_model_path(context, flame)
         capture = open_capture(source, flame=model, principal_point=principal_point)

@@ -155,7 +155,7 @@ class ApplyPose(Edit, bpy.types.Operator):
             raise StgaError(f"{self.pose}: is no pose of this file; save one, or append one")
         keyed = self.keyframe or context.scene.tool_settings.use_keyframe_insert_auto
         for owner in filter(None, (rig, head.data.shape_keys) if keyed else ()):
-            keyframes.check_keyable(owner)
+            keyframes.check_own_action(owner)
         applied = poses.apply_pose(head, rig, action, self.strength)
         for key in applied.sliders if keyed else ():
             key.keyframe_insert("value")

@@ -30,6 +30,7 @@ from ..stga_addon.scene.record import (
     store_path,
     stored_path,
 )
+from ..stga_addon.scene.rig.head import LINKED
 from ..stga_addon.scene.tags import is_head
 from ..stga_addon.tracking.folder import is_flame
 from ..stga_addon.training.run.folder import AVATAR, TRACKING, read_run
@@ -157,6 +158,15 @@ def shown_splats(scene: Any, head: Any) -> Any:
     return scene.stga.splats if scene.stga.splats in found else next(iter(found), None)
 
 
+def check_replaceable(scene: Any, head: Any, shown: Any) -> None:
+    """Raise StgaError where an avatar cannot take the place of what `shown_splats` found, None:
+    nothing that can be changed."""
+    if shown is not None:
+        splat_object.check_own_data(shown)
+    elif splat_object.splats_of(head, scene, linked=True):
+        raise StgaError(f"{head.name}: shows an avatar already, and {LINKED}")
+
+
 def follow_head(settings: Any) -> None:
     """Let the panel show the splats of the head that was chosen in it. A head without a run gets
     the scene's, or a new one beside that of another head."""
@@ -254,6 +264,7 @@ def _show_avatar(scene: Any, state: RequestState) -> Answer:
         count = f"{state.snapshot.status.figures.get('iteration', 0):.0f} iterations"
         shows = f"{head.name} keeps the avatar that it has; Show Avatar shows the new one"
         raise StgaError(f"{run}: was cancelled after {count}, so {shows}")
+    check_replaceable(scene, head, shown)
     avatar, attributes = loading.result()
     splat_object.check_head(avatar, head)
     is_update = shown is not None and splat_object.can_update(shown, avatar)

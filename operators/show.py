@@ -26,7 +26,7 @@ from . import common, options
 from .common import Action, Edit, FileImport, file_path, head_of, is_run, need
 from .options import ONCE
 from .request import idle, start
-from .results import shown_splats
+from .results import check_replaceable, shown_splats
 from .training_python import training_python
 
 GRAY = ("WIREFRAME", "SOLID")
@@ -58,8 +58,7 @@ class ShowAvatar(Edit, bpy.types.Operator, FileImport):
         avatar = read_avatar(path)
         show_progress(0.3)
         before = shown_splats(context.scene, head)
-        if before is None and splat_object.splats_of(head, context.scene, linked=True):
-            raise StgaError(f"{head.name}: shows an avatar already, and {LINKED}")
+        check_replaceable(context.scene, head, before)
         name = f"{head.name} {path.stem}"
         shown = splat_object.show_avatar(avatar, head, name, replaced=before)
         shown.hide_viewport = False
@@ -225,6 +224,10 @@ def _needs_own_splats(operator: Any, context: Any) -> bool:
     for thing in (splats, splats.data, splat_object.followed_head(splats)):
         if thing.library is not None:
             return common.polled(operator, False, f"{thing.name}: {LINKED}")
+    try:
+        splat_object.check_own_data(splats)
+    except StgaError as error:
+        return common.polled(operator, False, str(error))
     return True
 
 

@@ -15,7 +15,7 @@ from ..errors import StgaError
 from ..files import write_json
 from ..flame.quaternions import continuous, from_matrices
 from . import arrays, tags
-from .compat import mark_imported
+from .compat import is_made_by_hand, mark_imported
 from .objects import Warn, log_warning, place, remove, set_frames_per_second
 
 UP = (0.0, 0.0, 1.0)
@@ -118,14 +118,80 @@ def _camera_data(title: str, before: Any) -> Any:
     return data
 
 
+OPTICS = ("lens", "shift_x", "shift_y", "sensor_width")
+"""Fields of a camera's data that an import sets."""
+CAMERA_TAGS = (tags.KIND, tags.CAPTURE, tags.CAMERA_INDEX, tags.IMAGE_SIZE, tags.PIXEL_ASPECT)
+"""Custom properties of a camera that stands for one of a capture."""
+
+
+def _place_of(camera: Any) -> list[float]:
+    optics = [getattr(camera.data, name) for name in OPTICS]
+    return [*np.array(camera.matrix_basis).ravel().tolist(), *optics]
+
+
+def _is_changed(camera: Any, root: Any) -> bool:
+    """Whether an artist has moved or keyframed a camera of an import, or given it another lens."""
+    animated = [each.animation_data for each in (camera, camera.data) if each.animation_data]
+    actions = [each.action for each in animated if each.action is not None]
+    is_animated = any(each.nla_tracks or each.drivers for each in animated)
+    if camera.parent != root or is_animated or any(map(is_made_by_hand, actions)):
+        return True
+    imported = camera.get(tags.IMPORTED)
+    if imported is None:  # by an older version
+        return False
+    moves = camera.animation_data is not None and camera.animation_data.action is not None
+    compared = slice(-len(OPTICS) if moves else 0, None)
+    return not np.allclose(list(imported)[compared], _place_of(camera)[compared], atol=1e-6)
+
+
+def _free(camera: Any) -> None:
+    """Let a camera of an import be one of the scene's own."""
+    for tag in (*CAMERA_TAGS, tags.IMPORTED):
+        camera.pop(tag, None)
+
+
+def _cameras_before(capture: Capture, root: Any, warn: Warn) -> dict[int, Any]:
+    """Index -> camera of the last import; those that were changed since then, and copies, become
+    the scene's own."""
+    found = dict[int, Any]()
+    changed = []
+    for camera in tags.find(tags.CAMERA, capture.root):
+        above = camera.parent
+        if above is not None and above != root and above.get(tags.KIND) == tags.ROOT:
+            continue  # of another head
+        if _is_changed(camera, root):
+            changed.append(camera.name)
+            _free(camera)
+        elif camera[tags.CAMERA_INDEX] in found:
+            _free(camera)
+        else:
+            found[camera[tags.CAMERA_INDEX]] = camera
+    if changed:
+        stays = "changed since the import, and left as they are, beside the capture's"
+        warn(f"{root.name}: cameras were {stays}: {', '.join(changed)}")
+    return found
+
+
+def _remove_unless_used(cameras: Iterable[Any]) -> None:
+    """Delete cameras that the capture no longer has, but not those that a shot is seen through."""
+    scenes = bpy.data.scenes
+    used = {scene.camera for scene in scenes}
+    used |= {marker.camera for scene in scenes for marker in scene.timeline_markers}
+    for camera in cameras:
+        if camera in used:
+            _free(camera)
+        else:
+            remove([camera])
+
+
 def import_cameras(capture: Capture, root: Any, warn: Warn = log_warning) -> list[Any]:
     """A camera object for each of the capture's cameras, ascending by index, under `root` (from
     `capture_root`); one that moves is keyframed. The images are background images, each visible on
     its frame (Blender's image sequences number frames by a file name's last number, which in
-    captures is the camera). Importing again replaces the last import. `warn` reports missing images
-    and changing intrinsics."""
+    captures is the camera). Importing again replaces the last import, but for cameras that were
+    changed since. `warn` reports these, missing images and changing intrinsics."""
     cameras = []
-    old = {camera[tags.CAMERA_INDEX]: camera for camera in tags.find(tags.CAMERA, capture.root)}
+    old = _cameras_before(capture, root, warn)
     by_index: dict[int, dict[int, View]] = {}
     for view in capture.all_views:
         by_index.setdefault(view.camera_index, {}).setdefault(view.timestep, view)
@@ -171,8 +237,9 @@ def import_cameras(capture: Capture, root: Any, warn: Warn = log_warning) -> lis
             data.show_background_images = True
         for owner in (camera, data):
             mark_imported(owner)
+        camera[tags.IMPORTED] = _place_of(camera)
         cameras.append(camera)
-    remove(old.values())
+    _remove_unless_used(old.values())
     return cameras
 
 

@@ -1,7 +1,7 @@
 """Differences between Blender 4.2 and 5.3: every version switch of the add-on."""
 
 import hashlib
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from typing import Any, NamedTuple
 
@@ -186,16 +186,32 @@ ACTION_FIELDS = ("action_blend_type", "action_extrapolation", "action_influence"
 """Kept fields that say how an owner's action acts on the strips below."""
 STRIP_CURVES = ("influence", "strip_time")
 """Values of a strip that may have keyframes of their own."""
+POINT_FIELDS = (
+    "interpolation",
+    "easing",
+    "amplitude",
+    "period",
+    "back",
+    "handle_left_type",
+    "handle_right_type",
+    "handle_left",
+    "handle_right",
+)
+"""Fields of a keyframe beside its place, in an order in which they can be set."""
+KeptPoint = tuple[tuple[float, float], dict[str, Any]]
+"""A keyframe of a strip: place and fields."""
 
 
 class KeptAnimation(NamedTuple):
     """What performances, and keyframes made by hand, gave an owner: NLA tracks, as fields and
-    strips; values that shape keys have beside them, by data path; how its action acts; and the
-    action in place of its own, with the slot's identifier, None for its own."""
+    strips; values that shape keys have beside them, by data path; how its action acts; names of
+    strips that scripts cannot make; and the action in place of its own, with the slot's identifier,
+    None for its own."""
 
     tracks: list[tuple[dict[str, Any], list[tuple[Any, ...]]]]
     held: Mapping[str, float]
     fields: Mapping[str, Any]
+    lost: list[str]
     action: Any = None
     slot: str | None = None
 
@@ -211,6 +227,8 @@ def keep_animation(owner: Any) -> KeptAnimation:
     the last import was pushed down to; nothing of None. An action of that import that was changed
     by hand stays in the file."""
     animation = owner.animation_data if owner is not None else None
+    if animation is not None:
+        animation.use_tweak_mode = False  # in which a strip's action is the owner's
     tracks = animation.nla_tracks if animation else ()
     lowest = [strip for strip in tracks[0].strips if strip.action] if tracks else []
     holding = [strip for strip in lowest if tags.HELD in strip.action]
@@ -219,12 +237,11 @@ def keep_animation(owner: Any) -> KeptAnimation:
         held |= {each.data_path: each.evaluate(0) for each in strip_curves(strip)}
     own_rows = 1 + bool(holding)
     kept = []
+    lost = list[str]()
     for row, track in enumerate(tracks):
         strips = []
-        for strip in track.strips:
-            is_own = row < own_rows and strip.action and strip.action.name.startswith(owner.name)
-            if strip.action is None:
-                continue
+        for strip in _clips(track.strips, lost):
+            is_own = row < own_rows and _is_of_import(strip.action, owner)
             if not is_own or is_made_by_hand(strip.action):
                 strip.action.use_fake_user = True
             if is_own:
@@ -232,7 +249,7 @@ def keep_animation(owner: Any) -> KeptAnimation:
             fields = {name: getattr(strip, name) for name in STRIP_FIELDS}
             found = ((path, strip.fcurves.find(path)) for path in STRIP_CURVES)
             points = {
-                path: [tuple(each.co) for each in curve.keyframe_points]
+                path: [_kept_point(each) for each in curve.keyframe_points]
                 for path, curve in found
                 if curve is not None
             }
@@ -241,13 +258,37 @@ def keep_animation(owner: Any) -> KeptAnimation:
             kept.append(({name: getattr(track, name) for name in TRACK_FIELDS}, strips))
     how = {name: getattr(animation, name) for name in ACTION_FIELDS if animation}
     action = animation.action if animation else None
-    if action is None:
-        return KeptAnimation(kept, held, how)
-    is_of_import = tags.IMPORTED in action or action.name.startswith(f"{owner.name} action")
-    if tags.PERFORMANCE not in action and is_of_import:
-        return KeptAnimation(kept, held, how)
+    if action is None or (tags.PERFORMANCE not in action and _is_of_import(action, owner)):
+        return KeptAnimation(kept, held, how, lost)
     action.use_fake_user = True
-    return KeptAnimation(kept, held, how, action, slot_of(animation))
+    return KeptAnimation(kept, held, how, lost, action, slot_of(animation))
+
+
+def _is_of_import(action: Any, owner: Any) -> bool:
+    """Whether an import made the action for its owner: for shape keys and rigs. An object that is
+    keyframed by hand shares the action of its shape keys from Blender 4.4 on."""
+    is_made = tags.IMPORTED in action or tags.HELD in action
+    is_made |= action.name.startswith((f"{owner.name} action", f"{owner.name} place"))
+    return is_made and (owner.id_type == "KEY" or owner.type == "ARMATURE")
+
+
+def _clips(strips: Any, lost: list[str]) -> Iterator[Any]:
+    """Strips with actions, also those within meta strips; the names of others are added to
+    `lost`."""
+    for strip in strips:
+        if strip.type == "META":
+            yield from _clips(strip.strips, lost)
+        elif strip.type == "CLIP" and strip.action is not None:
+            yield strip
+        if strip.type != "CLIP":
+            lost.append(strip.name)
+
+
+def _kept_point(point: Any) -> KeptPoint:
+    fields = {name: getattr(point, name) for name in POINT_FIELDS}
+    for side in ("handle_left", "handle_right"):
+        fields[side] = tuple(fields[side])
+    return tuple(point.co), fields
 
 
 def give_animation(owner: Any, kept: KeptAnimation) -> None:
@@ -268,8 +309,10 @@ def give_animation(owner: Any, kept: KeptAnimation) -> None:
                 setattr(strip, field, value)
             for path, places in points.items():
                 curve = strip.fcurves.find(path)
-                for place in places if curve is not None else ():
-                    curve.keyframe_points.insert(*place)
+                for place, fields in places if curve is not None else ():
+                    point = curve.keyframe_points.insert(*place)
+                    for field, value in fields.items():
+                        setattr(point, field, value)
         for field, value in track_fields.items():
             setattr(track, field, value)
     if kept.action is not None:

@@ -13,6 +13,7 @@ from . import tags
 from .avatar_scene import place_beside
 from .compat import assign_action, slot_of
 from .display.splat_object import splat_modifier
+from .evaluation import kept_evaluated
 from .objects import COLLECTIONS, layers_of, mover_of, own_collections
 
 COPIED = (tags.HEAD, tags.RIG, tags.SPLATS)
@@ -27,6 +28,11 @@ def duplicate_avatar(head: Any, linked: bool) -> Any:
     linked: whether both play the same keyframes. Raises StgaError where the head cannot be copied.
     """
     root = _own_root(head)
+    scene = bpy.context.scene
+    if scene.objects.get(head.name) is not head:
+        raise StgaError(
+            f"{head.name}: is not in the scene {scene.name}; go to the one that it is in"
+        )
     family = [root, *(part for part in root.children if part.get(tags.KIND) in COPIED)]
     before = set(_blocks())
     copies = _written_and_read(family)
@@ -125,6 +131,11 @@ def attach_to_bone(head: Any, armature: Any, bone: str) -> None:
     """Let an avatar ride on a bone of another armature, from where it is now; it keeps its own
     neck. bone "": let it go where it is. Raises StgaError."""
     root = _own_root(head)
+    with kept_evaluated([armature]):
+        _attach(root, armature, bone)
+
+
+def _attach(root: Any, armature: Any, bone: str) -> None:
     place = root.matrix_world.copy()
     if bone and (armature is None or bone not in armature.data.bones):
         raise StgaError(f"{bone}: is no bone of {getattr(armature, 'name', 'an armature')}")

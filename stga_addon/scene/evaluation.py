@@ -22,8 +22,8 @@ _kept: list[int] = []
 
 @contextmanager
 def kept_evaluated(things: Iterable[Any]) -> Iterator[None]:
-    """Let Blender evaluate meshes and armatures in the block, whatever hides them; nothing is
-    shown."""
+    """Let Blender evaluate objects in the block, also meshes' shapes and armatures' poses, whatever
+    hides them; nothing is shown."""
     hidden = [each for each in dict.fromkeys(things) if each is not None and not _is_kept(each)]
     if not hidden:
         yield
@@ -39,6 +39,9 @@ def kept_evaluated(things: Iterable[Any]) -> Iterator[None]:
             helper.modifiers.new(thing.name, "ARMATURE").object = thing
         elif thing.type == "MESH":
             helper.modifiers.new(thing.name, "SHRINKWRAP").target = thing
+        else:
+            helper.constraints.new("COPY_TRANSFORMS").target = thing
+        thing.update_tag(refresh={"TIME"})  # its keyframes, which nobody has asked for yet
     uids = [each.session_uid for each in hidden]
     _kept.extend(uids)
     try:

@@ -32,7 +32,8 @@ RUN = "stga_run_folder"  # on the head: folder of its run, which may not have be
 STORED_IN = "stga_stored_in"  # on owners of paths: the .blend file that these were stored in
 WORLD = "stga_world"  # on splats of a run's world: their file
 PERFORMANCE = "stga_performance"  # on an action: keyframes of another motion than the capture's
-IMPORTED = "stga_imported"  # on an action: digest of the keyframes that an import gave it
+# on an action: digest of the keyframes that an import gave it; on a camera: where it placed it
+IMPORTED = "stga_imported"
 POSE = "stga_pose"  # on an action: a pose in the asset browser, `rig.poses`
 HELD = "stga_held"  # on an action: the part of the capture's motion that is held outside of it
 

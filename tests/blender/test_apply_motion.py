@@ -95,7 +95,8 @@ def test_refined_tracking_keeps_the_offsets_of_each_frame(tmp_path, place):
 
 def test_importing_again_keeps_the_shot(scene):
     """Catches camera, size, frame range, drivers or performance strips that another import of the
-    same capture takes away, on either owner, once and twice, and unused actions that pile up."""
+    same capture takes away, on either owner, once and twice, unused actions that pile up; a copy of
+    a capture's camera, or one that was moved, put back; and a strip in tweak mode as an action."""
     ops.apply_motion(filepath=scene.file, start=12, place="strip")
     ops.apply_motion(filepath=scene.file, start=30, place="strip", jaw=False)
     shot = bpy.context.scene
@@ -119,8 +120,26 @@ def test_importing_again_keeps_the_shot(scene):
         curve.driver.expression = "x + 0.25"
     times = (0, 1.5, 5, 12, 13.5, 17, 30, 33)
     before = [mesh_at(time) for time in times]
+    moved, copied, still = tags.find(tags.CAMERA, scene.folder)
+    flown = copied.copy()
+    flown.name = "a flight"
+    shot.collection.objects.link(flown)
+    flown.keyframe_insert("location", frame=1)
+    moved.location.x += 0.5
+    moved.data.lens = 35.0
+    kept = {each.name: (each.matrix_basis.copy(), each.data.lens) for each in (moved, flown)}
+    tweaked = rig_of(head).animation_data
+    tweaked.nla_tracks[-1].select = tweaked.nla_tracks[-1].strips[0].select = True
+    tweaked.use_tweak_mode = True
     for _ in range(2):
         ops.import_capture(directory=scene.folder, flame=scene.model_file)
+        for name, (matrix, lens) in kept.items():
+            found = shot.objects[name]
+            assert (found.matrix_basis, found.data.lens) == (matrix, lens)
+        assert flown.animation_data.action is not None
+        cameras = tags.find(tags.CAMERA, scene.folder)
+        assert len(cameras) == 3
+        assert still in cameras
         assert shot.camera == camera
         assert (shot.frame_end, shot.render.resolution_x) == (77, 999)
         for time, expected in zip(times, before, strict=True):
@@ -142,7 +161,8 @@ def test_importing_again_keeps_the_shot(scene):
 
 def test_importing_again_keeps_what_was_made_by_hand(scene):
     """Catches an action or keyframes in the capture's own that are deleted silently, a shape
-    key on a FLAME head, and a strip's influence or a camera's focus that are reset."""
+    key on a FLAME head, and a strip's influence, its interpolation, or a camera's focus that are
+    reset."""
     head = panel().head
     rig = rig_of(head)
     keys = head.data.shape_keys
@@ -155,7 +175,8 @@ def test_importing_again_keeps_what_was_made_by_hand(scene):
     strip = rig.animation_data.nla_tracks[-1].strips[0]
     strip.use_animated_influence = True
     for place in ((12, 0.2), (16, 0.9)):
-        strip.fcurves.find("influence").keyframe_points.insert(*place)
+        point = strip.fcurves.find("influence").keyframe_points.insert(*place)
+        point.interpolation = "CONSTANT"
     rig.pose.bones["jaw"].rotation_quaternion = (0.9, 0.4, 0, 0)
     rig.pose.bones["jaw"].keyframe_insert("rotation_quaternion", frame=40)
     rig.animation_data.action.name = "by hand"

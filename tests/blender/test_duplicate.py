@@ -115,3 +115,7 @@ def test_an_avatar_on_a_body(avatar):
     rig = find_rig(avatar)
     with failure("belongs to the avatar itself"):
         ops.attach_to_bone(armature=rig.name, bone=rig.data.bones[0].name)
+    other = bpy.data.scenes.new("other")
+    other.stga.head = avatar
+    with failure("is not in the scene other"), bpy.context.temp_override(scene=other):
+        ops.duplicate_avatar()

@@ -1,5 +1,7 @@
 """Heads and splats that a scene hides: they move in exports, or a sentence says why not."""
 
+import json
+
 import bpy
 import numpy as np
 import pytest
@@ -10,7 +12,7 @@ from stga_addon.scene.evaluation import HELPER
 from stga_addon.scene.render.viewport_display import ENGINE
 from stga_addon.scene.rig.motion import sample_motion
 
-from .session import failure, import_flame, ops, panel
+from .session import failure, import_flame, ops, panel, placed
 from .test_operators import show_ball
 
 pytestmark = pytest.mark.usefixtures("extension")
@@ -67,6 +69,40 @@ def test_renders_of_a_head_that_stands_still_are_refused(head, tmp_path):
     splat_modifier(panel().splats).show_render = False
     with failure("switched off, so its splats stand still; switch on its camera"):
         bpy.ops.render.render()
+
+
+@pytest.mark.parametrize("hides", ["nothing", "collection", "collection's monitor"])
+def test_hidden_cameras_and_bodies_are_where_they_are_animated(head, tmp_path, hides):
+    """Catches cameras exported from where they were when they were hidden, and an avatar that jumps
+    as soon as the body that it is attached to is shown."""
+    scene = bpy.context.scene
+    lane = bpy.data.collections.new("lane")
+    scene.collection.children.link(lane)
+    camera = placed("dolly", bpy.data.cameras.new("dolly"))
+    body = placed("body", bpy.data.armatures.new("body"))
+    bpy.context.view_layer.objects.active = body
+    bpy.ops.object.mode_set(mode="EDIT")
+    body.data.edit_bones.new("neck").tail = (0.1, 0.0, 1.0)
+    bpy.ops.object.mode_set(mode="OBJECT")
+    scene.frame_set(1)
+    for each in (camera, body):
+        lane.objects.link(each)
+        scene.collection.objects.unlink(each)
+        for frame in (1, 9):
+            each.location.x = 10 * frame
+            each.keyframe_insert("location", frame=frame)
+    scene.frame_set(1)
+    HIDE[hides](None, lane)
+    scene.frame_set(9)
+    ops.export_cameras(filepath=tmp_path / "transforms.json")
+    frames = json.loads((tmp_path / "transforms.json").read_text())["frames"]
+    dolly = next(each for each in frames if each["camera_id"] == "dolly")
+    assert dolly["transform_matrix"][0][3] == pytest.approx(90)
+    place = head.parent.matrix_world.copy()
+    ops.attach_to_bone(armature="body", bone="neck")
+    lane.hide_viewport = bpy.context.view_layer.layer_collection.children["lane"].exclude = False
+    scene.frame_set(9)
+    np.testing.assert_allclose(head.parent.matrix_world, place, atol=1e-4)
 
 
 def test_a_hidden_performer_is_sampled(extension, tmp_path):

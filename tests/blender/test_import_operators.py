@@ -89,15 +89,21 @@ def test_importing_again_doubles_nothing(tmp_path, model, kind):
 
 
 def test_importing_again_keeps_what_an_artist_painted(tmp_path):
-    """Catches painted regions and materials lost by another import, and others left selected."""
+    """Catches painted regions, materials and the head's own keyframes, which may be in the action
+    of its shapes, lost by another import, and others left selected."""
     folder = write_mesh_capture(tmp_path / "capture")
     ops.import_capture(directory=folder)
     head = panel().head
     head.vertex_groups.new(name="dimple").add([3, 4, 5], 1.0, "REPLACE")
     head.vertex_groups.new(name="stga_3").add([7], 0.7, "REPLACE")
     head.data.materials.append(bpy.data.materials.new("skin"))
+    for frame in (1, 5):
+        head.pass_index = frame
+        head.keyframe_insert("pass_index", frame=frame)
     ops.import_capture(directory=folder)
     assert panel().head == head
+    bpy.context.scene.frame_set(1)
+    assert head.pass_index == 1
     assert head.vertex_groups["dimple"].weight(4) == 1.0
     assert head.vertex_groups["stga_3"].weight(7) == pytest.approx(0.7)
     assert [material.name for material in head.data.materials] == ["skin"]

@@ -99,18 +99,18 @@ def test_strips_override_only_their_frames(head, own, other):
         assert owner.animation_data.action is None
 
 
-@pytest.mark.parametrize("second", [12, 8])
-def test_strips_blend_where_they_overlap(head, own, second):
-    """Catches a neck or a slider that snaps where a strip begins or ends over another, and a blend
-    on one of the two owners only."""
+@pytest.mark.parametrize(("second", "is_strip"), [(12, True), (8, True), (30, False)])
+def test_strips_blend_where_they_overlap(head, own, second, is_strip):
+    """Catches a neck or a slider that snaps where a strip begins or ends over another, or where a
+    performance that was an action ends, and a blend on one of the two owners only."""
     rig = rig_of(head)
     smile = head.data.shape_keys.key_blocks["expr_000"]
     still = own.frame(1)
     for start, sign in ((1, 1.0), (second, -1.0)):
         neck = np.array((0.0, sign * 0.3, 0.0))
         frame = replace(still, neck_pose=neck, expr=np.eye(len(still.expr))[0] * sign)
-        placement = Placement(start, str(start), as_strip=True, blend=5.0)
-        apply_motion(head, [frame] * 16, placement)
+        as_strip = is_strip or start == second
+        apply_motion(head, [frame] * 16, Placement(start, str(start), as_strip=as_strip, blend=5.0))
     values = []
     for time in np.arange(7, second + 10, 0.5):  # the own motion ends at 6
         at_frame(head, time)

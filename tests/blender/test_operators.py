@@ -312,16 +312,27 @@ def frames_to(folder, avatar, events=None):
     return write
 
 
-def test_a_range_is_exported_step_by_step(extension, shown, tmp_path):
-    """Catches another export than a script's, traces of a cancelled one, and a silent thread."""
+def test_a_range_is_exported_step_by_step(extension, shown, tmp_path, monkeypatch):
+    """Catches another export than a script's, traces of a cancelled one, a silent thread, and
+    frames that are set under a render which begins meanwhile."""
     capture, avatar = shown
-    bpy.context.scene.frame_set(1)
+    scene = bpy.context.scene
+    scene.frame_set(1)
 
     def fail(meshes):
         next(iter(meshes))
         raise extension.stga_addon.errors.StgaError("no room")
 
+    rendering = [False]
+    monkeypatch.setattr(extension.operators.export, "is_rendering", lambda: rendering[0])
     whole = RangeExport(extension, frames_to(tmp_path / "whole", avatar), range(4))
+    assert whole.event() == "RUNNING_MODAL"
+    rendering[0] = True
+    for frame in (30, 31):  # as the render sets them
+        scene.frame_set(frame)
+        assert whole.event() == "RUNNING_MODAL"
+        assert scene.frame_current == frame
+    rendering[0] = False
     assert whole.until() == "FINISHED"
     files = sorted((tmp_path / "whole").glob("*.ply"))
     assert [path.name for path in files] == [f"{frame:05d}.ply" for frame in range(4)]

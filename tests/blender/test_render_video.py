@@ -26,6 +26,7 @@ from stga_addon.jobs.table import Kind
 from stga_addon.raster.cpu.compose import compose
 from stga_addon.raster.posed_splats import ComposedImage
 from stga_addon.render.video import check_output
+from stga_addon.scene.record import capture_of
 from stga_addon.scene.render import drawn_video
 from stga_addon.scene.render.drawn_video import DrawnVideo, png_bytes
 
@@ -273,15 +274,18 @@ def test_finished_jobs_end_with_the_add_on(extension, shown, temporary):
 
 
 def test_while_blender_renders(extension, shown, monkeypatch):
-    """Catches frames that are set under a running render, by a video, an export or at its end, and
-    an engine that is unregistered meanwhile, which hangs Blender for ever."""
+    """Catches frames that are set under a running render, by a video, an export, an import or at
+    its end, and an engine that is unregistered meanwhile, which hangs Blender for ever."""
     scene = bpy.context.scene
     rendering = [True]
     waiting = []
     monkeypatch.setattr(bpy.app.timers, "register", lambda tick, **_: waiting.append(tick))
     objects = extension.stga_addon.scene.objects
     monkeypatch.setattr(objects, "is_rendering", lambda: rendering[0])
-    monkeypatch.setattr(extension.operators.render_video, "is_rendering", lambda: rendering[0])
+    for module in (extension.operators.render_video, extension.operators.import_capture):
+        monkeypatch.setattr(module, "is_rendering", lambda: rendering[0])
+    with failure("would get other meshes"):
+        ops.import_capture(directory=capture_of(panel().head))
     with failure("wait until the render has ended"):
         ops.render_video(filepath=shown / "images", path="scene", format="png")
     with failure("wait until the render has ended"):

@@ -6,6 +6,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 from stga_addon.scene import tags
+from stga_addon.scene.arrays import mesh_vertices
 from stga_addon.scene.rig.head import rig_of
 
 from .captures import mesh_at
@@ -77,8 +78,9 @@ def test_linked_avatars_are_left_alone(head, tmp_path):
 def test_an_overridden_head_keeps_what_is_done_to_it(flame_head, tmp_path):
     """Catches bones that a library override can pose by hand, and Pose the Head refuses; and what
     Blender does not save of an override, accepted: selections, keys for Solve Again, another
-    import, wider sliders and the run's folder."""
+    import, wider sliders, another avatar, keyframes in a linked action and the run's folder."""
     name = flame_head.name
+    show_ball(tmp_path / "avatar.npz", mesh_vertices(flame_head.data))
     collection = bring_linked(tmp_path / "a.blend", [flame_head.users_collection[0].name])
     override = collection.override_hierarchy_create(
         bpy.context.scene, bpy.context.view_layer, do_fully_editable=True
@@ -90,9 +92,15 @@ def test_an_overridden_head_keeps_what_is_done_to_it(flame_head, tmp_path):
     assert rig_of(head).mode == "POSE"
     bpy.ops.object.mode_set(mode="OBJECT")
     capture = {"directory": tmp_path / "capture", "flame": tmp_path / "capture" / "model.npz"}
-    for operator, options in (("select", {}), ("mark_key", {}), ("import_capture", capture)):
+    operators = {"select": {}, "mark_key": {}, "measure_range": {}, "import_capture": capture}
+    for operator, options in operators.items():
         with failure("is overridden, and Blender would not save"):
             getattr(ops, operator)(**options)
+    with failure("has its splats in another file"):
+        ops.show_avatar(filepath=tmp_path / "avatar.npz")
+    ops.save_pose(name="pose")
+    with failure("has its keyframes in another file"):
+        ops.apply_pose(pose="pose", keyframe=True)
     wide = tmp_path / "wide.npz"
     np.savez(wide, expr=np.full((3, 2), 6.0))
     with failure("expr_000 needs a wider range"):

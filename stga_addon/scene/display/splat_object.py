@@ -123,6 +123,15 @@ def splats_of(head: Any, scene: Any, linked: bool = False) -> list[Any]:
     return [each for each in own if followed_head(each) == head]
 
 
+def check_own_data(splat_object: Any) -> None:
+    """Raise StgaError where a splat object's splats are in another file: others would be gone after
+    reopening."""
+    data = splat_object.data
+    if data.library is not None or data.override_library is not None:
+        problem = "has its splats in another file, and Blender would not save others"
+        raise StgaError(f"{splat_object.name}: {problem}; open that file, or make its mesh local")
+
+
 def show_world_splats(splats: Splats, name: str, scene: Any = None) -> Any:
     """Make a splat object of a world-space set, for example a standard 3DGS PLY, in a scene (None:
     the context's); returns it."""

@@ -82,6 +82,9 @@ def import_head(capture: Capture, warn: Warn = log_warning, correctives: str = "
     for owner, animation, driven in zip(_animated(head), kept, drivers, strict=True):
         if owner is not None:
             _give_back(owner, animation)
+            if names := ", ".join(animation.lost):
+                gone = "transitions and meta strips are gone, but not their clips"
+                warn(f"{owner.name}: {gone}: {names}")
             give_drivers(owner, driven, warn)
     left = {each for each in bpy.data.actions if is_unused_import(each) and not each.users}
     bpy.data.batch_remove(left)

@@ -214,6 +214,15 @@ def check_keyable(owner: Any) -> None:
         raise StgaError(f"{owner.name}: is in tweak mode in the NLA editor; leave tweak mode first")
 
 
+def check_own_action(owner: Any) -> None:
+    """Raise StgaError where keyframes cannot be added to the action of `owner`."""
+    check_keyable(owner)
+    action = owner.animation_data.action if owner.animation_data is not None else None
+    if owner.library is not None or (action is not None and action.library is not None):
+        remedy = "Apply Motion gives it keyframes of this file"
+        raise StgaError(f"{owner.name}: has its keyframes in another file; {remedy}")
+
+
 class Placement(NamedTuple):
     """Where keyframes of a motion go. start: the first frame; name: of the motion, which new
     actions get; parts: of PARTS, those that are replaced; as_strip: into a strip of the NLA editor,
@@ -227,9 +236,10 @@ class Placement(NamedTuple):
     blend: float = 0.0
 
 
-def push_down_own(owner: Any) -> None:
+def push_down_own(owner: Any, blend: float = 0.0) -> None:
     """Turn the action of rig or shape keys into a strip with effect only where it lasts: beside it
-    the face is neutral, and the head stays where it was."""
+    the face is neutral, and the head stays where it was. blend: of a performance, as of
+    `Placement`."""
     animation = owner.animation_data
     if animation is None or animation.action is None:
         return
@@ -247,7 +257,17 @@ def push_down_own(owner: Any) -> None:
         animation.action[tags.HELD] = True
         push_down_action(owner)
         assign_action(animation, action, slot)
+    is_performance = tags.PERFORMANCE in animation.action
     push_down_action(owner, "NOTHING")
+    if is_performance:
+        _blend_ends(animation.nla_tracks[-1].strips[0], blend)
+
+
+def _blend_ends(strip: Any, blend: float) -> None:
+    """Both ends, also where the motion is too short for the two."""
+    limited = min(blend, (strip.frame_end - strip.frame_start) / 2)
+    strip.blend_in = limited
+    strip.blend_out = limited
 
 
 def hold_beside_strips(owner: Any, values: Mapping[str, float]) -> None:
@@ -280,7 +300,7 @@ def new_actions(
     for owner in owners:
         title = f"{owner.name} {placement.name}"
         if placement.as_strip:
-            push_down_own(owner)
+            push_down_own(owner, placement.blend)
             animation = owner.animation_data_create()
             animation.action = bpy.data.actions.new(title)
             continue
@@ -296,11 +316,7 @@ def new_actions(
                 paths = [each.data_path for each in action_curves(owner)]
                 hold_beside_strips(owner, {path: owner.path_resolve(path) for path in paths})
             push_down_action(owner, extrapolation="NOTHING")
-            strip = owner.animation_data.nla_tracks[-1].strips[0]
-            # both, also where the motion is too short for the two
-            blend = min(placement.blend, (strip.frame_end - strip.frame_start) / 2)
-            strip.blend_in = blend
-            strip.blend_out = blend
+            _blend_ends(owner.animation_data.nla_tracks[-1].strips[0], placement.blend)
 
 
 def key_tracked_offsets(
