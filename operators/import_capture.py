@@ -12,6 +12,7 @@ from typing import Any
 
 import bpy
 
+from ..stga_addon.avatar.file import read_avatar
 from ..stga_addon.capture.filmed import Filmed, filmed
 from ..stga_addon.capture.meshes import MESH_SUFFIXES
 from ..stga_addon.capture.open import OWN_MODELS, open_capture
@@ -33,7 +34,7 @@ from ..stga_addon.export.skinned_reader import (
     unpack_skinned_splats,
 )
 from ..stga_addon.export.splat_files import READERS
-from ..stga_addon.files import is_file, read_bytes
+from ..stga_addon.files import is_file, read_bytes, read_npz
 from ..stga_addon.flame.model import MASK_FILE
 from ..stga_addon.flame.sequence import FIELD_ALIASES, FRAME_FIELDS
 from ..stga_addon.scene import tags
@@ -317,8 +318,7 @@ def _unpacked(path: Path) -> tuple[Path, SkinnedSplats]:
     places = [parent / f"{path.stem}_avatar" for parent in (path.parent, kept)]
     for place in places:
         for folder in (place, *place.parent.glob(f"{glob.escape(place.name)}_*")):
-            made = all(is_file(folder / name) for name in UNPACKED)
-            if made and read_bytes(folder / SOURCE_FILE) == digest.encode():
+            if _holds_parts(folder, digest):
                 return folder, read_skinned_splats(path)
     for place in places:
         folder = next_folder(place) if os.path.lexists(place) else place
@@ -335,6 +335,19 @@ def _unpacked(path: Path) -> tuple[Path, SkinnedSplats]:
             raise
         return folder, found
     raise StgaError(problem)
+
+
+def _holds_parts(folder: Path, digest: str) -> bool:
+    """Whether a folder has the parts of the avatar's file of this digest, none of them damaged."""
+    if not all(is_file(folder / name) for name in UNPACKED):
+        return False
+    try:
+        for name in (MODEL_FILE, MOTION_FILE):
+            read_npz(folder / name)
+        read_avatar(folder / AVATAR_FILE)
+        return read_bytes(folder / SOURCE_FILE) == digest.encode()
+    except StgaError:
+        return False
 
 
 class OpenDemo(HeadImport, bpy.types.Operator):

@@ -138,7 +138,8 @@ def test_an_avatar_comes_back(extension, tmp_path):
 def test_importing_an_avatar_overwrites_nothing(extension, tmp_path, monkeypatch):
     """Catches a trained run beside the file that gets its quantized copy, a second head by a second
     import, a file in a read-only folder that is refused, heads called "motion", a warning of FLAME
-    masks, and a performer of the head's name taken for the head."""
+    masks, a performer of the head's name taken for the head, and half a head where parts of an
+    earlier import are damaged."""
     demo_head(tmp_path)
     ops.export_avatar(filepath=tmp_path / "anna.glb", format="skinned-gltf")
     run = write_ball_run(tmp_path / "anna_avatar")
@@ -175,3 +176,8 @@ def test_importing_an_avatar_overwrites_nothing(extension, tmp_path, monkeypatch
     ops.import_avatar(filepath=tmp_path / "ben.glb")
     assert panel().head.name == "ben head"
     assert Path(panel().head[tags.CAPTURE]).is_relative_to(kept)
+    damaged = Path(panel().avatar)
+    damaged.write_bytes(b"")
+    bpy.ops.wm.read_homefile(use_empty=True)
+    ops.import_avatar(filepath=tmp_path / "ben.glb")
+    assert Path(panel().avatar) == kept / "stga_avatars/ben_avatar_2/avatar.npz"
