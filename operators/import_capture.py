@@ -15,6 +15,7 @@ import bpy
 from ..stga_addon.avatar.file import read_avatar
 from ..stga_addon.capture.filmed import Filmed, filmed
 from ..stga_addon.capture.meshes import MESH_SUFFIXES
+from ..stga_addon.capture.model import Capture
 from ..stga_addon.capture.open import OWN_MODELS, open_capture
 from ..stga_addon.capture.transforms import (
     DEFAULT_PRINCIPAL_POINT,
@@ -137,11 +138,7 @@ class HeadImport(Edit):
             set_up_scene = not heads
         show_progress(0.8)
         cameras = import_cameras(capture, capture_root(capture.root), warn=warn)
-        store_path(head, tags.FLAME_MODEL, str(capture.flame_file or ""))
-        head[tags.PRINCIPAL_POINT] = principal_point
-        head[tags.TRACKED] = is_tracked(capture.root)
-        head[tags.FOCAL_LENGTH] = describe_focal_length(capture.root)
-        _store_filmed(head, filmed(capture))
+        _store_source(head, capture, principal_point)
         scene.stga.head = head
         if set_up_scene or not heads:
             scene.frame_start = capture.timesteps[0]
@@ -169,6 +166,15 @@ class HeadImport(Edit):
 
     def is_told(self, warning: str) -> bool:
         return not self.ignored_warning or self.ignored_warning not in warning
+
+
+def _store_source(head: Any, capture: Capture, principal_point: str) -> None:
+    """Keep on the head how its capture is read, and what the panel says of it."""
+    store_path(head, tags.FLAME_MODEL, str(capture.flame_file or ""))
+    head[tags.PRINCIPAL_POINT] = principal_point
+    head[tags.TRACKED] = is_tracked(capture.root)
+    head[tags.FOCAL_LENGTH] = describe_focal_length(capture.root)
+    _store_filmed(head, filmed(capture))
 
 
 def _used_actions() -> set[int]:
