@@ -84,7 +84,9 @@ def read_skinned_splats(path: Path) -> SkinnedSplats:
             rig, faces = _rig(document, binary, arrays, header)
             avatar = _avatar(header, arrays, rig, faces)
     except (*UNREADABLE, struct.error, zlib.error) as error:
-        raise StgaError(f"{path}: is no file of skinned splats ({error})") from error
+        is_form = isinstance(error, AttributeError | TypeError)
+        reason = "its JSON is of another form" if is_form else error
+        raise StgaError(f"{path}: is no file of skinned splats ({reason})") from error
     check_avatar(path, avatar)
     return SkinnedSplats(avatar, rig, fps)
 
