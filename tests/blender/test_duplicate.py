@@ -119,3 +119,20 @@ def test_an_avatar_on_a_body(avatar):
     other.stga.head = avatar
     with failure("is not in the scene other"), bpy.context.temp_override(scene=other):
         ops.duplicate_avatar()
+
+
+def test_the_panels_head_of_two_is_imported_again(avatar, demo):
+    """Catches another import that replaces the original where the panel shows its copy."""
+    ops.duplicate_avatar()
+    copy = panel().head
+    neutral = mesh_vertices(copy.data)
+    for each in (avatar, copy):
+        each.data.vertices[0].co = (9, 9, 9)
+    ops.import_capture(directory=demo)
+    assert panel().head == copy
+    assert tuple(avatar.data.vertices[0].co) == (9, 9, 9)
+    np.testing.assert_array_equal(mesh_vertices(copy.data), neutral)
+    assert len(tags.heads_of(bpy.context.scene)) == 2
+    assert copy.parent != avatar.parent
+    splats = panel().splats
+    assert get_input(splats, splat_nodes.HEAD) == copy

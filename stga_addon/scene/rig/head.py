@@ -60,7 +60,7 @@ def import_head(capture: Capture, warn: Warn = log_warning, correctives: str = "
     meshes = []
     if sequence is None:
         meshes = [flat_floats(capture.mesh(timestep)) for timestep in capture.timesteps]
-    before = next(iter(tags.find(tags.HEAD, capture.root)), None)
+    before = _imported_before(capture)
     if before is not None:
         check_own(before)
         _check_parent(before)
@@ -89,6 +89,13 @@ def import_head(capture: Capture, warn: Warn = log_warning, correctives: str = "
     left = {each for each in bpy.data.actions if is_unused_import(each) and not each.users}
     bpy.data.batch_remove(left)
     return head
+
+
+def _imported_before(capture: Capture) -> Any | None:
+    """The head that another import replaces: of several of one capture the panel's."""
+    heads = tags.find(tags.HEAD, capture.root)
+    chosen = getattr(getattr(bpy.context.scene, "stga", None), "head", None)
+    return chosen if chosen in heads else next(iter(heads), None)
 
 
 def _animated(head: Any) -> tuple[Any, Any, Any]:
@@ -185,7 +192,7 @@ def _add_keys(head: Any, keys: Mapping[str, OtherKey]) -> None:
 
 def _place_head(capture: Capture) -> Any:
     root = capture_root(capture.root)
-    head = next(iter(tags.find(tags.HEAD, capture.root)), None)
+    head = _imported_before(capture)
     if head is not None and arrays.has_triangles(head.data, capture.faces):
         # Into the same mesh, which keeps materials, vertex groups and painted attributes.
         reset(head)
