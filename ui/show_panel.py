@@ -183,17 +183,24 @@ def _before_image(scene: Any, *_: Any) -> None:
 
 
 def left_out_hint(scene: Any) -> str | None:
-    """A sentence where the engine STGA Splats leaves out what the scene's images are to show."""
+    """A sentence where the engine STGA Splats leaves out what the scene's images are to show, or
+    where another engine shows it twice."""
+    if scene.render.engine != ENGINE:
+        twice = "EEVEE and Cycles show all objects by themselves; leave out the set of STGA Splats"
+        return twice if shows_set(scene) else None
     where = "Set: Shown, in the render properties, shows them"
     return f"STGA Splats leaves out other objects; {where}" if leaves_out_set(scene) else None
 
 
 def draw_left_out(layout: Any, context: Any) -> None:
-    """Say that the engine leaves out the set, with the button that shows it."""
+    """Say that images lack the set, or show it twice, with the button that changes it."""
     hint = left_out_hint(context.scene)
     if hint:
+        is_shown = shows_set(context.scene)
         draw_text(layout, context, hint, "INFO")
-        layout.operator("stga.choose_set", text="Show Set", icon="SCENE_DATA").shown = "SHOWN"
+        text = "Leave Out Set" if is_shown else "Show Set"
+        button = layout.operator("stga.choose_set", text=text, icon="SCENE_DATA")
+        button.shown = "LEFT_OUT" if is_shown else "SHOWN"
 
 
 def _pop_up(hint: str) -> None:

@@ -29,6 +29,7 @@ def kept_evaluated(things: Iterable[Any]) -> Iterator[None]:
         yield
         return
     scene = bpy.context.scene
+    before = bpy.context.evaluated_depsgraph_get()
     helper = bpy.data.objects.new(HELPER, bpy.data.meshes.new(HELPER))
     uid = helper.session_uid
     scene.collection.objects.link(helper)
@@ -41,7 +42,8 @@ def kept_evaluated(things: Iterable[Any]) -> Iterator[None]:
             helper.modifiers.new(thing.name, "SHRINKWRAP").target = thing
         else:
             helper.constraints.new("COPY_TRANSFORMS").target = thing
-        thing.update_tag(refresh={"TIME"})  # its keyframes, which nobody has asked for yet
+        if not thing.evaluated_get(before).is_evaluated:
+            thing.update_tag(refresh={"TIME"})  # keyframes that nobody has asked for yet
     uids = [each.session_uid for each in hidden]
     _kept.extend(uids)
     try:

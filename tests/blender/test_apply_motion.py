@@ -93,6 +93,15 @@ def test_refined_tracking_keeps_the_offsets_of_each_frame(tmp_path, place):
         assert_allclose(mesh_at(10 + 2 * timestep), shown.mesh(timestep), atol=2 * TOLERANCE)
 
 
+def drive(owner, path, source):
+    curve = owner.driver_add(path, 0) if path.endswith("n") else owner.driver_add(path)
+    variable = curve.driver.variables.new()
+    variable.name = "x"
+    variable.targets[0].id = source
+    variable.targets[0].data_path = "location.x"
+    curve.driver.expression = "x + 0.25"
+
+
 def test_importing_again_keeps_the_shot(scene):
     """Catches camera, size, frame range, drivers or performance strips that another import of the
     same capture takes away, on either owner, once and twice, unused actions that pile up; a copy of
@@ -107,17 +116,9 @@ def test_importing_again_keeps_the_shot(scene):
     shot.render.resolution_x = 999
     head = panel().head
     head.data.shape_keys.animation_data.nla_tracks[1].strips[0].influence = 0.5
-    for owner, path, source in (
-        (head.data.shape_keys, 'key_blocks["expr_000"].value', camera),
-        (rig_of(head), 'pose.bones["left_eye"].location', camera),
-        (head, "pass_index", camera),
-    ):
-        curve = owner.driver_add(path, 0) if path.endswith("n") else owner.driver_add(path)
-        variable = curve.driver.variables.new()
-        variable.name = "x"
-        variable.targets[0].id = source
-        variable.targets[0].data_path = "location.x"
-        curve.driver.expression = "x + 0.25"
+    drive(head.data.shape_keys, 'key_blocks["expr_000"].value', camera)
+    drive(rig_of(head), 'pose.bones["left_eye"].location', camera)
+    drive(head, "pass_index", camera)
     times = (0, 1.5, 5, 12, 13.5, 17, 30, 33)
     before = [mesh_at(time) for time in times]
     moved, copied, still = tags.find(tags.CAMERA, scene.folder)

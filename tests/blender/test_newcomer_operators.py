@@ -73,7 +73,7 @@ def test_next_step_tells_what_is_so_now(extension, head, monkeypatch, tmp_path):
     is_training = property(lambda state: state.kind == "training")
     monkeypatch.setattr(request, "is_running", is_training)
     texts = draw(extension, "next_step")
-    assert any("Training: the splats follow" in text for text in texts)
+    assert any("Training: the splats improve" in text for text in texts)
     assert not any("Orbit" in text for text in texts)
 
 

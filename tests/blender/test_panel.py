@@ -110,7 +110,7 @@ def test_what_was_not_filmed_and_the_lens_are_said(extension, trained):
     for is_shown in (True, False):
         set_input(settings.splats, splat_nodes.SHOW_UNSEEN, is_shown)
         text = " ".join(draw(extension))
-        assert ("40° on its left. Blue was not filmed" in text) == is_shown
+        assert ("40° on its left. Blue parts were not filmed" in text) == is_shown
     assert "Focal length: 924 px, estimated" in text
 
 

@@ -24,6 +24,7 @@ from stga_addon.scene.display.splat_object import (
     set_input,
     splat_modifier,
 )
+from stga_addon.scene.light import throws_shadow
 from stga_addon.training.run.folder import Run, write_run
 from stga_addon.training.settings import make_settings
 
@@ -289,8 +290,8 @@ def test_a_file_says_what_is_missing_without_the_extension(extension, head, tmp_
 
 
 def test_what_the_engine_leaves_out_is_said(extension, head, tmp_path):
-    """Catches F12 by the engine that drops meshes without a warning, and a button that leaves it at
-    that."""
+    """Catches F12 by the engine that drops meshes without a warning, a button that leaves it at
+    that, and passes and shadows of a set that stay on for another engine."""
     show_ball(tmp_path / "avatar.npz")
     scene = bpy.context.scene
     hint = extension.ui.show_panel.left_out_hint
@@ -298,8 +299,15 @@ def test_what_the_engine_leaves_out_is_said(extension, head, tmp_path):
     assert hint(scene) is None
     bpy.ops.mesh.primitive_cube_add()
     assert "leaves out" in hint(scene)
+    layer = scene.view_layers[0]
+    before = layer.use_pass_z, throws_shadow(panel().splats)
     ops.choose_set(shown="SHOWN")
     assert hint(scene) is None
+    assert (layer.use_pass_z, throws_shadow(panel().splats)) == (True, True)
+    scene.render.engine = "CYCLES"
+    assert "leave out the set" in hint(scene)
+    scene.render.engine = extension.ui.show_panel.ENGINE
     ops.choose_set(shown="LEFT_OUT")
+    assert (layer.use_pass_z, throws_shadow(panel().splats)) == before
     bpy.context.object.hide_render = True
     assert hint(scene) is None

@@ -41,6 +41,8 @@ def show_set(scene: Any) -> None:
         own.scene = scene
     title = f"{scene.name} Set"
     scene[tags.SET] = bpy.data.scenes.new(title)
+    if not scene.view_layers[0].use_pass_z:
+        scene[tags.WITHOUT_SET] = True
     followers = bpy.data.collections.new(title)
     followers[tags.KIND] = tags.SET
     scene[tags.SET].collection.children.link(followers)
@@ -62,11 +64,12 @@ def show_set(scene: Any) -> None:
         head = followed_head(splats)
         if head is not None and head.library is None and not throws_shadow(splats):
             throw_shadow(splats, True)
+            splats[tags.WITHOUT_SET] = True
 
 
 def leave_out_set(scene: Any) -> None:
     """Remove the second scene and its nodes; what followed the combination follows the splats'
-    images again. Heads' shadows stay as they are."""
+    images again. The depth pass and heads' shadows that it needed are off again."""
     tree = compat.compositor_tree(scene)
     both = None if tree is None else tree.nodes.get(NODE)
     if both is not None:
@@ -77,6 +80,11 @@ def leave_out_set(scene: Any) -> None:
         for node in (both, tree.nodes.get(LAYERS)):
             if node is not None:
                 tree.nodes.remove(node)
+    if scene.pop(tags.WITHOUT_SET, False):
+        scene.view_layers[0].use_pass_z = False
+    for splats in filter(tags.is_splats, scene.objects):
+        if splats.library is None and splats.pop(tags.WITHOUT_SET, False):
+            throw_shadow(splats, False)
     other = scene.pop(tags.SET, None)
     if other is not None:
         followers = other.collection.children[:1]
