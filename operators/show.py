@@ -178,7 +178,8 @@ class PreviewImages(Edit, bpy.types.Operator):
         for thing in _own_as_trained(context):
             splat_object.choose_display(thing, mode)
         splat_object.use_transparent_bounces(scene)
-        film_set.leave_out_set(scene)  # these engines show the other objects themselves
+        if scene.render.engine != ENGINE:  # others show the set themselves
+            film_set.leave_out_set(scene)
         if mode == QUADS:
             self._limit_samples(scene.eevee)
         if getattr(space, "type", "") == "VIEW_3D":  # none where a script calls it
