@@ -73,7 +73,7 @@ def test_web_data(folder, tmp_path):
     """Catches data on people's servers that a newer player refuses, or poses in another way."""
     data = (folder / make.SKINNED).read_bytes()
     header, arrays = read_web_data(data)
-    results = evaluated(data, tmp_path)["results"]
+    results = evaluated(tmp_path, data)[0]["results"]
     rig = make.rigged().rig
     assert len(results) == len(rig.pose)
     for frame, result in enumerate(results):
