@@ -223,11 +223,8 @@ def _require_files(frames: Sequence[Frame]) -> None:
             ("mesh_path", frame.mesh),
             ("flame_param_path", frame.flame),
         ):
-            if file is None or file in seen:
-                continue
-            if not is_file(file):
+            if file is not None and file not in seen and not is_file(file):
                 raise StgaError(f"{file}: does not exist, but {frame.where} names it as its {key}")
-            check_encodable(file)
             seen.add(file)
 
 

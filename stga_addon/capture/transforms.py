@@ -2,7 +2,6 @@
 
 import itertools
 import math
-import os
 import posixpath
 import re
 import sys
@@ -257,10 +256,7 @@ def inside(root: Path, relative: str, where: str) -> Path:
     absolute = text.startswith("/") or any(drives)
     if absolute or "\0" in text or parts == ["."]:
         raise StgaError(f"{where}: {shorten(relative)} is not a path of a file relative to {root}")
-    try:
-        longest = max(len(os.fsencode(part)) for part in parts)
-    except UnicodeEncodeError:  # half of a pair, as "\\ud800"
-        raise StgaError(f"{where}: {shorten(relative)} is no name that a file can have") from None
+    longest = max(len(part.encode()) for part in parts)
     if len(text) > MAX_PATH_CHARACTERS or longest > MAX_NAME_BYTES:
         raise StgaError(f"{where}: {shorten(relative)} is longer than a path can be")
     # Behind a first "..", only the name of a sibling may follow.

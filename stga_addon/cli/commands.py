@@ -183,9 +183,12 @@ class Command:
                     problem = f"has no effect with {flag_of(specs[mode])}"
                     raise StgaError(f"{flag_of(spec)}: {problem}")
         refuse_useless(options, *self.kinds)
-        given = getattr(options, "flame", None) and getattr(options, "capture", None)
-        if given is not None and getattr(options, "motion", None) is None and needs_no_flame(given):
-            raise StgaError(f"--flame: has no effect on {given}, which is read without a model")
+        # none of the request's needs: Blender's preferences give each capture a model
+        flame, capture, motion = (
+            getattr(options, name, None) for name in ("flame", "capture", "motion")
+        )
+        if flame and capture and motion is None and needs_no_flame(capture):
+            raise StgaError(f"--flame: has no effect on {capture}, which is read without a model")
 
 
 def _about(kind: Any) -> str:

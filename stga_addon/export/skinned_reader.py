@@ -84,8 +84,8 @@ def read_skinned_splats(path: Path) -> SkinnedSplats:
             rig, faces = _rig(document, binary, arrays, header)
             avatar = _avatar(header, arrays, rig, faces)
     except (*UNREADABLE, struct.error, zlib.error) as error:
-        is_form = isinstance(error, AttributeError | TypeError)
-        reason = "its JSON is of another form" if is_form else error
+        is_otherwise = isinstance(error, AttributeError | TypeError)
+        reason = "a value of its JSON has another type" if is_otherwise else error
         raise StgaError(f"{path}: is no file of skinned splats ({reason})") from error
     check_avatar(path, avatar)
     return SkinnedSplats(avatar, rig, fps)

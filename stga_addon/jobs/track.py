@@ -344,9 +344,10 @@ def _open(request: Track, steps: "_Steps") -> tuple["Footage", tuple[str, ...]]:
             raise StgaError(f"--take around: {request.footage} has a calibration already")
     elif request.landmarks is None:
         # a few frames do not tell how the room moves, and are too far apart for cameras
-        whole = footage if request.most is None else opened(frames=replace(frames, most=None))
+        is_whole = request.most is None or request.take == "talk"
+        whole = footage if is_whole else opened(frames=replace(frames, most=None))
         found, messages = _with_found_cameras(whole, request, steps)
-        is_found = found.finds_cameras or request.most is None
+        is_found = is_whole or found.finds_cameras
         footage = found if is_found else replace(footage, warnings=found.warnings)
     steps.plan(footage)
     return (footage if request.size == 1 else sized(footage, request.size)), messages

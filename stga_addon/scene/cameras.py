@@ -125,6 +125,7 @@ CAMERA_TAGS = (tags.KIND, tags.CAPTURE, tags.CAMERA_INDEX, tags.IMAGE_SIZE, tags
 
 
 def _place_of(camera: Any) -> list[float]:
+    """A camera's own matrix, row by row, and its OPTICS."""
     optics = [getattr(camera.data, name) for name in OPTICS]
     return [*np.array(camera.matrix_basis).ravel().tolist(), *optics]
 

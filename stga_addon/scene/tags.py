@@ -38,7 +38,8 @@ POSE = "stga_pose"  # on an action: a pose in the asset browser, `rig.poses`
 HELD = "stga_held"  # on an action: the part of the capture's motion that is held outside of it
 
 SET = "stga_set"  # on a scene: the scene that renders its set, `render.film_set`
-WITHOUT_SET = "stga_without_set"  # on a scene or its splats: what a set shown has switched on
+# on a scene: its depth pass is on for its set alone; on splats: the shadow of their head is
+ON_FOR_SET = "stga_on_for_set"
 OWN_RESOLUTION = "stga_own_resolution"  # on a scene, while a capture's camera is looked through
 
 # Kinds of object.

@@ -15,10 +15,10 @@ from stga_addon.tracking import focal_length
 from stga_addon.tracking.fit import HeadFit, RecordedTake, TimestepLandmarks
 from stga_addon.tracking.focal_length import estimated_focal
 from stga_addon.tracking.folder import describe_focal_length
-from stga_addon.tracking.footage.open import open_footage, typical_focal
+from stga_addon.tracking.footage.open import open_footage, sized, typical_focal
 from stga_addon.tracking.footage.video import VideoFrames
 from stga_addon.tracking.known_person import KnownPerson
-from stga_addon.tracking.opened import TrackingOptions
+from stga_addon.tracking.opened import TrackingOptions, open_take
 from stga_addon.tracking.track import track
 
 from .recording import write_points
@@ -254,6 +254,18 @@ def test_a_phones_video_is_decoded_once_and_its_lens_is_told(tmp_path, head, mon
     assert frame["fl_x"] == pytest.approx(found.focal_length.pixels, abs=0.05)
     written = np.asarray(Image.open(tmp_path / "out" / frame["file_path"]))
     np.testing.assert_array_equal(written, footage.cameras[0].image(4))
+
+
+def test_resized_frames_of_a_video_are_decoded_once(tmp_path, head, monkeypatch):
+    """Catches a quick look's video that is decoded anew in each stage."""
+    film(tmp_path, head, 30)
+    footage = sized(open_footage(tmp_path / "phone.mp4"), 0.5)
+    opened = open_take(footage, tmp_path / "head.npz", tmp_path / "out", TrackingOptions())
+    camera = opened.footage.cameras[0]
+    image = camera.image(4)
+    np.testing.assert_array_equal(image, footage.cameras[0].image(4))
+    monkeypatch.setattr(VideoFrames, "_frame", lambda *_: pytest.fail("was decoded again"))
+    np.testing.assert_array_equal(camera.image(4), image)
 
 
 @pytest.mark.parametrize(

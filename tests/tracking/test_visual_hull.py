@@ -77,8 +77,8 @@ def test_furniture_beside_the_head_is_nobody(tmp_path):
     ids=["wrong cameras", "masks of its own"],
 )
 def test_mattes_stay(tmp_path, with_mask, camera_for, warned):
-    """Catches mattes that cameras which were found wrongly empty, without a word, and changes to
-    those of footage with masks."""
+    """Catches mattes that wrong cameras empty without a warning, and changes to those of footage
+    with masks."""
     footage, _, _ = filmed(tmp_path, with_mask)
     before = stored(tmp_path)
     warnings = cut_to_visual_hull(footage, camera_for, np.add(HEAD, (0.0, 0.0, 0.3 * warned)))

@@ -68,8 +68,8 @@ V_BLUE = SUM_BLUE
 (ALPHA, DX, DY, V_POWER, PART_RED, PART_GREEN, PART_BLUE) = (
     np.uint64(8 * PIXELS + n * LISTED * BLOCK_PIXELS) for n in range(7)
 )  # fmt: skip
-# Column c of a batch's splat q lies at c·BATCH_PAIRS + q of a flat array. The blocks that the batch
-# reaches are found in vectors for that.
+# Column c of a batch's splat q lies at c·BATCH_PAIRS + q of a flat array, so that `_find_blocks`
+# works in vectors.
 (AT_MEAN_X, AT_MEAN_Y, AT_PRECISION_X, AT_SHEAR, AT_PRECISION_Y, AT_OPACITY, AT_RED, AT_GREEN,
  AT_BLUE, AT_EXTENT_Y, AT_RATE_X, AT_RATE_Y, AT_BLOCKS) = (
     np.uint64(n * BATCH_PAIRS) for n in range(13))  # fmt: skip

@@ -42,7 +42,7 @@ def show_set(scene: Any) -> None:
     title = f"{scene.name} Set"
     scene[tags.SET] = bpy.data.scenes.new(title)
     if not scene.view_layers[0].use_pass_z:
-        scene[tags.WITHOUT_SET] = True
+        scene[tags.ON_FOR_SET] = True
     followers = bpy.data.collections.new(title)
     followers[tags.KIND] = tags.SET
     scene[tags.SET].collection.children.link(followers)
@@ -64,7 +64,7 @@ def show_set(scene: Any) -> None:
         head = followed_head(splats)
         if head is not None and head.library is None and not throws_shadow(splats):
             throw_shadow(splats, True)
-            splats[tags.WITHOUT_SET] = True
+            splats[tags.ON_FOR_SET] = True
 
 
 def leave_out_set(scene: Any) -> None:
@@ -80,10 +80,10 @@ def leave_out_set(scene: Any) -> None:
         for node in (both, tree.nodes.get(LAYERS)):
             if node is not None:
                 tree.nodes.remove(node)
-    if scene.pop(tags.WITHOUT_SET, False):
+    if scene.pop(tags.ON_FOR_SET, False):
         scene.view_layers[0].use_pass_z = False
     for splats in filter(tags.is_splats, scene.objects):
-        if splats.library is None and splats.pop(tags.WITHOUT_SET, False):
+        if splats.library is None and splats.pop(tags.ON_FOR_SET, False):
             throw_shadow(splats, False)
     other = scene.pop(tags.SET, None)
     if other is not None:

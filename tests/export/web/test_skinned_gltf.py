@@ -220,6 +220,7 @@ def set_frames(document, count):
         (lambda d, _: d["animations"][0]["channels"].pop(2), "does not turn joint 1"),
         (lambda d, _: d["animations"][0]["channels"].pop(1), "does not move the root"),
         (lambda d, _: set_frames(d, 90_000), "motion of 90000 frames is longer"),
+        (lambda d, _: d.update(extras=["stga_splats"]), "a value of its JSON has another type"),
         (
             lambda d, _: d["meshes"][0]["primitives"][0].update(targets=[{"POSITION": 4}] * 999),
             "of another type or length",
