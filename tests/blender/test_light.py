@@ -248,7 +248,9 @@ def test_nothing_is_made_anew_while_nothing_moves():
     assert again().mesh is not brighter.mesh
 
 
-@pytest.mark.parametrize("engine", ["CYCLES", pytest.param(EEVEE, marks=EEVEE_MARKS)])
+@pytest.mark.parametrize(
+    "engine", ["CYCLES", pytest.param(EEVEE, marks=(*EEVEE_MARKS, pytest.mark.nightly))]
+)
 def test_shadow_onto_the_scene(engine, tmp_path):
     """Catches a head seen where it should only throw its shadow, and no shadow."""
     shown, head = shown_head()

@@ -38,11 +38,11 @@ from stga_addon.training.run.folder import read_run
 from .arguments import REQUESTS, generate_arguments, tracked_footage
 from .damages import damage
 
-CASES = int(os.environ.get("STGA_FUZZ_CASES", 100))
+CASES = int(os.environ.get("STGA_FUZZ_CASES", 60))
 """Of every run of the tests; `make fuzz` tries 20,000."""
 PARTS = min(10, 1 + CASES // 200)
 """Tests that the cases are spread over, so that several processes share them; each makes the files
-anew, which takes longer than a hundred cases."""
+anew, which takes longer than all cases of `make test`."""
 FIRST_CASE = int(os.environ.get("STGA_FUZZ_FIRST", 0))
 MAX_CASE_S = 60
 MAX_OUTPUT_CHARACTERS = 2000

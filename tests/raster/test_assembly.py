@@ -176,6 +176,7 @@ LOOPS = {
 """name -> function, signature, its vectorized loops, and the spills that each may have"""
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize("name", LOOPS)
 def test_inner_loops_are_vectorized_on_every_processor(name, monkeypatch):
     """Catches a change that leaves a hot loop scalar, half as wide, with masked stores or with

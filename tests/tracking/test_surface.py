@@ -233,7 +233,9 @@ def distances(fit, timestep, true, head, front):
     return np.median(nearest_points(true, head.model.faces, back[front])[1])
 
 
-@pytest.mark.parametrize(("count", "share"), [(4, 0.6), (3, 0.5)])
+@pytest.mark.parametrize(
+    ("count", "share"), [pytest.param(4, 0.6, marks=pytest.mark.nightly), (3, 0.5)]
+)
 def test_skin_slides_as_dense_tracking_has_it(head, count, share):
     """Catches poses that follow the detector's landmarks where the surface does not tell, or that
     of three cameras follow the surface: the detector has the lower face 6 mm to one side, at each

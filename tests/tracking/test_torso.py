@@ -185,7 +185,8 @@ def torso_angles(model, meshes):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("heads", "torsos", "motions"), [(1, 0, ("still", "own")), (1, 0.5, ("own",))]
+    ("heads", "torsos", "motions"),
+    [(1, 0, ("still", "own")), pytest.param(1, 0.5, ("own",), marks=pytest.mark.nightly)],
 )
 def test_a_torso_that_turns_against_the_head_is_followed(head, heads, torsos, motions):
     """Catches shoulders that ride on the head, and a head that is moved to turn them."""
