@@ -25,6 +25,7 @@ from stga_addon.scene.display.lit_nodes import (
 )
 from stga_addon.scene.display.splat_nodes import DISPLAY, NATIVE, NATIVE_LIGHT, POINTS
 from stga_addon.scene.display.splat_object import set_input, store_light
+from stga_addon.scene.light import throw_shadow
 from stga_addon.scene.render.scene_splats import light_hint
 
 from .session import picture
@@ -138,14 +139,18 @@ def test_nothing_is_left_of_the_scenes_light(tmp_path):
 
 
 def test_the_panel_offers_the_light_of_native_splats(extension):
-    """Catches a choice that is not offered, or offered for other displays, and a hint that images
-    do not show the scene's light where they do."""
+    """Catches a choice that is not offered, or offered for other displays, a hint that images do
+    not show the scene's light where they do, and none where the head's mesh shadows its splats."""
     shown, _ = native_head()
     scene = bpy.context.scene
     scene.stga.splats = shown
     assert NATIVE_LIGHT in draw(extension, "show")
     assert "render colors as recorded" in light_hint(scene)
     set_input(shown, NATIVE_LIGHT, SCENE_LIGHT)
+    assert light_hint(scene) is None
+    throw_shadow(shown, True)
+    assert "turn Head Shadow off" in light_hint(scene)
+    throw_shadow(shown, False)
     assert light_hint(scene) is None
     set_input(shown, DISPLAY, POINTS)
     assert NATIVE_LIGHT not in draw(extension, "show")

@@ -35,7 +35,7 @@ from ..display.splat_object import (
 )
 from ..evaluation import evaluated, kept_evaluated, require_moved
 from ..layers import SceneLayer
-from ..light import PosedAvatar, SceneLight, lighting_settings
+from ..light import PosedAvatar, SceneLight, lighting_settings, throws_shadow
 from ..objects import objects_of_images
 from ..vertex_groups import frame_group, frame_selection
 
@@ -414,14 +414,19 @@ def forget_frame(splat_object: Any) -> bool:
 
 
 def light_hint(scene: Any) -> str | None:
-    """A sentence where EEVEE and Cycles render in another light than the scene's, or None."""
+    """A sentence where EEVEE and Cycles render in another light than the scene's, or in a shadow
+    that is none, or None."""
+    rendered = [each for each in scene.objects if tags.CONVENTION in each and not each.hide_render]
+    if any(is_lit(shown) and throws_shadow(shown) for shown in rendered):
+        return (
+            "The head's mesh darkens its own splats; in Scene Light they throw their shadow without "
+            "it: turn Head Shadow off"
+        )
     settings = lighting_settings(scene)
     if settings is None or settings.mode == "recorded":
         return None
-    for shown in scene.objects:
-        if tags.CONVENTION not in shown or shown.hide_render or stored_light(shown) is None:
-            continue
-        if is_lit(shown):
+    for shown in rendered:
+        if stored_light(shown) is None or is_lit(shown):
             continue
         frame = shown.data.get(tags.RELIT_FRAME) if RELIT_COLOR in shown.data.attributes else None
         if frame != scene.frame_current:
