@@ -429,7 +429,7 @@ def _unevenness(times: np.ndarray) -> float:
     return round(float(np.abs(steps - np.median(steps)).mean()), 6) if len(steps) else 0.0
 
 
-def evened(times: np.ndarray) -> tuple[np.ndarray, float]:
+def at_even_times(times: np.ndarray) -> tuple[np.ndarray, float]:
     """Times (T,) in seconds, ascending from 0, and the rate in rows a second, gaps ignored.
 
     Rows that are even but for rounding, as to milliseconds, get even times, at a standard rate if

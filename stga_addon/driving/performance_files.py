@@ -19,7 +19,7 @@ from .clocks import (
     OTHER_RATE,
     Columns,
     Guess,
-    evened,
+    at_even_times,
     find_times,
     numbers,
 )
@@ -325,7 +325,7 @@ def _performance(
         guesses += turns
     guesses += [*notes, *([guess.text] if guess else [])]
     times, first = np.unique(times - times.min(), return_index=True)
-    times, rate = evened(times)
+    times, rate = at_even_times(times)
     rate = fps or rate
     if not MIN_FPS <= rate <= MAX_FPS or times[-1] * rate > MAX_ROWS:
         expected = f"expected {MIN_FPS:g} to {MAX_FPS:g}"

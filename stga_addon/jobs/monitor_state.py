@@ -269,11 +269,11 @@ def transition(state: RequestState, event: Event) -> Outcome:
         case Started(subject, folder):
             return _started(state, subject, folder)
         case CancelAsked() if state.kind in TRANSIENT:
-            return _forgotten(state, KillWorker(state.folder) if state.folder else None)
+            return _without_request(state, KillWorker(state.folder) if state.folder else None)
         case CancelAsked():
             return state, (StopWorker(state.folder),) if state.folder else ()
         case Dismissed():
-            return _forgotten(state)
+            return _without_request(state)
         case SceneRead(subject, result_shown):
             is_stored = (subject, result_shown) == (state.subject, state.result_shown)
             return state, () if is_stored else _stored(state)
@@ -304,7 +304,7 @@ def _started(before: RequestState, subject: Path, folder: Path) -> Outcome:
     return state, (*stale, *_stored(state), *curve, Redraw())
 
 
-def _forgotten(state: RequestState, first: Effect | None = None, error: str = "") -> Outcome:
+def _without_request(state: RequestState, first: Effect | None = None, error: str = "") -> Outcome:
     """The state without its request, whose folder is removed."""
     empty = RequestState(state.kind, error=error)
     removed = (RemoveFiles(state.folder),) if state.folder is not None else ()
@@ -324,7 +324,7 @@ def _status_read(state: RequestState, event: StatusRead) -> Outcome:
         stopped=False,
     )
     if event.snapshot.state == WorkerState.NONE and event.files.avatar is not None:
-        return _forgotten(state)  # dismissed since the file was saved
+        return _without_request(state)  # dismissed since the file was saved
     drawn = [(each.folder, each.files.metrics, each.files.picture) for each in (before, state)]
     if drawn[0] != drawn[1] and state.kind in (*TRAINS, Kind.TRACKING):
         effects.append(ReadCurve(state.run))
@@ -340,7 +340,7 @@ def _status_read(state: RequestState, event: StatusRead) -> Outcome:
             state = replace(state, loading=state.folder)
         elif state.kind in TRANSIENT and not is_alive:
             # The panel has no options of the command line.
-            return _forgotten(state, error=state.snapshot.status.error.removeprefix("--effect "))
+            return _without_request(state, error=state.snapshot.status.error.removeprefix("--effect "))
         return state, tuple(effects)
     # the tracked capture, the trained avatar, or a preview of it, once each
     if files.capture not in (None, state.shown_capture) and (is_alive or state.has_result):
@@ -367,8 +367,8 @@ def _loading_ended(state: RequestState, undoable: bool = False, error: str = "")
     undoable = undoable or (state.kind in TRAINS and was_result and not error)
     undo = (PushUndo(),) if undoable else ()
     if state.kind in TRANSIENT:
-        forgotten, removed = _forgotten(state, error=error)
-        return forgotten, (*undo, *removed)
+        cleared, removed = _without_request(state, error=error)
+        return cleared, (*undo, *removed)
     state = replace(
         state,
         loading=None,

@@ -95,6 +95,12 @@ LID_EDGE_CM = 0.1
 LID_HALF_WIDTH_CM = 1.15
 HAIRS_PER_CLUMP = 30
 POINTS_PER_HAIR = 9
+LASHES = 260
+"""Lashes of both eyes."""
+LASH_LENGTH_M = 0.007
+"""Typical length of a lash."""
+LASH_RADIUS_M = 0.00008
+"""Radius of a lash."""
 
 
 @dataclass(frozen=True)
@@ -400,18 +406,18 @@ def _grow(
 
 def _lashes(paint: _Paint, neutral: np.ndarray, rng: np.random.Generator) -> Strands:
     """Lashes fan out from the upper lids' edges and curl up."""
-    triangle, inside = _scatter(paint, paint.lid_edges, 260, rng)
+    triangle, inside = _scatter(paint, paint.lid_edges, LASHES, rng)
     corners = paint.faces[triangle]
     root = np.einsum("nk,nka->na", inside, neutral[corners])
     away = np.einsum("nk,nka->na", inside, paint.at[corners])
     away -= np.where(away[:, :1] > 0, paint.eye_at, paint.eye_at * [-1, 1, 1])
     ahead = away * [0.75, 0.35, 1.0] + rng.normal(0, 0.06, away.shape)
     ahead /= np.linalg.norm(ahead, axis=1, keepdims=True)
-    length = 0.007 * rng.uniform(0.7, 1.1, len(root))
+    length = LASH_LENGTH_M * rng.uniform(0.7, 1.1, len(root))
     curl = np.array([0.0, 0.75, 0.0])
     t = np.linspace(0, 1, POINTS_PER_HAIR)[None, :, None]
     points = root[:, None] + length[:, None, None] * (t * ahead[:, None] + t**2 * curl)
-    return Strands("lashes", points, triangle, 0.00008, 0.97, REDNESS)
+    return Strands("lashes", points, triangle, LASH_RADIUS_M, 0.97, REDNESS)
 
 
 def _all_strands(paint: _Paint, neutral: np.ndarray) -> tuple[Strands, ...]:
