@@ -90,11 +90,17 @@ HAIRLINE = (
 )
 """(degrees from straight ahead, centimeters above the eyes)"""
 BROW_HEIGHTS_CM = 1.95, 2.6, 2.1
+"""Height of a brow above the eyes at its inner end, its arch and its outer end."""
 REDNESS = 0.5
+"""Redness of the hair's melanin, 0…1."""
 LID_EDGE_CM = 0.1
+"""Distance from a lid's edge within which lashes grow."""
 LID_HALF_WIDTH_CM = 1.15
+"""Half the width of a lid's edge with lashes."""
 HAIRS_PER_CLUMP = 30
+"""Hairs that lean toward one of them."""
 POINTS_PER_HAIR = 9
+"""Points of the line that a hair is."""
 LASHES = 260
 """Lashes of both eyes."""
 LASH_LENGTH_M = 0.007
