@@ -340,7 +340,9 @@ def _status_read(state: RequestState, event: StatusRead) -> Outcome:
             state = replace(state, loading=state.folder)
         elif state.kind in TRANSIENT and not is_alive:
             # The panel has no options of the command line.
-            return _without_request(state, error=state.snapshot.status.error.removeprefix("--effect "))
+            return _without_request(
+                state, error=state.snapshot.status.error.removeprefix("--effect ")
+            )
         return state, tuple(effects)
     # the tracked capture, the trained avatar, or a preview of it, once each
     if files.capture not in (None, state.shown_capture) and (is_alive or state.has_result):

@@ -419,8 +419,8 @@ def light_hint(scene: Any) -> str | None:
     rendered = [each for each in scene.objects if tags.CONVENTION in each and not each.hide_render]
     if any(is_lit(shown) and throws_shadow(shown) for shown in rendered):
         return (
-            "The head's mesh darkens its own splats; in Scene Light they throw their shadow without "
-            "it: turn Head Shadow off"
+            "The head's mesh darkens its own splats, which throw their shadow without it in Scene "
+            "Light: turn Head Shadow off"
         )
     settings = lighting_settings(scene)
     if settings is None or settings.mode == "recorded":
