@@ -349,26 +349,6 @@ def test_hair_ends_at_the_ears(bundled, frontal, outside):
         assert np.mean(np.abs(255 * sides.color[rows] - color).max(1) < 30) > 0.95
 
 
-def test_a_lit_and_a_shaded_side_meet_behind_a_neck(bundled, tmp_path):
-    """Catches patches of both sides' shades behind a neck, and a collar that becomes a gradient."""
-    cloth = np.array([60, 90, 150])
-    color = painted(bundled)
-    centers, level = middles(bundled)
-    in_the_shade = (centers[:, 0] < 0) ^ (np.sin(centers[:, 1] * 900) > 0.5)
-    color[in_the_shade & (level < -1.0)] = 0.85 * SKIN
-    color[level < -2.1] = cloth
-    sides = sides_of(filmed(bundled, color, TURNS_DEG, 0.0, tmp_path))
-    back = np.flatnonzero(sides.triangles & (centers[:, 2] < -0.02) & (level < -1.4))
-    found = 255 * sides.color[back]
-    is_cloth = np.abs(found - cloth).max(1) < 25
-    is_skin = np.abs(found - SKIN).max(1) < 40
-    assert min(is_cloth.sum(), is_skin.sum()) > 20
-    assert np.mean(is_cloth | is_skin) > 0.95
-    _, near = cKDTree(centers[back]).query(centers[back], 7)
-    jump = np.abs(found[near] - found[:, None]).max((1, 2))
-    assert np.quantile(jump[is_skin & ~is_cloth[near].any(1)], 0.9) < 10
-
-
 def test_what_lips_and_lids_hide(bundled, turning, outside):
     """Catches a closed mouth that is skin inside, or at the throat's end, teeth that are too white
     or train with a slit between lips, lips with a dark rim, an eye that is skin where it looks
@@ -490,13 +470,11 @@ def test_a_chest_below_the_images(bundled, tmp_path):
     assert changed.mean() < 0.1
 
 
-def test_a_mirrored_cheek_is_in_the_light_of_its_side(bundled, tmp_path):
-    """Catches a cheek that is as dark as the other one, which was filmed in the shade, beside the
-    bright half of a face; one that is as gray as the wall that its outline is blurred with; and
-    hair at the temple made brighter than the rest."""
+def test_a_mirrored_cheek(bundled, tmp_path):
+    """Catches a cheek as gray as the wall that its outline is blurred with, though the other one
+    is shown, and hair at the temple that turns to skin."""
     color = painted(bundled)
     centers, level = middles(bundled)
-    color[centers[:, 0] > 0] *= 0.6
     temple = (level > 0.3) & (centers[:, 2] < 0.055)
     color[temple] = HAIR
     angles = (0, 30, 60)

@@ -47,19 +47,13 @@ visible: a folded eyelid has less."""
 NEAREST = 24
 """Visible triangles of whose colors a hidden one has the median."""
 SOURCE_TRIANGLES = 100
-"""Triangles over which the light on a side of the face, and hair's color off axis, are medians, and
-over which unseen colors are softened."""
+"""Triangles over which hair's color off axis is a median."""
 COLLAR_SLOPE = 0.3
 """Rise of a collar from front to back, by its depth."""
 LEVEL_WEIGHT = 3.0
 """Factor by which visible triangles of neck and shoulders count as farther where they are above or
 below a hidden triangle, along the normal of the collar's plane, instead of beside it: only a neck's
 front has a chin's shadow."""
-SAME_COLOR_DEVIATION = 0.12
-"""Largest difference in 0…1 of colors that differ by their shade alone: collars and hairlines stay
-sharp."""
-MAX_LIGHT_RATIO = 2.0
-"""Largest ratio of the light on one side of a face to that on the other."""
 SHOWN_COSINE = 0.6
 """Cosine between a triangle and the camera that it faces most above which its color depends on no
 view; up to SOURCE_COSINE, it depends wholly on the view."""
@@ -94,10 +88,9 @@ class UnseenSides:
 
 def unseen_sides(surface: Surface) -> UnseenSides:
     """Colors of triangles that no camera faces. They take the color of the nearest visible
-    triangles on either side of the head; those on the other side are mirrored and relit by this
-    side's light. Unseen hair has one color, and ears take the color of ears. Visible triangles keep
-    their color, except on faces of few cameras, which take their mirror image's color where that is
-    shown better."""
+    triangles on either side of the head; those on the other side are mirrored. Unseen hair has one
+    color, and ears take the color of ears. Visible triangles keep their color, except on faces of
+    few cameras, which take their mirror image's color where that is shown better."""
     capture = surface.capture
     cosine = surface.facing
     is_outside = surface.outside
@@ -113,7 +106,7 @@ def unseen_sides(surface: Surface) -> UnseenSides:
     unseen = is_outside & (cosine < SOURCE_COSINE)
     well_shown = is_source & (cosine > WELL_SHOWN_COSINE)
     hair = _hair(surface, color, pixels > 0, is_source)
-    sides = _Sides(surface, color, well_shown, hair)
+    sides = _Sides(surface, color)
     hidden = unseen | ~shown | surface.lids
     found = color.copy()
     ears = np.zeros_like(shown) if surface.at is None else ears_of(surface.at)
@@ -128,7 +121,6 @@ def unseen_sides(surface: Surface) -> UnseenSides:
             if (own & is_source).any() and (own & hidden).any():
                 is_level = kind == "body"
                 found[own & hidden] = sides.nearest(own & is_source, own & hidden, is_level)
-        found[unseen] = sides.softened(found, unseen)
         if surface.has_few_cameras:
             turns_away = sides.of_face & is_outside & (cosine < WELL_SHOWN_COSINE)
             off_axis[turns_away] = sides.nearest(is_source & ~ears, turns_away)
@@ -192,24 +184,20 @@ def _hair(
 class _Sides:
     """Colors of a surface's triangles by those that are shown on either side of the head."""
 
-    def __init__(
-        self, surface: Surface, color: np.ndarray, well_shown: np.ndarray, hair: np.ndarray
-    ) -> None:
+    def __init__(self, surface: Surface, color: np.ndarray) -> None:
         capture = surface.capture
-        self._capture = capture
         self._color = color
         self.centers = surface.centers
-        self.of_face = np.zeros_like(well_shown)
+        self.of_face = np.zeros(len(color), bool)
         if surface.at is not None:
             self.of_face = ~surface.kinds["scalp"] & ~surface.kinds["body"]
             _, up, ahead = surface.at.axes
             tilted = unit(up + COLLAR_SLOPE * ahead)
             farther = (LEVEL_WEIGHT - 1) * (self.centers @ tilted)
             self._raised = self.centers + np.outer(farther, tilted)
-        self._hair = np.median(color[hair], axis=0) if len(hair) else np.full(3, np.inf)
-        own = well_shown & self.of_face
-        self._skin = np.median(color[own], axis=0) if own.any() else np.zeros(3)
-        self._both = mirror_images(capture, own, own)
+        self._part = connected_parts(len(capture.neutral), capture.faces)[capture.faces[:, 0]]
+        every = np.ones(len(color), bool)
+        self._partner, self._image = mirror_images(capture, every, every)
 
     def nearest(
         self, sources: np.ndarray, hidden: np.ndarray, is_level: bool = False
@@ -218,16 +206,15 @@ class _Sides:
         sources (F,) bool or mirror images of these, of the same connected part where it has
         any. is_level: whether those above and below count as farther (LEVEL_WEIGHT)."""
         centers = self._raised if is_level else self.centers
-        part = connected_parts(len(self._capture.neutral), self._capture.faces)
-        part = part[self._capture.faces[:, 0]]
         own = np.flatnonzero(sources)
-        partner, image = mirror_images(self._capture, np.ones_like(sources), sources)
-        places = centers[np.concatenate([own, partner])]
-        colors = np.concatenate([self._color[own], self._in_light(partner, image)])
-        parts = part[np.concatenate([own, partner])]
+        of_source = sources[self._image]
+        rows = np.concatenate([own, self._partner[of_source]])
+        places = centers[rows]
+        colors = self._color[np.concatenate([own, self._image[of_source]])]
+        parts = self._part[rows]
         found = self._color.copy()
-        for number in np.unique(part[hidden]):
-            rows = np.flatnonzero(hidden & (part == number))
+        for number in np.unique(self._part[hidden]):
+            rows = np.flatnonzero(hidden & (self._part == number))
             known = parts == number
             if not known.any():
                 known[:] = True
@@ -235,36 +222,11 @@ class _Sides:
             found[rows] = np.median(colors[known][near], axis=1)
         return np.asarray(found[hidden])
 
-    def softened(self, color: np.ndarray, hidden: np.ndarray) -> np.ndarray:
-        """Colors (N, 3) of the triangles `hidden` (F,) bool, of colors (F, 3): means of similar
-        ones around. What is copied from a lit and a shaded side would have patches of both."""
-        own = color[hidden]
-        around = own[nearest_rows(self.centers[hidden], self.centers[hidden], SOURCE_TRIANGLES)]
-        difference = (around - own[:, None]) / SAME_COLOR_DEVIATION
-        weight = np.exp(-(difference**2).sum(2, keepdims=True) / 2)
-        return np.asarray((weight * around).sum(1) / weight.sum(1))
-
     def mirrored(self, hidden: np.ndarray, shown: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Which of the triangles `hidden` (F,) bool have mirror images that are `shown`, and their
         colors (N, 3)."""
-        rows, image = mirror_images(self._capture, hidden, shown)
-        return rows, self._in_light(rows, image)
-
-    def _in_light(self, rows: np.ndarray, image: np.ndarray) -> np.ndarray:
-        """Colors (N, 3) of mirror images, those of the face in the light of the side of `rows`, as
-        the nearest that are shown on both sides give it."""
-        found = self._color[image]
-        both, opposite = self._both
-        from_skin = np.linalg.norm(found - self._skin, axis=1)
-        from_hair = np.linalg.norm(found - self._hair, axis=1)
-        own = np.flatnonzero(self.of_face[rows] & (from_skin < from_hair))
-        if not len(both) or not len(own):
-            return np.asarray(found)
-        near = nearest_rows(self.centers[both], self.centers[rows[own]], SOURCE_TRIANGLES)
-        here, there = (np.median(self._color[side[near]], axis=1) for side in (both, opposite))
-        gain = here / np.maximum(there, MIN_DIVISOR)
-        found[own] *= np.clip(gain, 1 / MAX_LIGHT_RATIO, MAX_LIGHT_RATIO)
-        return np.clip(found, 0, 1)
+        are_shown = hidden[self._partner] & shown[self._image]
+        return self._partner[are_shown], self._color[self._image[are_shown]]
 
 
 def _lid_colors(
