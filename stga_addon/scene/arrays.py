@@ -6,11 +6,15 @@ from typing import Any
 import bpy
 import numpy as np
 
+from ..errors import StgaError
 from .compat import action_curves
 from .evaluation import evaluated, kept_evaluated
 
 Z_UP_TO_Y_UP = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
 """Rotation from Blender's axes to those of captures: (x, y, z) is (x, z, -y)."""
+MAX_AREA_RATIO = 4.0
+"""Largest ratio of the area of a head's triangles to that of the evaluated head, for which the
+first vertices of that are the head's; in a remeshed head they are anywhere."""
 
 
 def read_values(items: Any, field: str, width: int, dtype: Any = np.float32) -> np.ndarray:
@@ -47,6 +51,36 @@ def evaluated_vertices(obj: Any) -> np.ndarray:
         mesh = shown.to_mesh()
         try:
             return mesh_vertices(mesh)
+        finally:
+            shown.to_mesh_clear()
+
+
+def own_vertices(head: Any) -> np.ndarray:
+    """(V, 3) float32 of a head's own vertices as `evaluated_vertices`, also where modifiers divide
+    its triangles or add others. Raises StgaError where they replace them."""
+    own = head.data
+    found = evaluated_vertices(head)
+    if len(found) == len(own.vertices):
+        return found
+    posed = found[: len(own.vertices)]
+    if len(posed) == len(own.vertices):
+        # in a remeshed head its vertices are anywhere
+        own.calc_loop_triangles()
+        triangles = read_values(own.loop_triangles, "vertices", 3, np.int32)
+        p0, p1, p2 = posed[triangles].swapaxes(0, 1)
+        area = np.linalg.norm(np.cross(p1 - p0, p2 - p0), axis=1).sum() / 2
+        if area <= MAX_AREA_RATIO * _evaluated_area(head):
+            return posed
+    problem = "its modifiers make other triangles"
+    raise StgaError(f"{head.name}: {problem}; switch off those that do, such as Decimate or Remesh")
+
+
+def _evaluated_area(obj: Any) -> float:
+    with kept_evaluated([obj]):
+        shown = evaluated(obj, bpy.context.evaluated_depsgraph_get())
+        mesh = shown.to_mesh()
+        try:
+            return float(read_values(mesh.polygons, "area", 1).sum())
         finally:
             shown.to_mesh_clear()
 
