@@ -12,9 +12,9 @@ from .evaluation import evaluated, kept_evaluated
 
 Z_UP_TO_Y_UP = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
 """Rotation from Blender's axes to those of captures: (x, y, z) is (x, z, -y)."""
-MAX_AREA_RATIO = 4.0
-"""Largest ratio of the area of a head's triangles to that of the evaluated head, for which the
-first vertices of that are the head's; in a remeshed head they are anywhere."""
+MAX_SPREAD = 2.0
+"""Largest ratio between the quartiles of the factors by which modifiers stretch a head's edges; of
+a remeshed head, whose first vertices are anywhere, it is larger."""
 
 
 def read_values(items: Any, field: str, width: int, dtype: Any = np.float32) -> np.ndarray:
@@ -62,27 +62,21 @@ def own_vertices(head: Any) -> np.ndarray:
     found = evaluated_vertices(head)
     if len(found) == len(own.vertices):
         return found
-    posed = found[: len(own.vertices)]
-    if len(posed) == len(own.vertices):
-        # in a remeshed head its vertices are anywhere
+    if len(found) > len(own.vertices):
         own.calc_loop_triangles()
         triangles = read_values(own.loop_triangles, "vertices", 3, np.int32)
-        p0, p1, p2 = posed[triangles].swapaxes(0, 1)
-        area = np.linalg.norm(np.cross(p1 - p0, p2 - p0), axis=1).sum() / 2
-        if area <= MAX_AREA_RATIO * _evaluated_area(head):
+        posed = found[: len(own.vertices)]
+        stretch = _edges(posed[triangles]) / np.maximum(_edges(mesh_vertices(own)[triangles]), 1e-9)
+        low, high = np.quantile(stretch, (0.25, 0.75))
+        if high <= MAX_SPREAD * low:
             return posed
     problem = "its modifiers make other triangles"
     raise StgaError(f"{head.name}: {problem}; switch off those that do, such as Decimate or Remesh")
 
 
-def _evaluated_area(obj: Any) -> float:
-    with kept_evaluated([obj]):
-        shown = evaluated(obj, bpy.context.evaluated_depsgraph_get())
-        mesh = shown.to_mesh()
-        try:
-            return float(read_values(mesh.polygons, "area", 1).sum())
-        finally:
-            shown.to_mesh_clear()
+def _edges(corners: np.ndarray) -> np.ndarray:
+    """(F, 3) lengths of the edges of triangles (F, 3, 3)."""
+    return np.asarray(np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2))
 
 
 def triangle_mesh(name: str, vertices: np.ndarray, faces: np.ndarray) -> Any:

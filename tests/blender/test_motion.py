@@ -253,10 +253,9 @@ def test_a_head_with_modifiers_is_sampled(head, own):
     head.modifiers.remove(divided)
     other = placed("ball", triangle_mesh("ball", *ball()))
     remeshed = other.modifiers.new("remeshed", "REMESH")
-    remeshed.voxel_size = 0.004
-    assert len(evaluated_vertices(other)) > len(other.data.vertices)
-    with refusal("its modifiers make other triangles"):
-        own_vertices(other)
+    for remeshed.voxel_size in (0.003, 0.005, 0.01, 0.02):
+        with refusal("its modifiers make other triangles"):
+            own_vertices(other)
     other.modifiers.remove(remeshed)
     other.modifiers.new("decimated", "DECIMATE").ratio = 0.5
     with refusal("its modifiers make other triangles"):

@@ -9,9 +9,12 @@ from ...avatar.embedding import CONVENTIONS, MIN_AREA_RATIO, UPRIGHT_COSINE
 from ...avatar.offsets import COLOR, OFFSETS, SCALE
 from ...avatar.strain import AVERAGING_ROUNDS, MIN_SQUARED_NORMAL, STRAIN_COMPONENTS, STRAIN_GAIN
 from .. import compat
-from ..arrays import MAX_AREA_RATIO
 from . import splat_attributes as stored
 from .node_builder import NodeGroup, Nodes, Socket
+
+MAX_AREA_RATIO = 4.0
+"""Largest ratio of the area of the splats' triangles to that of the evaluated head, for which the
+head's first vertices are those of the splats; in a remeshed head they are anywhere."""
 
 # Temporary attributes on the head's faces.
 _FRAME_ORIGIN = "stga_frame_origin"
