@@ -19,7 +19,7 @@ from stga_addon.training.optimize.avatar_tracking import RefinedTracking
 from stga_addon.training.run.folder import with_refined_tracking, write_tracking
 
 from .captures import mesh_at
-from .session import failure, ops, panel
+from .session import failure, ops, panel, placed
 
 pytestmark = pytest.mark.usefixtures("extension")
 TOLERANCE = 2e-6
@@ -224,13 +224,14 @@ def add_bones(rig):
     path = ear.path_from_id("rotation_euler")
     action_curves(rig).find(path, index=1).modifiers.new("CYCLES")
     rig.pose.bones["base"].location.z = 0.03
+    rig.pose.bones["jaw"].custom_shape = placed("widget")
 
 
 @pytest.mark.parametrize("as_strip", [False, True])
 def test_importing_again_keeps_bones_and_keys_that_were_added(scene, as_strip):
     """Catches bones that an artist added to the rig lost, with what they move, their keyframes,
-    pose, parents or collection; joints that two sides' mirroring displaces, and keyframes of an
-    added shape key that no longer play."""
+    pose, parents or collection; the shape by which an artist draws a bone; joints that two sides'
+    mirroring displaces, and keyframes of an added shape key that no longer play."""
     head = panel().head
     rig = rig_of(head)
     add_bones(rig)
@@ -255,6 +256,8 @@ def test_importing_again_keeps_bones_and_keys_that_were_added(scene, as_strip):
         assert "made by hand" not in bpy.context.window_manager.stga_message
         assert sorted(bone.name for bone in rig.data.bones) == names
         assert rig.data.collections["Extra"].bones.keys() == ["ear"]
+        assert rig.pose.bones["jaw"].custom_shape.name == "widget"
+        assert rig.pose.bones["left_eye"].custom_shape.name == "STGA Bone"
         for time in times:
             assert_allclose(mesh_at(time), before[time], atol=TOLERANCE)
             for name, matrix in posed[time].items():

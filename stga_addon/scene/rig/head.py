@@ -515,8 +515,8 @@ def _collect_bones(armature: Any) -> None:
 
 
 def _draw_at_skin(rig: Any, basis: np.ndarray, weights: np.ndarray, joints: np.ndarray) -> None:
-    """Draw jaw and eyes from their joints to the skin in front; as bones they point up, FLAME's
-    rest."""
+    """Draw jaw and eyes, unless an artist draws them otherwise, from their joints to the skin in
+    front; as bones they point up, FLAME's rest."""
     shape = bpy.data.objects.get(BONE_SHAPE)
     if shape is None:
         mesh = bpy.data.meshes.new(BONE_SHAPE)
@@ -530,7 +530,8 @@ def _draw_at_skin(rig: Any, basis: np.ndarray, weights: np.ndarray, joints: np.n
         bone = rig.pose.bones[name]
         moved = basis[weights[:, joint] > 0.5] - joints[joint]
         rig.data.bones[name].hide = not len(moved)  # a jaw that a shape moves
-        if len(moved):
+        is_ours = bone.custom_shape is None or bone.custom_shape in bone_shapes(rig)
+        if len(moved) and is_ours:
             tip = Vector(moved[(moved[:, 2] - np.abs(moved[:, 0])).argmax()])
             bone.custom_shape = shape
             bone.use_custom_shape_bone_size = False
@@ -543,7 +544,8 @@ def bone_shapes(rig: Any) -> list[Any]:
     them."""
     bones = rig.pose.bones if rig.pose is not None else ()
     drawn = {bone.custom_shape for bone in bones} - {None}
-    return [each for each in drawn if each.data.name.startswith(BONE_SHAPE)]
+    made = [each for each in drawn if each.data is not None]  # an artist may choose an Empty
+    return [each for each in made if each.data.name.startswith(BONE_SHAPE)]
 
 
 def _new_shape_key(
