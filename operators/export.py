@@ -35,7 +35,7 @@ from ..stga_addon.format import format_bytes
 from ..stga_addon.jobs.export import Export
 from ..stga_addon.progress import Cancelled
 from ..stga_addon.scene import tags
-from ..stga_addon.scene.arrays import Z_UP_TO_Y_UP, evaluated_vertices
+from ..stga_addon.scene.arrays import Z_UP_TO_Y_UP, own_vertices
 from ..stga_addon.scene.cameras import export_cameras, scene_camera
 from ..stga_addon.scene.display.splat_nodes import NATIVE
 from ..stga_addon.scene.display.splat_object import check_head, display_mode, later_modifiers
@@ -253,9 +253,7 @@ class ExportAvatar(SplatExport, bpy.types.Operator):
 
         python = _usd_python(context, self.format)
         owner = Identity(head)
-        return self.write_frames(
-            context, path, lambda: evaluated_vertices(owner.get()), write, [head]
-        )
+        return self.write_frames(context, path, lambda: own_vertices(owner.get()), write, [head])
 
 
 class ExportSplats(SplatExport, bpy.types.Operator):

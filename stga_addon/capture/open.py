@@ -188,10 +188,13 @@ def is_capture(path: Path) -> bool:
 def needs_no_flame(path: Path) -> bool:
     """Whether a path looks like a capture that is read without a FLAME model file: its meshes are
     files, or of the bundled head, whose model is in the folder."""
-    if not is_capture(path):
+    return is_capture(path) and (is_file(path / BUNDLED_MODEL) or has_mesh_files(path))
+
+
+def has_mesh_files(path: Path) -> bool:
+    """Whether a path looks like a capture whose meshes are files, without poses of a model."""
+    if not is_capture(path) or is_file(path / BUNDLED_MODEL):
         return False
-    if is_file(path / BUNDLED_MODEL):
-        return True
     is_flame = is_folder(path / PARAMETERS) or is_file(path / CANONICAL_NAME)
     return not is_flame and not _names(transforms_files(path), "flame_param_path")
 

@@ -16,7 +16,7 @@ from ..avatar.file import read_avatar
 from ..avatar.filmed import filmed_sides
 from ..capture.filmed import filmed
 from ..capture.model import Capture, summarize_capture
-from ..capture.open import is_capture, needs_no_flame, open_capture
+from ..capture.open import has_mesh_files, is_capture, needs_no_flame, open_capture
 from ..capture.other_input import other_input
 from ..errors import StgaError, printable
 from ..export.formats import FORMATS
@@ -189,6 +189,8 @@ class Command:
         )
         if flame and capture and motion is None and needs_no_flame(capture):
             raise StgaError(f"--flame: has no effect on {capture}, which is read without a model")
+        if getattr(options, "zero_pose", None) and capture and has_mesh_files(capture):
+            raise StgaError(f"--zero-pose: has no effect on {capture}, whose meshes have no pose")
 
 
 def _about(kind: Any) -> str:

@@ -117,8 +117,8 @@ def _flame_joints(path: Path, rig: Rig) -> list[int]:
 
 
 def _model(path: Path, rig: Rig, faces: np.ndarray) -> Arrays:
-    """Arrays of a FLAME model; of each joint that the rig lacks, one that moves nothing. Raises
-    StgaError as `_flame_joints`."""
+    """Arrays of a FLAME model; of each joint that the rig lacks, and in place of expressions that
+    it has none of, one that moves nothing. Raises StgaError as `_flame_joints`."""
     own = rig.basis[: rig.expressions]
     joints = _flame_joints(path, rig)
     # the weights of vertices, of least norm, that give a joint's place and how shapes move it
@@ -137,7 +137,7 @@ def _model(path: Path, rig: Rig, faces: np.ndarray) -> Arrays:
     weights[:, joints] = rig.weights
     arrays = {
         "v_template": rig.base,
-        "shapedirs": np.moveaxis(own, 0, 2),
+        "shapedirs": np.moveaxis(own if len(own) else np.zeros((1, *rig.base.shape)), 0, 2),
         "n_identity": np.array(0),
         "J_regressor": joint_regressor,
         "kintree_table": np.array([parents, range(len(JOINTS))], np.int64),
@@ -158,8 +158,9 @@ def _motion(path: Path, rig: Rig) -> Arrays:
     frames = len(rig.pose)
     turns = np.zeros((frames, len(JOINTS), 3))
     turns[:, _flame_joints(path, rig)] = rig.pose
+    expressions = rig.coefficients[:, : rig.expressions]
     motion = {
-        "expr": rig.coefficients[:, : rig.expressions],
+        "expr": expressions if rig.expressions else np.zeros((frames, 1)),
         "rotation": turns[:, 0],
         "neck_pose": turns[:, 1],
         "jaw_pose": turns[:, 2],

@@ -170,10 +170,11 @@ class Track:
         if self.avatar is not None and has_run(self.avatar) and (self.model or self.meshes):
             name = "--meshes" if self.model is None else "--model"
             raise StgaError(f"{name}: does not go with --avatar, whose head is tracked")
-        for name in ("cameras", "landmarks"):
-            if self.take == "around" and getattr(self, name) is not None:
+        known = ("cameras", "landmarks") if self.take == "around" else ("cameras",)
+        for name in known if self.take != "auto" else ():
+            if getattr(self, name) is not None:
                 problem = f"does not go with --{name}, which is of cameras that are known"
-                raise StgaError(f"--take around: {problem}")
+                raise StgaError(f"--take {self.take}: {problem}")
 
 
 @dataclass(frozen=True)

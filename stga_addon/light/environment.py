@@ -22,8 +22,12 @@ SUN_CONTRAST = 12.0
 """Brightness, relative to the environment's mean, above which a pixel belongs to a sun."""
 SUN_RADIUS = np.radians(12)
 """Angle from the brightest pixel within which bright ones are the same sun."""
-HDR_SIZE = re.compile(rb"\n[-+][XY] +(\d{1,9}) +[-+][XY] +(\d{1,9})\s")
-"""Line of a .hdr picture that says its size."""
+HDR_SIZE = re.compile(rb"\n([-+][XY]) +(\d{1,9}) +([-+][XY]) +(\d{1,9})\s")
+"""Line of a .hdr picture that says its size and in which order its pixels follow."""
+TOP_LEFT_FIRST = (b"-Y", b"+X")
+"""The order of pixels that is read: rows from the top, each from the left."""
+MAX_RUN_PIXELS = 3
+"""Largest number of pixels that together say the length of a run."""
 MAX_HDR_HEADER_BYTES = 1 << 16
 """Bytes in which it is searched."""
 UPRIGHT = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
@@ -36,20 +40,48 @@ def read_hdr(path: Path) -> np.ndarray:
     import cv2  # Blender, which reads the pictures of its worlds itself, may have none
 
     data = read_bytes(path)
-    size = HDR_SIZE.search(data[:MAX_HDR_HEADER_BYTES]) if data.startswith(b"#?") else None
-    if size is not None and not is_image_size(int(size[1]), int(size[2])):
-        raise StgaError(
-            f"{path}: claims {int(size[1])} x {int(size[2])} pixels; at most {MAX_IMAGE_PIXELS} "
-            "are read; scale it down"
-        )
+    line = HDR_SIZE.search(data[:MAX_HDR_HEADER_BYTES]) if data.startswith(b"#?") else None
+    if line is not None:
+        size = int(line[2]), int(line[4])
+        if not is_image_size(*size):
+            raise StgaError(
+                f"{path}: claims {size[0]} x {size[1]} pixels; at most {MAX_IMAGE_PIXELS} are "
+                "read; scale it down"
+            )
+        if (line[1], line[3]) != TOP_LEFT_FIRST:
+            order = f"{line[1].decode()} {line[3].decode()}"
+            problem = f"its pixels follow in the order {order}, expected -Y +X"
+            raise StgaError(f"{path}: {problem}; save it again with another program")
+        data = data[: line.end()] + _without_old_runs(data[line.end() :], size[0] * size[1])
     flags = cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH
     try:
-        found = None if size is None else cv2.imdecode(np.frombuffer(data, np.uint8), flags)
+        found = None if line is None else cv2.imdecode(np.frombuffer(data, np.uint8), flags)
     except (cv2.error, MemoryError):  # empty, or claims too many pixels
         found = None
     if found is None or found.dtype != np.float32:
         raise StgaError(f"{path}: is not a Radiance picture (.hdr), or its pixels are damaged")
     return np.asarray(cv2.cvtColor(found, cv2.COLOR_BGR2RGB, found))
+
+
+def _without_old_runs(body: bytes, count: int) -> bytes:
+    """The pixels of a .hdr picture, in which those that repeat the one before, (1, 1, 1, number),
+    are written out, because OpenCV takes them for colors. Other pixels have a larger mantissa;
+    scanlines of the newer run-length encoding stay as they are. count: pixels of the picture."""
+    if body[:2] == b"\2\2" and body[2:3] < b"\x80":
+        return body
+    pixels = np.frombuffer(body, np.uint8, len(body) // 4 * 4).reshape(-1, 4)[:count]
+    is_run = (pixels[:, :3] == 1).all(axis=1)
+    if not is_run.any():
+        return body
+    rows = np.arange(len(pixels), dtype=np.int32)
+    before = np.maximum.accumulate(np.where(is_run, 0, rows))
+    place = rows - before - 1  # in a number of several pixels, the lowest first
+    lengths = pixels[:, 3].astype(np.int32) << 8 * np.clip(place, 0, MAX_RUN_PIXELS - 1)
+    repeats = np.where(is_run, np.minimum(lengths, count), 1)
+    used = 1 + np.searchsorted(np.cumsum(repeats, dtype=np.int64), count)
+    if is_run[0] or place.max() >= MAX_RUN_PIXELS or used > len(pixels):
+        return b""
+    return np.repeat(pixels[before[:used]], repeats[:used], axis=0)[:count].tobytes()
 
 
 def pixel_directions(height: int, width: int) -> tuple[np.ndarray, np.ndarray]:

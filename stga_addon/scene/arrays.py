@@ -6,11 +6,15 @@ from typing import Any
 import bpy
 import numpy as np
 
+from ..errors import StgaError
 from .compat import action_curves
 from .evaluation import evaluated, kept_evaluated
 
 Z_UP_TO_Y_UP = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
 """Rotation from Blender's axes to those of captures: (x, y, z) is (x, z, -y)."""
+MAX_SPREAD = 2.0
+"""Largest ratio between the quartiles of the factors by which modifiers stretch a head's edges; of
+a remeshed head, whose first vertices are anywhere, it is larger."""
 
 
 def read_values(items: Any, field: str, width: int, dtype: Any = np.float32) -> np.ndarray:
@@ -49,6 +53,30 @@ def evaluated_vertices(obj: Any) -> np.ndarray:
             return mesh_vertices(mesh)
         finally:
             shown.to_mesh_clear()
+
+
+def own_vertices(head: Any) -> np.ndarray:
+    """(V, 3) float32 of a head's own vertices as `evaluated_vertices`, also where modifiers divide
+    its triangles or add others. Raises StgaError where they replace them."""
+    own = head.data
+    found = evaluated_vertices(head)
+    if len(found) == len(own.vertices):
+        return found
+    if len(found) > len(own.vertices):
+        own.calc_loop_triangles()
+        triangles = read_values(own.loop_triangles, "vertices", 3, np.int32)
+        posed = found[: len(own.vertices)]
+        stretch = _edges(posed[triangles]) / np.maximum(_edges(mesh_vertices(own)[triangles]), 1e-9)
+        low, high = np.quantile(stretch, (0.25, 0.75))
+        if high <= MAX_SPREAD * low:
+            return posed
+    problem = "its modifiers make other triangles"
+    raise StgaError(f"{head.name}: {problem}; switch off those that do, such as Decimate or Remesh")
+
+
+def _edges(corners: np.ndarray) -> np.ndarray:
+    """(F, 3) lengths of the edges of triangles (F, 3, 3)."""
+    return np.asarray(np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2))
 
 
 def triangle_mesh(name: str, vertices: np.ndarray, faces: np.ndarray) -> Any:

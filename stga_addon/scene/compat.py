@@ -1,6 +1,7 @@
 """Differences between Blender 4.2 and 5.3: every version switch of the add-on."""
 
 import hashlib
+import re
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from typing import Any, NamedTuple
@@ -8,6 +9,8 @@ from typing import Any, NamedTuple
 import bpy
 import numpy as np
 
+from ..driving.performance import ARKIT_SHAPES
+from ..flame.model import JOINTS
 from . import tags
 
 SLOTTED_ACTIONS = bpy.app.version >= (4, 4, 0)
@@ -91,6 +94,19 @@ def all_curves(action: Any) -> list[Any]:
     return [curve for bag in bags for curve in bag.fcurves]
 
 
+IMPORTED_CURVE = re.compile(
+    rf'pose\.bones\["({"|".join(JOINTS)})"\]\.(rotation_quaternion|location)'
+    rf'|key_blocks\["(t\d+|(expr_|identity_|offset_t)\d+|{"|".join(ARKIT_SHAPES)})"\]\.value'
+    r'|\["stga_\w+"\]'
+)
+"""Data path of what an import, or a performance, keyframes; others are an artist's."""
+
+
+def _is_added(curve: Any) -> bool:
+    """Whether an f-curve of a rig or of shape keys moves what an artist added to them."""
+    return IMPORTED_CURVE.fullmatch(curve.data_path) is None
+
+
 def mark_imported(owner: Any) -> None:
     """Mark the action of `owner` as what an import has made."""
     animation = owner.animation_data
@@ -99,7 +115,8 @@ def mark_imported(owner: Any) -> None:
 
 
 def is_made_by_hand(action: Any) -> bool:
-    """Whether an action has other keyframes than an import gave it, and other work is in them."""
+    """Whether an action has other keyframes than an import gave it of what that moves, and other
+    work is in them."""
     is_ours = tags.HELD in action or tags.PERFORMANCE in action
     return not is_ours and action.get(tags.IMPORTED) != _digest(action)
 
@@ -107,6 +124,8 @@ def is_made_by_hand(action: Any) -> bool:
 def _digest(action: Any) -> str:
     digest = hashlib.blake2b(digest_size=8)
     for curve in all_curves(action):
+        if _is_added(curve):
+            continue
         places = np.empty(2 * len(curve.keyframe_points), np.float32)
         curve.keyframe_points.foreach_get("co", places)
         digest.update(f"{curve.data_path} {curve.array_index}".encode() + places.tobytes())
@@ -205,8 +224,9 @@ KeptPoint = tuple[tuple[float, float], dict[str, Any]]
 class KeptAnimation(NamedTuple):
     """What performances, and keyframes made by hand, gave an owner: NLA tracks, as fields and
     strips; values that shape keys have beside them, by data path; how its action acts; names of
-    strips that scripts cannot make; and the action in place of its own, with the slot's identifier,
-    None for its own."""
+    strips that scripts cannot make; the action in place of its own, with the slot's identifier,
+    None for its own; the blend of the import's own strip; and a copy of its own action, with the
+    slot's identifier, where that moves what an artist added."""
 
     tracks: list[tuple[dict[str, Any], list[tuple[Any, ...]]]]
     held: Mapping[str, float]
@@ -214,6 +234,8 @@ class KeptAnimation(NamedTuple):
     lost: list[str]
     action: Any = None
     slot: str | None = None
+    blend: float = 0.0
+    added: tuple[Any, str | None] | None = None
 
 
 def slot_of(user: Any) -> str | None:
@@ -238,6 +260,8 @@ def keep_animation(owner: Any) -> KeptAnimation:
     own_rows = 1 + bool(holding)
     kept = []
     lost = list[str]()
+    blend = 0.0
+    added = None
     for row, track in enumerate(tracks):
         strips = []
         for strip in _clips(track.strips, lost):
@@ -245,6 +269,8 @@ def keep_animation(owner: Any) -> KeptAnimation:
             if not is_own or is_made_by_hand(strip.action):
                 strip.action.use_fake_user = True
             if is_own:
+                blend = max(blend, strip.blend_out)
+                added = added or _copy_if_added(strip.action, slot_of(strip))
                 continue
             fields = {name: getattr(strip, name) for name in STRIP_FIELDS}
             found = ((path, strip.fcurves.find(path)) for path in STRIP_CURVES)
@@ -259,9 +285,57 @@ def keep_animation(owner: Any) -> KeptAnimation:
     how = {name: getattr(animation, name) for name in ACTION_FIELDS if animation}
     action = animation.action if animation else None
     if action is None or (tags.PERFORMANCE not in action and _is_of_import(action, owner)):
-        return KeptAnimation(kept, held, how, lost)
+        if action is not None:
+            added = _copy_if_added(action, slot_of(animation))
+        return KeptAnimation(kept, held, how, lost, blend=blend, added=added)
     action.use_fake_user = True
-    return KeptAnimation(kept, held, how, lost, action, slot_of(animation))
+    return KeptAnimation(kept, held, how, lost, action, slot_of(animation), blend, added)
+
+
+def _copy_if_added(action: Any, slot: str | None) -> tuple[Any, str | None] | None:
+    """A copy of an action of an import, with the identifier of its slot, if that moves what an
+    artist added."""
+    if tags.HELD in action or not any(map(_is_added, _curves_of_slot(action, slot))):
+        return None
+    return action.copy(), slot
+
+
+def _curves_of_slot(action: Any, slot: str | None) -> Any:
+    """The f-curves of the slot of an identifier; of None all, as actions without slots have."""
+    return all_curves(action) if slot is None else _slot_curves(action, action.slots[slot])
+
+
+def give_added_curves(owner: Any, kept: KeptAnimation) -> None:
+    """Let the new action of an owner also move what an artist added, as the one before did."""
+    if kept.added is None:
+        return
+    before, slot = kept.added
+    curves = action_curves(owner)
+    for curve in filter(_is_added, _curves_of_slot(before, slot)):
+        try:
+            owner.path_resolve(curve.data_path)
+        except ValueError:  # what it moved is gone
+            continue
+        _copy_curve(curve, curves.new(curve.data_path, index=curve.array_index))
+    bpy.data.actions.remove(before)
+
+
+def _copy_curve(curve: Any, copy: Any) -> None:
+    """Give an empty f-curve keyframes, modifiers and fields of another one."""
+    kept = [_kept_point(each) for each in curve.keyframe_points]
+    for place, _ in kept:
+        copy.keyframe_points.insert(*place)
+    for point, (_, fields) in zip(copy.keyframe_points, kept, strict=True):
+        for field, value in fields.items():
+            setattr(point, field, value)
+    for field in ("extrapolation", "mute"):
+        setattr(copy, field, getattr(curve, field))
+    for each in curve.modifiers:
+        made = copy.modifiers.new(each.type)
+        for field in each.bl_rna.properties:
+            if not field.is_readonly:
+                setattr(made, field.identifier, getattr(each, field.identifier))
+    copy.update()
 
 
 def _is_of_import(action: Any, owner: Any) -> bool:

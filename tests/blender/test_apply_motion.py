@@ -13,13 +13,13 @@ from stga_addon.capture.open import open_capture
 from stga_addon.flame.forward import FlameFrame, flame_forward
 from stga_addon.scene import tags
 from stga_addon.scene.arrays import key_points
-from stga_addon.scene.compat import strip_curves
+from stga_addon.scene.compat import action_curves, strip_curves
 from stga_addon.scene.rig.head import rig_of
 from stga_addon.training.optimize.avatar_tracking import RefinedTracking
 from stga_addon.training.run.folder import with_refined_tracking, write_tracking
 
 from .captures import mesh_at
-from .session import failure, ops, panel
+from .session import failure, ops, panel, placed
 
 pytestmark = pytest.mark.usefixtures("extension")
 TOLERANCE = 2e-6
@@ -197,6 +197,73 @@ def test_importing_again_keeps_what_was_made_by_hand(scene):
     assert camera.data.dof.use_dof
 
 
+def add_bones(rig):
+    """As an artist adds them: one on the neck, which skins the mesh, and one that holds the
+    root."""
+    bpy.context.view_layer.objects.active = rig
+    bpy.ops.object.mode_set(mode="EDIT")
+    bones = rig.data.edit_bones
+    for name, parent in (("ear", "neck"), ("ring", "ear"), ("base", "")):
+        added = bones.new(name)
+        added.head = (0.1, 0.02, 0.0)
+        added.tail = (0.15, 0.05, 0.02)
+        added.roll = 0.3
+        added.parent = bones.get(parent)
+    top = next(name for name in ("root_joint", "root") if name in bones)
+    bones[top].parent = bones["base"]
+    bpy.ops.object.mode_set(mode="OBJECT")
+    rig.data.collections.new("Extra").assign(rig.data.bones["ear"])
+    rig.data.use_mirror_x = True
+    head = panel().head
+    head.vertex_groups.new(name="ear").add([3, 4, 5], 0.7, "REPLACE")
+    ear = rig.pose.bones["ear"]
+    ear.rotation_mode = "XYZ"
+    for frame, turn in ((0, 0.0), (3, 0.8)):
+        ear.rotation_euler.y = turn
+        ear.keyframe_insert("rotation_euler", frame=frame)
+    path = ear.path_from_id("rotation_euler")
+    action_curves(rig).find(path, index=1).modifiers.new("CYCLES")
+    rig.pose.bones["base"].location.z = 0.03
+    rig.pose.bones["jaw"].custom_shape = placed("widget")
+
+
+@pytest.mark.parametrize("as_strip", [False, True])
+def test_importing_again_keeps_bones_and_keys_that_were_added(scene, as_strip):
+    """Catches bones that an artist added to the rig lost, with what they move, their keyframes,
+    pose, parents or collection; the shape by which an artist draws a bone; joints that two sides'
+    mirroring displaces, and keyframes of an added shape key that no longer play."""
+    head = panel().head
+    rig = rig_of(head)
+    add_bones(rig)
+    fix = head.shape_key_add(name="fix", from_mix=False)
+    fix.points[0].co.x += 0.1
+    for frame, value in ((0, 0.0), (3, 1.0)):
+        fix.value = value
+        fix.keyframe_insert("value", frame=frame)
+    if as_strip:
+        ops.apply_motion(filepath=scene.file, start=12, place="strip")
+    times = (0, 1.5, 3, 7.5, 13)
+
+    names = sorted(bone.name for bone in rig.data.bones)
+    before = {time: mesh_at(time) for time in times}
+    posed = {}
+    for time in times:
+        mesh_at(time)
+        posed[time] = {bone.name: np.array(bone.matrix) for bone in rig.pose.bones}
+    assert np.abs(posed[0]["ring"] - posed[7.5]["ring"]).max() > 0.01
+    for _ in range(2):
+        ops.import_capture(directory=scene.folder, flame=scene.model_file)
+        assert "made by hand" not in bpy.context.window_manager.stga_message
+        assert sorted(bone.name for bone in rig.data.bones) == names
+        assert rig.data.collections["Extra"].bones.keys() == ["ear"]
+        assert rig.pose.bones["jaw"].custom_shape.name == "widget"
+        assert rig.pose.bones["left_eye"].custom_shape.name == "STGA Bone"
+        for time in times:
+            assert_allclose(mesh_at(time), before[time], atol=TOLERANCE)
+            for name, matrix in posed[time].items():
+                assert_allclose(rig.pose.bones[name].matrix, matrix, atol=TOLERANCE)
+
+
 def test_a_mesh_sequence_keeps_its_performances(tmp_path):
     """Catches performances, and the shapes that they move, which another import of the same
     capture takes away."""
@@ -221,6 +288,24 @@ def test_a_mesh_sequence_keeps_its_performances(tmp_path):
             ops.import_capture(directory=folder)
             for time, expected in zip(times, before, strict=True):
                 assert_allclose(mesh_at(time), expected, atol=TOLERANCE)
+
+
+def test_the_capture_passes_into_the_neutral_face(scene):
+    """Catches a face that jumps where its capture ends under performances, also after another
+    import of the capture, and a capture that does not play as a whole."""
+    last = max(scene.own.timesteps)
+    own = [mesh_at(frame) for frame in scene.own.timesteps]
+    ops.apply_motion(filepath=scene.file, start=40, place="strip", blend=6)
+    for _ in range(2):
+        for frame, expected in zip(scene.own.timesteps, own, strict=True):
+            assert_allclose(mesh_at(frame), expected, atol=TOLERANCE)
+        behind = np.stack([mesh_at(last + frame) for frame in range(8)])
+        assert_array_equal(behind[6], behind[7])
+        steps = np.abs(np.diff(behind[:7], axis=0)).max(axis=(1, 2))
+        whole = np.abs(behind[6] - behind[0]).max()
+        assert whole > 1e-3
+        assert steps.max() < 0.3 * whole
+        ops.import_capture(directory=scene.folder, flame=scene.model_file)
 
 
 def test_the_head_is_neutral_beside_strips(scene):

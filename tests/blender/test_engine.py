@@ -528,9 +528,13 @@ def test_what_cannot_be_rendered_is_named():
         shown_layers()
     bpy.ops.object.mode_set(mode="OBJECT")
     assert len(shown_layers()) == 1
-    head.modifiers.new("finer", "SUBSURF")
-    with failure("head: has other triangles than head splats"):
-        bpy.ops.render.render()
+    for kind in ("SUBSURF", "EDGE_SPLIT"):
+        changed = head.modifiers.new("other", kind)
+        if kind == "EDGE_SPLIT":
+            changed.split_angle = 0.0
+        with failure("head: has other triangles than head splats"):
+            bpy.ops.render.render()
+        head.modifiers.remove(changed)
     set_input(shown, splat_nodes.HEAD, None)
     with failure("has no head to follow"):
         bpy.ops.render.render()

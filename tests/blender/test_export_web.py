@@ -135,6 +135,18 @@ def test_an_avatar_comes_back(extension, tmp_path):
     assert np.ptp(corners, axis=0) == pytest.approx(np.ptp(before[1], axis=0)[[0, 2, 1]], abs=2e-3)
 
 
+def test_an_avatar_without_sliders_comes_back(extension, tmp_path):
+    """Catches a file of the motion alone that is refused for what it never had, or stands still."""
+    demo_head(tmp_path)
+    ops.export_avatar(filepath=tmp_path / "anna.glb", format="skinned-gltf", motion_only=True)
+    frames = range(3)
+    before = np.array([mesh_at(frame) for frame in frames])
+    bpy.ops.wm.read_homefile(use_empty=True)
+    ops.import_avatar(filepath=tmp_path / "anna.glb")
+    found = np.array([mesh_at(frame) for frame in frames])
+    assert np.abs(found - before).max() < BLENDER_TOLERANCE_M
+
+
 def test_importing_an_avatar_overwrites_nothing(extension, tmp_path, monkeypatch):
     """Catches a trained run beside the file that gets its quantized copy, a second head by a second
     import, a file in a read-only folder that is refused, heads called "motion", a warning of FLAME

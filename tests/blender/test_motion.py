@@ -6,13 +6,14 @@ from dataclasses import replace
 import bpy
 import numpy as np
 import pytest
+from capture.factory import ball
 from numpy.testing import assert_allclose
 from refusal import refusal
 
 from stga_addon.flame.forward import flame_forward
 from stga_addon.flame.sequence import PARTS, retimed, sequence_mesh
 from stga_addon.scene import compat
-from stga_addon.scene.arrays import evaluated_vertices
+from stga_addon.scene.arrays import evaluated_vertices, own_vertices, triangle_mesh
 from stga_addon.scene.compat import SLOTTED_ACTIONS
 from stga_addon.scene.rig import keyframes
 from stga_addon.scene.rig.head import import_head, rig_of
@@ -239,6 +240,26 @@ def test_sampled_motion_equals_the_keyframes(head, own):
     sample_motion(head, own, (2,), warn=said.append)
     assert len(said) == 1
     assert re.search(r"by up to \d+\.\d mm", said[0])
+
+
+def test_a_head_with_modifiers_is_sampled(head, own):
+    """Catches a traceback, or scattered vertices, where a modifier divides the head's triangles or
+    makes others, and a subdivided head that is refused."""
+    plain = own_vertices(head)
+    divided = head.modifiers.new("divided", "SUBSURF")
+    divided.subdivision_type = "SIMPLE"
+    assert_allclose(own_vertices(head), plain, atol=1e-6)
+    assert len(sample_motion(head, own, (4, 5)).timesteps) == 2
+    head.modifiers.remove(divided)
+    other = placed("ball", triangle_mesh("ball", *ball()))
+    remeshed = other.modifiers.new("remeshed", "REMESH")
+    for remeshed.voxel_size in (0.003, 0.005, 0.01, 0.02):
+        with refusal("its modifiers make other triangles"):
+            own_vertices(other)
+    other.modifiers.remove(remeshed)
+    other.modifiers.new("decimated", "DECIMATE").ratio = 0.5
+    with refusal("its modifiers make other triangles"):
+        own_vertices(other)
 
 
 def test_sampled_motion_includes_edits_by_hand(head, own):

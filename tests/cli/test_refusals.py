@@ -63,6 +63,10 @@ $ export {avatar} --format ply --out {o}.ply --motion take.csv
 --motion: has no effect with --format ply without --timestep
 $ track {root} --out {o} --take around --cameras {cameras}
 --take around: does not go with --cameras
+$ track {root} --out {o} --take talk --cameras {cameras}
+--take talk: does not go with --cameras
+$ select {root} --zero-pose all
+--zero-pose: has no effect on {root}, whose meshes have no pose
 $ track {root} --out {o} --take around
 --take around: {root} has a calibration already
 $ info {root} --flame {model}

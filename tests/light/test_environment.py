@@ -1,11 +1,12 @@
 """Environments and files of lights: what is written is read, and an environment keeps its light."""
 
+import itertools
 import struct
 
 import cv2
 import numpy as np
 import pytest
-from numpy.testing import assert_allclose
+from numpy.testing import assert_allclose, assert_array_equal
 from refusal import refusal
 
 from stga_addon.light.environment import (
@@ -69,6 +70,45 @@ def test_hdr_pixels(tmp_path, packed):
             r"b\.hdr: claims \d+ x \d+ pixels" if data in (huge, large) else r"b\.hdr: is no"
         ):
             read_hdr(damaged)
+
+
+def old_runs(pixels):
+    """Pixels (H, W, 4) uint8 with runs of equal ones as Radiance wrote them at first: one pixel,
+    then (1, 1, 1, byte) for each byte of the number of others, from the lowest."""
+    data = b""
+    for row in pixels:
+        starts = [0, *1 + np.flatnonzero((row[1:] != row[:-1]).any(axis=1)), len(row)]
+        for start, end in itertools.pairwise(starts):
+            data += row[start].tobytes()
+            others = int(end - start - 1)
+            while others:
+                data += bytes([1, 1, 1, others & 255])
+                others >>= 8
+    return data
+
+
+@pytest.mark.parametrize("width", [6, 40, 900])
+def test_old_runs_and_other_orders(tmp_path, width):
+    """Catches runs of the older encoding read as colors, silently where bytes follow the pixels,
+    and pictures in another order of pixels called damaged."""
+    pixels = np.exp(np.random.default_rng(0).normal(size=(4, width, 3)))
+    pixels[:, 3:-2] = [0.5, 2.0, 30.0]
+    pixels[2] = 0.25
+    path = write_hdr(tmp_path / "a.hdr", pixels, False)
+    expected = read_hdr(path)
+    size = b"-Y 4 +X %d\n" % width
+    header = path.read_bytes().partition(size)[0]
+    data = old_runs(rgbe(pixels))
+    for padding in (b"", bytes(16 * width)):
+        path.write_bytes(header + size + data + padding)
+        assert_array_equal(read_hdr(path), expected)
+    for body in (data[:-8], b"\1\1\1\5" + data, data[:4] + b"\1\1\1\0" * 4 + data[4:]):
+        path.write_bytes(header + size + body)
+        with refusal(r"a\.hdr: is no"):
+            read_hdr(path)
+    path.write_bytes(header + b"+Y 4 +X %d\n" % width + data)
+    with refusal(r"a\.hdr: its pixels follow in the order \+Y \+X"):
+        read_hdr(path)
 
 
 def test_an_environment_keeps_its_irradiance():

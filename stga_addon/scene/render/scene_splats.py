@@ -169,7 +169,7 @@ def visible_layers(
         head = followed_head(each)
         if head is None:
             raise StgaError(f"{each.name}: has no head to follow; choose one in its modifier")
-        vertices = _posed_vertices(each, head, stored.faces, depsgraph)
+        vertices = _posed_vertices(each, head, stored, depsgraph)
         vertices, frames = cache.frames(each, stored, vertices)
         avatar = PosedAvatar(each, head, stored, vertices, to_world)
         relit = cache.light.relit(avatar, find_visible, depsgraph)
@@ -268,13 +268,15 @@ def with_heads(scene: Any) -> list[Any]:
     return [*shown, *map(followed_head, shown)]
 
 
-def _posed_vertices(splat_object: Any, head: Any, faces: np.ndarray, depsgraph: Any) -> np.ndarray:
+def _posed_vertices(splat_object: Any, head: Any, avatar: Avatar, depsgraph: Any) -> np.ndarray:
     """(V, 3) of the evaluated head in the splat object's space. Raises StgaError where the head has
-    not as many triangles as `faces`."""
+    not as many triangles and vertices as the avatar."""
     modifier = splat_modifier(splat_object.evaluated_get(depsgraph))
     require_moved(head, modifier, depsgraph)
     posed = evaluated(head, depsgraph)
-    if posed.type != "MESH" or len(posed.data.loops) != faces.size:
+    wanted = avatar.faces.size, len(avatar.neutral)
+    mesh = posed.data if posed.type == "MESH" else None
+    if mesh is None or (len(mesh.loops), len(mesh.vertices)) != wanted:
         follower = splat_object.name
         reason = f"has other triangles than {follower}, which follows it; check its modifiers"
         if head.mode == "EDIT":

@@ -25,6 +25,7 @@ from .. import arrays, tags
 from ..arrays import Z_UP_TO_Y_UP, add_driver, flat_floats, key_points
 from ..compat import (
     KeptAnimation,
+    give_added_curves,
     give_animation,
     is_unused_import,
     keep_animation,
@@ -81,6 +82,7 @@ def import_head(capture: Capture, warn: Warn = log_warning, correctives: str = "
     mark_imported(head.data.shape_keys)
     for owner, animation, driven in zip(_animated(head), kept, drivers, strict=True):
         if owner is not None:
+            give_added_curves(owner, animation)
             _give_back(owner, animation)
             if names := ", ".join(animation.lost):
                 gone = "transitions and meta strips are gone, but not their clips"
@@ -131,7 +133,7 @@ MAX_DIFFERENCE_M = 1e-4
 
 def _give_back(owner: Any, kept: KeptAnimation) -> None:
     if kept.tracks:
-        keyframes.push_down_own(owner)
+        keyframes.push_down_own(owner, kept.blend)
     if kept.held:
         keyframes.hold_beside_strips(owner, kept.held)
     give_animation(owner, kept)
@@ -242,6 +244,12 @@ def shape_key_model(thing: Any) -> tuple[np.ndarray, np.ndarray, tuple[str, ...]
     return mean, faces, tuple(block.name for block in others), shapes
 
 
+RIG_BONES = {
+    name
+    for joint in JOINTS
+    for name in (joint, keyframes.parent_bone(joint), keyframes.deform_bone(joint))
+}
+"""Names of the bones that an import makes."""
 BONE_SHAPE = "STGA Bone"
 BONE_LENGTH = 0.03  # meters; only how long the bones are displayed
 NEGLIGIBLE_DISPLACEMENT = 1e-6  # meters along an axis, with all sliders at their limits
@@ -408,7 +416,7 @@ OWN = "open that file, or make the head's mesh local"
 
 
 def _remove_bone_groups(head: Any, rigs: Sequence[Any]) -> None:
-    bones = {bone.name for rig in rigs for bone in rig.data.bones}
+    bones = {bone.name for rig in rigs for bone in rig.data.bones} & RIG_BONES
     for group in reversed([group for group in head.vertex_groups if group.name in bones]):
         head.vertex_groups.remove(group)
 
@@ -421,16 +429,21 @@ def _rigs(head: Any) -> list[Any]:
 def _place_armature(
     head: Any, joints: np.ndarray, parents: np.ndarray, deformed: Sequence[str]
 ) -> Any:
-    """The rig's object with bones at joints (5, 3); deformed: the bones that vertices follow."""
+    """The rig's object with bones at joints (5, 3); deformed: the bones that vertices follow. Bones
+    that an artist added to an earlier import's stay, with their parents."""
     title = f"{head.parent.name} rig"
-    armature = bpy.data.armatures.new(title)
+    existing = next(iter(_rigs(head)), None)
+    armature = bpy.data.armatures.new(title) if existing is None else existing.data.copy()
     temporary = bpy.data.objects.new(title, armature)  # edit mode needs an object that is visible
     layer = bpy.context.view_layer
     active = layer.objects.active
     leave_edit_mode()
     bpy.context.scene.collection.objects.link(temporary)
     layer.objects.active = temporary
+    is_mirrored = armature.use_mirror_x
+    armature.use_mirror_x = False  # of left and right eye, the one would move the other
     bpy.ops.object.mode_set(mode="EDIT")
+    held = _remove_joints(armature)
     for name, last, parent, (x, y, z) in zip(
         JOINTS, deformed, parents.tolist(), joints.tolist(), strict=True
     ):
@@ -443,19 +456,18 @@ def _place_armature(
             edited.roll = 0.0
             edited.parent = armature.edit_bones[above] if above else None
             above = link
+    _give_parents(armature, held)
     bpy.ops.object.mode_set(mode="OBJECT")
+    armature.use_mirror_x = is_mirrored
     layer.objects.active = active
     bpy.data.objects.remove(temporary)
-    visible = armature.collections.new("Joints")
-    hidden = armature.collections.new("Helpers")
-    hidden.is_visible = False
-    for made in armature.bones:
-        (visible if made.name in JOINTS else hidden).assign(made)
-    rig = place(head.parent, tags.RIG, title, armature, next(iter(_rigs(head)), None))
+    _collect_bones(armature)
+    rig = place(head.parent, tags.RIG, title, armature, existing)
     rig.show_in_front = True
     layer.update()  # creates the pose bones
     for bone in rig.pose.bones:
-        bone.matrix_basis = Matrix()
+        if bone.name in RIG_BONES:
+            bone.matrix_basis = Matrix()
     for joint, name in enumerate(JOINTS):
         bone = rig.pose.bones[name]
         bone.rotation_mode = "QUATERNION"
@@ -465,9 +477,46 @@ def _place_armature(
     return rig
 
 
+def _remove_joints(armature: Any) -> dict[str, tuple[str, bool]]:
+    """Remove the bones of an earlier import from an armature in Edit mode. Returns what is between
+    them and bones that an artist added: bone -> its parent, and whether it is connected to that."""
+    bones = armature.edit_bones
+    held = {
+        bone.name: (bone.parent.name, bone.use_connect)
+        for bone in bones
+        if bone.parent is not None and (bone.name in RIG_BONES) != (bone.parent.name in RIG_BONES)
+    }
+    for bone in [bone for bone in bones if bone.name in RIG_BONES]:
+        bones.remove(bone)
+    return held
+
+
+def _give_parents(armature: Any, held: Mapping[str, tuple[str, bool]]) -> None:
+    """Give bones the parents that `_remove_joints` found, but joints those of the model."""
+    bones = armature.edit_bones
+    for name, (parent, is_connected) in held.items():
+        # removed bones have left their children to their own parents
+        if name not in RIG_BONES or (name in bones and bones[name].parent is None):
+            bones[name].parent = bones.get(parent)
+            bones[name].use_connect = is_connected
+
+
+def _collect_bones(armature: Any) -> None:
+    """Put joints into a bone collection, and the bones that move with them into a hidden one."""
+    known = armature.collections_all
+    visible = known.get("Joints") or armature.collections.new("Joints")
+    hidden = known.get("Helpers")
+    if hidden is None:
+        hidden = armature.collections.new("Helpers")
+        hidden.is_visible = False
+    for made in armature.bones:
+        if made.name in RIG_BONES:
+            (visible if made.name in JOINTS else hidden).assign(made)
+
+
 def _draw_at_skin(rig: Any, basis: np.ndarray, weights: np.ndarray, joints: np.ndarray) -> None:
-    """Draw jaw and eyes from their joints to the skin in front; as bones they point up, FLAME's
-    rest."""
+    """Draw jaw and eyes, unless an artist draws them otherwise, from their joints to the skin in
+    front; as bones they point up, FLAME's rest."""
     shape = bpy.data.objects.get(BONE_SHAPE)
     if shape is None:
         mesh = bpy.data.meshes.new(BONE_SHAPE)
@@ -481,7 +530,8 @@ def _draw_at_skin(rig: Any, basis: np.ndarray, weights: np.ndarray, joints: np.n
         bone = rig.pose.bones[name]
         moved = basis[weights[:, joint] > 0.5] - joints[joint]
         rig.data.bones[name].hide = not len(moved)  # a jaw that a shape moves
-        if len(moved):
+        is_ours = bone.custom_shape is None or bone.custom_shape in bone_shapes(rig)
+        if len(moved) and is_ours:
             tip = Vector(moved[(moved[:, 2] - np.abs(moved[:, 0])).argmax()])
             bone.custom_shape = shape
             bone.use_custom_shape_bone_size = False
@@ -494,7 +544,8 @@ def bone_shapes(rig: Any) -> list[Any]:
     them."""
     bones = rig.pose.bones if rig.pose is not None else ()
     drawn = {bone.custom_shape for bone in bones} - {None}
-    return [each for each in drawn if each.data.name.startswith(BONE_SHAPE)]
+    made = [each for each in drawn if each.data is not None]  # an artist may choose an Empty
+    return [each for each in made if each.data.name.startswith(BONE_SHAPE)]
 
 
 def _new_shape_key(

@@ -238,8 +238,9 @@ class Placement(NamedTuple):
 
 def push_down_own(owner: Any, blend: float = 0.0) -> None:
     """Turn the action of rig or shape keys into a strip with effect only where it lasts: beside it
-    the face is neutral, and the head stays where it was. blend: of a performance, as of
-    `Placement`."""
+    the face is neutral, and the head stays where it was. blend: frames of its ends, of a
+    performance as of `Placement`, of the capture's own motion, which plays as a whole, beside
+    it."""
     animation = owner.animation_data
     if animation is None or animation.action is None:
         return
@@ -259,8 +260,18 @@ def push_down_own(owner: Any, blend: float = 0.0) -> None:
         assign_action(animation, action, slot)
     is_performance = tags.PERFORMANCE in animation.action
     push_down_action(owner, "NOTHING")
-    if is_performance:
-        _blend_ends(animation.nla_tracks[-1].strips[0], blend)
+    strip = animation.nla_tracks[-1].strips[0]
+    if not is_performance:
+        _hold_ends(strip, blend)
+    _blend_ends(strip, blend)
+
+
+def _hold_ends(strip: Any, duration: float) -> None:
+    """Let a strip last longer on both sides, where its first and its last pose stay."""
+    strip.action_frame_start -= duration
+    strip.action_frame_end += duration
+    strip.frame_start_raw = strip.action_frame_start
+    strip.frame_end_raw = strip.action_frame_end
 
 
 def _blend_ends(strip: Any, blend: float) -> None:
