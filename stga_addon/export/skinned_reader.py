@@ -117,8 +117,8 @@ def _flame_joints(path: Path, rig: Rig) -> list[int]:
 
 
 def _model(path: Path, rig: Rig, faces: np.ndarray) -> Arrays:
-    """Arrays of a FLAME model; of each joint that the rig lacks, and in place of expressions that
-    it has none of, one that moves nothing. Raises StgaError as `_flame_joints`."""
+    """Arrays of a FLAME model. A joint that the rig lacks moves nothing; a rig without expressions
+    gets one that moves nothing. Raises StgaError as `_flame_joints`."""
     own = rig.basis[: rig.expressions]
     joints = _flame_joints(path, rig)
     # the weights of vertices, of least norm, that give a joint's place and how shapes move it

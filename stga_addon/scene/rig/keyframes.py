@@ -238,9 +238,9 @@ class Placement(NamedTuple):
 
 def push_down_own(owner: Any, blend: float = 0.0) -> None:
     """Turn the action of rig or shape keys into a strip with effect only where it lasts: beside it
-    the face is neutral, and the head stays where it was. blend: frames of its ends, of a
-    performance as of `Placement`, of the capture's own motion, which plays as a whole, beside
-    it."""
+    the face is neutral, and the head stays where it was. blend: frames in which the strip's ends
+    pass into the neutral face. Those of a performance are within it, as `Placement` has them; the
+    capture's own motion plays whole, and its first and last pose stay for as long."""
     animation = owner.animation_data
     if animation is None or animation.action is None:
         return
@@ -267,7 +267,8 @@ def push_down_own(owner: Any, blend: float = 0.0) -> None:
 
 
 def _hold_ends(strip: Any, duration: float) -> None:
-    """Let a strip last longer on both sides, where its first and its last pose stay."""
+    """Let a strip begin `duration` frames earlier and end as many later: its first and its last
+    pose are held there."""
     strip.action_frame_start -= duration
     strip.action_frame_end += duration
     strip.frame_start_raw = strip.action_frame_start
