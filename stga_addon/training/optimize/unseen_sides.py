@@ -48,9 +48,9 @@ NEAREST = 24
 """Visible triangles of whose colors a hidden one has the median."""
 SOURCE_TRIANGLES = 100
 """Triangles over which hair's color off axis is a median."""
-COLLAR_SLOPE = 0.3
+COLLAR_SLOPE = 0.6
 """Rise of a collar from front to back, by its depth."""
-LEVEL_WEIGHT = 3.0
+LEVEL_WEIGHT = 8.0
 """Factor by which visible triangles of neck and shoulders count as farther where they are above or
 below a hidden triangle, along the normal of the collar's plane, instead of beside it: only a neck's
 front has a chin's shadow."""
