@@ -253,7 +253,8 @@ def test_a_head_with_modifiers_is_sampled(head, own):
     head.modifiers.remove(divided)
     other = placed("ball", triangle_mesh("ball", *ball()))
     remeshed = other.modifiers.new("remeshed", "REMESH")
-    for remeshed.voxel_size in (0.003, 0.005, 0.01, 0.02):
+    for size in (0.003, 0.005, 0.01, 0.02):
+        remeshed.voxel_size = size
         with refusal("its modifiers make other triangles"):
             own_vertices(other)
     other.modifiers.remove(remeshed)

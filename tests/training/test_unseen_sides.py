@@ -349,6 +349,23 @@ def test_hair_ends_at_the_ears(bundled, frontal, outside):
         assert np.mean(np.abs(255 * sides.color[rows] - color).max(1) < 30) > 0.95
 
 
+def test_shoulders_behind_a_shirt_are_clothed(bundled, tmp_path):
+    """Catches shoulders in the color of the neck where a camera in front, lower than the face, does
+    not see them: a shirt is open in front and reaches the nape."""
+    color = painted(bundled)
+    centers, level = middles(bundled)
+    color[(color == CLOTH).all(1)] = SKIN
+    color[level + 0.6 * centers[:, 2] / 0.07 < -2.2] = CLOTH
+    surface = Surface(filmed(bundled, color, (0,), -0.3, tmp_path))
+    sides = unseen_sides(surface)
+    unseen = sides.triangles & surface.kinds["body"]
+    for kind in (CLOTH, SKIN):
+        rows = unseen & (color == kind).all(1)
+        assert rows.sum() > 100
+        away = np.abs(255 * sides.color[rows] - kind).max(1)
+        assert (away < 30).mean() > 0.88
+
+
 def test_what_lips_and_lids_hide(bundled, turning, outside):
     """Catches a closed mouth that is skin inside, or at the throat's end, teeth that are too white
     or train with a slit between lips, lips with a dark rim, an eye that is skin where it looks

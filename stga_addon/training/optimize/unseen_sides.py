@@ -47,7 +47,7 @@ visible: a folded eyelid has less."""
 NEAREST = 24
 """Visible triangles of whose colors a hidden one has the median."""
 SOURCE_TRIANGLES = 100
-"""Triangles over which hair's color off axis is a median."""
+"""Triangles over which hair's color off axis, and that of the layer behind skin, are medians."""
 COLLAR_SLOPE = 0.6
 """Rise of a collar from front to back, by its depth."""
 LEVEL_WEIGHT = 8.0
