@@ -178,13 +178,13 @@ _active: dict[int, int] = {}
 
 
 def _follow_active(scene: Any) -> None:
-    """Let the panel work on the head of what has become the active object."""
+    """If the active object has changed, let the panel work on the head that it belongs to."""
     active = bpy.context.view_layer.objects.active if bpy.context.scene == scene else None
     followed = _active.get(scene.session_uid)
     if active is None or followed == active.session_uid:
         return
     _active[scene.session_uid] = active.session_uid
-    if followed is None:  # as the file was saved
+    if followed is None:  # first call for this scene: keep the saved head
         return
     family = (active, *mover_of(active).children)
     head = next((each for each in family if is_head(each)), scene.stga.head)

@@ -175,18 +175,21 @@ def key_regions(head: Any) -> list[str]:
 
 
 def count_selected(scene: Any, head: Any) -> None:
-    """Fill the panel's table of selected triangles."""
+    """Fill the panel's table: how many triangles each frame selects, and how many splats they have,
+    or will have at the start of a training."""
     settings = scene.stga
     per_face = groups.splats_per_face(settings.splats, head)
     order = TrainingSettings().lattice_order(len(head.data.polygons))
-    every = (order + 1) * (order + 2) // 2  # at the start of a training
+    initial_per_face = (order + 1) * (order + 2) // 2
     settings.selected_frames.clear()
     for timestep, selected in groups.read_selection(head).items():
         row = settings.selected_frames.add()
         row.frame = timestep
         row.triangles = int(selected.sum())
-        counted = row.triangles * every if per_face is None else per_face[selected].sum()
-        row.splats = int(counted)
+        if per_face is None:
+            row.splats = row.triangles * initial_per_face
+        else:
+            row.splats = int(per_face[selected].sum())
 
 
 def _fractions(head: Any) -> np.ndarray:

@@ -168,15 +168,19 @@ def transforms_files(folder: Path) -> list[Path]:
 def read_transforms(
     path: Path, principal_point: str = DEFAULT_PRINCIPAL_POINT, moved: bool = False
 ) -> tuple[Frame, ...]:
-    """Read the frames of one transforms file; neither images nor tracked files are opened, nor need
-    they exist.
+    """Read the frames of one transforms file. Images and tracked files are not opened, and need not
+    exist.
 
-    A frame's own intrinsics take precedence over the top level's, which are wrong in some exports.
-    `transform_matrix` is camera-to-world with OpenGL axes. `principal_point` defines `cy`: "vhap"
-    (H − cy from the top, as VHAP's exporter writes it), "opencv" (from the top) or "center" (cx and
-    cy are ignored, as GaussianAvatars does). Paths are relative to the file's folder and may leave
-    it only for a sibling folder (union sets of VHAP); moved: those of images that lead elsewhere
-    are sought by their names. Raises StgaError naming the file and the field.
+    Intrinsics of a frame take precedence over those of the top level, which are wrong in some
+    exports. `transform_matrix` is camera-to-world with OpenGL axes. Paths are relative to the
+    file's folder, and may leave it only for a sibling folder (union sets of VHAP). Raises StgaError
+    naming the file and the field.
+
+    principal_point  what `cy` means: "vhap" (H − cy from the top, as VHAP's exporter writes it),
+                     "opencv" (from the top), or "center" (cx and cy are ignored, as in
+                     GaussianAvatars)
+    moved            the file was moved: an image whose path leads outside is searched for in the
+                     file's folder, by what follows the last ".." or by its name
     """
     return _numbered(_timed(_read_frames(path, read_json(path), principal_point, moved)))
 

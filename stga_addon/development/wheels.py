@@ -142,10 +142,10 @@ def this_platform() -> str:
 
 
 def collect_wheels(folder: Path, target: Target, log: Log = lambda line: None) -> list[Path]:
-    """The wheels that training needs on the target, downloaded into `folder` where they are
-    missing; sorted by name. log: called with each one.
+    """The wheels that training needs on the target, sorted by name. Those that `folder` lacks are
+    downloaded into it. log: called with a line for each wheel.
 
-    Raises StgaError where one cannot be had.
+    Raises StgaError if a wheel is not available.
     """
     wanted = [*REQUIREMENTS.values(), GPU_REQUIREMENT, CAMERAS_REQUIREMENT]
     wheels: dict[str, Path] = {}

@@ -351,16 +351,19 @@ class SeenPoints:
     def unexplained(
         self, shot: TorsoShot, at: np.ndarray, level: int
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Fraction (N,) from 0 to 1 of each point, moved to `at` (N, 3), that the images do not
-        explain, and (N,) bool whether it is seen."""
+        """How little the images support the points once they are moved to `at` (N, 3).
+
+        Returns two arrays: (N,) from 0, where the images agree with `reference`, to 1, where they
+        contradict it; and (N,) bool, whether the point's camera observes it there.
+        """
         fraction = np.zeros(len(at))
-        seen = np.zeros(len(at), bool)
+        is_observed = np.zeros(len(at), bool)
         for number, rows in self.rows.items():
             if number in shot.views:
                 residual = self.residual(shot, number, rows, at[rows], level)
                 fraction[rows] = unexplained(residual, level)
-                seen[rows] = shot.shows(number, at[rows])
-        return fraction, seen
+                is_observed[rows] = shot.shows(number, at[rows])
+        return fraction, is_observed
 
     def residual(
         self, shot: TorsoShot, number: int, rows: np.ndarray, at: np.ndarray, level: int

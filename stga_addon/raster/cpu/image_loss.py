@@ -164,8 +164,11 @@ def _load_source(image, target, row, c, rows, columns):
 
 @inline_jit
 def _similarity_row(rows, columns):
-    """Write SSIM of a row to `similarities`, and its derivatives by three of the four `moments` to
-    `slopes`, there from PADDING_PX on."""
+    """Write the SSIM of a row's pixels to `similarities`, and its derivatives to `slopes`.
+
+    The derivatives are with respect to three blurred values: the mean of the image, the sum of
+    squares, and the product. Each plane of `slopes` begins with PADDING_PX empty pixels.
+    """
     moments = rows.moments
     slopes = rows.slopes
     stride = columns.stride
@@ -195,7 +198,7 @@ def _similarity_row(rows, columns):
         slopes[np.uint64(stride + PADDING_PX) + n] = by_squares
         slopes[np.uint64(2 * stride + PADDING_PX) + n] = by_product
         rows.similarities[n] = ssim
-    for plane in range(3):  # what lies beyond the image has no slope
+    for plane in range(3):  # derivatives beyond the image are zero
         beyond = plane * stride + PADDING_PX
         slopes[beyond + columns.span : beyond + columns.padded] = ZERO
 

@@ -285,7 +285,8 @@ def _next_tile(tile, column, width, tiles_x):
 
 @inline_jit
 def _count_pairs(k, rect, order, tiles_x, row):
-    """Count the pairs of part k of order (M,), the splats near to far, in each tile (tiles,)."""
+    """Write to `row` (tiles,) how many splats of part k overlap each tile. `order` (M,) are the
+    numbers of the splats, sorted from near to far; part k is the k-th of SORT_PARTS."""
     row[:] = 0
     past = np.uint64((k + 1) * len(order) // SORT_PARTS)
     for n in range(np.uint64(k * len(order) // SORT_PARTS), past):

@@ -172,11 +172,12 @@ class Rasterizer:
         v_image: Any,
         v_transmittance: Any = None,
     ) -> Tables:
-        """Record the gradient of every pair; returns the tables with those of the rendering."""
+        """Record the backward pass of blending, which writes the gradient of every pair of a splat
+        and a tile; returns the tables of the rendering and of these gradients."""
         self.device.buffer("pair_gradients", PROJECTED * self.capacity)
         constants = {} if v_transmittance is None else {"HAS_V_TRANSMITTANCE": True}
-        given = {"v_image": v_image, "v_transmittance": v_transmittance or v_image}
-        tables = rendering | given
+        # The shader binds both; it does not read v_transmittance without the constant.
+        tables = rendering | {"v_image": v_image, "v_transmittance": v_transmittance or v_image}
         columns, rows = tile_grid(camera.width, camera.height)
         groups = Device.groups_of(columns * rows + self.capacity // SEGMENT_PAIRS + 1)
         work.dispatch("blend.backward", groups, tables, **constants)

@@ -32,13 +32,13 @@ CAMERA = Camera(16, 16, 16.0, 16.0, 8.0, 8.0, np.eye(4))
 
 
 def precompile_kernels(device: str = "cpu") -> None:
-    """Compile what training on a device of `choose_device` runs: the CPU's kernels, which evaluate,
-    and the GPU's.
+    """Compile all kernels that a training on this device (`choose_device`) runs.
 
-    Each of the former runs once on two splats, with the argument types of real training. If the
-    cache is empty, a second process compiles rendering at the same time (`raster.cpu.precompile`).
-    While a process compiles ahead (`jobs.compile_ahead`), this one waits for it, unless it has
-    kernels that are bundled (`raster.cpu.bundled`).
+    The CPU's kernels are always compiled, because evaluations run on the CPU: each runs once on two
+    splats, with the argument types of real training. If the cache is empty, a second process
+    compiles rendering at the same time (`raster.cpu.precompile`). If another process is already
+    compiling ahead (`jobs.compile_ahead`), this one waits for it first, unless kernels are bundled
+    (`raster.cpu.bundled`).
     """
     end = time.monotonic() + HELPER_TIMEOUT_S
     while not USES_BUNDLED_KERNELS and is_preparing() and time.monotonic() < end:

@@ -232,17 +232,18 @@ class _Sides:
 def _lid_colors(
     surface: Surface, is_source: np.ndarray, color: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Lids (M,) that stay in their folds, which are in the shade, and the median color (M, 3) of
-    skin in their half of the face; none where no skin is shown there."""
-    found = np.full(color.shape, np.nan)
+    """Triangles (M,) of folded lids, of which views show only a shaded edge, and the colors (M, 3)
+    that they get: the median of the observed skin in the same half of the face. Lids are left out
+    where no skin is observed in their half."""
+    skin_color = np.full(color.shape, np.nan)
     at = surface.at
     if at is not None:
         skin = face_of(at) & is_source
         for half in (at.azimuth > 0, at.azimuth <= 0):
             if (skin & half).any():
-                found[surface.folded_lids & half] = np.median(color[skin & half], axis=0)
-    lids = np.flatnonzero(np.isfinite(found[:, 0]))
-    return lids, found[lids]
+                skin_color[surface.folded_lids & half] = np.median(color[skin & half], axis=0)
+    lids = np.flatnonzero(np.isfinite(skin_color[:, 0]))
+    return lids, skin_color[lids]
 
 
 def _fringe(at: HeadCoordinates, shown: np.ndarray) -> np.ndarray:

@@ -36,12 +36,12 @@ ROUNDING = 1e-5
 def starting_state(
     continuation: Continuation, settings: TrainingSettings, triangles: int
 ) -> TrainState:
-    """The parent's avatar as a state of training on a mesh of so many triangles.
+    """The state with which a continuation begins: the parent's avatar, on a mesh with this number
+    of triangles.
 
-    Where the settings have colors or positions follow strain and the avatar's do not, they begin by
-    zero. The optimizer continues where the parent's checkpoint is of that very avatar; otherwise
-    its moments are zero. Raises StgaError where the avatar is not the one that the continuation was
-    made for.
+    Driven offsets that the settings ask for and the avatar lacks begin at zero. Adam's moments are
+    those of the parent's checkpoint if its averaged splats are the avatar's, and zero otherwise.
+    Raises StgaError if the avatar has changed since the continuation was started.
     """
     folder = continuation.parent
     if file_digest(folder / AVATAR) != continuation.avatar:
@@ -55,13 +55,13 @@ def starting_state(
         kept = read_checkpoint(folder).state
     if kept is not None:
         offsets = {name: offset.average for name, offset in kept.driven_offsets.items()}
-        ours = {**vars(avatar.splats), **avatar.driven_offsets}
-        latest = replace(avatar, driven_offsets=offsets).with_limited_offsets
-        theirs = {**vars(kept.splats(averaged=True)), **latest.driven_offsets}
-        if ours.keys() == theirs.keys() and all(
-            array.shape == theirs[name].shape
-            and np.allclose(array, theirs[name], rtol=0, atol=ROUNDING)
-            for name, array in ours.items()
+        of_avatar = {**vars(avatar.splats), **avatar.driven_offsets}
+        limited = replace(avatar, driven_offsets=offsets).with_limited_offsets
+        of_checkpoint = {**vars(kept.splats(averaged=True)), **limited.driven_offsets}
+        if of_avatar.keys() == of_checkpoint.keys() and all(
+            array.shape == of_checkpoint[name].shape
+            and np.allclose(array, of_checkpoint[name], rtol=0, atol=ROUNDING)
+            for name, array in of_avatar.items()
         ):
             parameters = Parameters(*(array.copy() for array in kept.average))
             screen, count = np.zeros((2, len(kept)), np.float32)
