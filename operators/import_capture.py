@@ -155,7 +155,7 @@ class HeadImport(Edit):
             frame_head(head, middle, [context.window.screen])
         if set_up_scene and cameras:
             configure_scene(scene, capture, middle, warn=warn)
-        for sentence in filter(self.is_told, capture.warnings):
+        for sentence in filter(self.is_reported, capture.warnings):
             warn(sentence)
         _finish_replacing(head, used, had_sliders, warn)
         counted = {"timesteps": capture.timesteps, "triangles": capture.faces, "cameras": cameras}
@@ -164,7 +164,7 @@ class HeadImport(Edit):
         show_panel()
         begin_preparing()
 
-    def is_told(self, warning: str) -> bool:
+    def is_reported(self, warning: str) -> bool:
         return not self.ignored_warning or self.ignored_warning not in warning
 
 

@@ -118,10 +118,10 @@ def summarize_run(metrics: Sequence[Mapping[str, Any]], settings: TrainingSettin
     gain = next((line[TRACKING_GAIN] for line in metrics if TRACKING_GAIN in line), None)
     if gain is not None:
         verb, then = ("gain", "") if gain > 0 else ("lose", ", so heads stay as they were tracked")
-        says = f"views left out {verb} {abs(gain):.2f} dB{then}"
+        outcome = f"views left out {verb} {abs(gain):.2f} dB{then}"
         if math.isnan(gain):
-            says = "kept unchecked: no view could be left out of it"
-        lines.append(f"tracking by the avatar: {says}")
+            outcome = "kept unchecked: no view could be left out of it"
+        lines.append(f"tracking by the avatar: {outcome}")
     plateau = forecasts.flat_since(metrics)
     if plateau is not None:
         helps = "more time does not help with these settings"

@@ -42,7 +42,7 @@ UNSEEN_INPUTS = (splat_nodes.SHOW_UNSEEN, splat_nodes.FILMED_ONLY)
 """Inputs of avatars that know what was filmed."""
 POPUP_MARGIN_PX = 60
 """Width of a window that a popup's text leaves free."""
-_is_told = False
+_is_reported = False
 """Whether the render job in progress has said what it does not show."""
 
 
@@ -164,19 +164,19 @@ def _begin_exposure(scene: Any) -> None:
 
 @persistent
 def _before_job(*_: Any) -> None:
-    global _is_told
-    _is_told = False
+    global _is_reported
+    _is_reported = False
 
 
 @persistent
 def _before_image(scene: Any, *_: Any) -> None:
-    """Say once a job that an image does not show the scene's light, or its other objects."""
-    global _is_told
-    if _is_told:
+    """Report once a job that an image does not show the scene's light, or its other objects."""
+    global _is_reported
+    if _is_reported:
         return
     hint = light_hint(scene) if shows_nodes(scene) else left_out_hint(scene)
     if hint:
-        _is_told = True
+        _is_reported = True
         print(f"STGA: {hint}")
         if not bpy.app.background:  # this is the job's thread
             bpy.app.timers.register(partial(_pop_up, hint))

@@ -143,13 +143,13 @@ def export(request: Export, report: Report, log: Log) -> Written:
     flame = None if capture is None else capture.flame
     meshes: Meshes = [(0, avatar.neutral)]
     if format.has_rig and capture is None and request.frames is None:
-        _say_size(request, avatar, 1, log)
+        _log_size(request, avatar, 1, log)
         playback = Playback(title=_title(request), fps=fps, motion_only=True)
-        _say_licence(flame_notice(avatar, None, motion_only=True), log)
+        _log_licence(flame_notice(avatar, None, motion_only=True), log)
     elif format.source == "range":
         capture = avatar_source.required_capture(capture)
         timesteps = avatar_source.timesteps_between(capture, request.frames, log)
-        _say_size(request, avatar, len(timesteps), log)
+        _log_size(request, avatar, len(timesteps), log)
         if format.has_rig:
             playback, flame = capture_playback(request, avatar, capture, timesteps, fps, log)
         posed = ((timestep, capture.mesh(timestep)) for timestep in timesteps)
@@ -163,8 +163,8 @@ def export(request: Export, report: Report, log: Log) -> Written:
     return Written(request.output)
 
 
-def _say_size(request: Export, avatar: Avatar, frames: int, log: Log) -> None:
-    """Say how large the file will be. Raises StgaError where the disk has too little free space."""
+def _log_size(request: Export, avatar: Avatar, frames: int, log: Log) -> None:
+    """Log how large the file will be. Raises StgaError where the disk has too little free space."""
     size = FORMATS[request.file_format].size(Content(avatar), frames)
     check_free_space(request.output, size)
     log(
@@ -186,7 +186,7 @@ def capture_playback(
     fps: float,
     log: Log,
 ) -> tuple[Playback, FlameSequence | None]:
-    """What a page shows of timesteps, and its FLAME motion. Says what of FLAME it holds."""
+    """What a page shows of timesteps, and its FLAME motion. Logs what of FLAME it holds."""
     # what each timestep trains: the open file's or the run's selection, else by the rule
     chosen: Mapping[int, np.ndarray] | None = None
     if request.played is not None:
@@ -216,11 +216,11 @@ def capture_playback(
     notice = flame_notice(avatar, sequence, motion_only)
     if sequence is not None and not motion_only:
         notice += " --motion-only leaves them out, but not the meshes of the take."
-    _say_licence(notice, log)
+    _log_licence(notice, log)
     return playback, sequence
 
 
-def _say_licence(notice: str, log: Log) -> None:
+def _log_licence(notice: str, log: Log) -> None:
     if notice:
         log(notice)
 

@@ -35,7 +35,7 @@ BROKEN = {
 def _first_picture(monkeypatch):
     """As in a new process."""
     monkeypatch.setattr(renderer, "_problems", {})
-    monkeypatch.setattr(engine, "_told", set())
+    monkeypatch.setattr(engine, "_reported", set())
 
 
 def break_shader(monkeypatch, name):

@@ -285,7 +285,7 @@ def view_camera(scene: Any, view_name: str) -> Any:
     return scene.objects.get(name) or camera
 
 
-_told: set[str] = set()
+_reported: set[str] = set()
 """Why the GPU cannot draw, each sentence once in this process."""
 
 
@@ -313,8 +313,8 @@ def draw_image(
         return kept[0].read()
     except Exception as error:  # of many kinds, by device and version
         reason = f"Splats are not drawn by Blender's GPU module ({error})"
-        if reason not in _told:
-            _told.add(reason)
+        if reason not in _reported:
+            _reported.add(reason)
             warn(reason)
         return None
 

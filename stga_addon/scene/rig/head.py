@@ -108,7 +108,7 @@ def _animated(head: Any) -> tuple[Any, Any, Any]:
 
 
 def follow_moved_capture(
-    heads: Iterable[Any], capture: Capture, say: Callable[[str], object]
+    heads: Iterable[Any], capture: Capture, log: Callable[[str], object]
 ) -> None:
     """Let a head, with all that was imported with it, be that of a capture that is its own, moved:
     where the folder of before is gone, and triangles, timesteps and neutral mesh are the same."""
@@ -124,7 +124,7 @@ def follow_moved_capture(
         for each in bpy.data.objects:
             if each.library is None and each.get(tags.CAPTURE) == before:
                 each[tags.CAPTURE] = str(capture.root.resolve())
-        say(f"{head.name}: its capture was moved from {before}")
+        log(f"{head.name}: its capture was moved from {before}")
 
 
 MAX_DIFFERENCE_M = 1e-4

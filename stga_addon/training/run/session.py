@@ -253,7 +253,7 @@ class _Session:
         if self.trainer.tracking is not None and self._without_training_views():
             self.fitting_s = TRACKING_TIME_FRACTION * (self.run.settings.seconds or 0.0)
         # meanwhile, the splats are shown as they begin
-        self._tell("Compiling kernels", longer=1.0)
+        self._report_progress("Compiling kernels", longer=1.0)
         precompile_kernels(self.run.device)
         self.trainer.prepare_hooks()
         lines = self.evaluator.lines
@@ -268,9 +268,9 @@ class _Session:
             if not self._is_trained():
                 self._stop()
             elif self._evaluate_finally():
-                self._tell("Measuring residuals")
+                self._report_progress("Measuring residuals")
                 self._write_residuals()
-        self._tell("Interrupted" if self.interrupts else "Trained")
+        self._report_progress("Interrupted" if self.interrupts else "Trained")
         if self.interrupts:
             raise KeyboardInterrupt
 
@@ -312,7 +312,7 @@ class _Session:
                     saved = self.elapsed_s
                 elapsed_s = max(self.elapsed_s - started, 1e-9)
                 self.speed = (trainer.iteration - first) / elapsed_s
-                if self._tell("Training") or self.interrupts:
+                if self._report_progress("Training") or self.interrupts:
                     break
 
     def _refinement_is_due(self) -> bool:
@@ -368,11 +368,11 @@ class _Session:
         if not avatar.exists():
             text = "it is written anew from the checkpoint, the last state of training"
             _log.warning("%s was missing; %s", avatar, text)
-            self._tell("Writing the missing avatar from the checkpoint")
+            self._report_progress("Writing the missing avatar from the checkpoint")
             self._write_avatar()
             residuals.unlink(missing_ok=True)
         if not residuals.exists():
-            self._tell("Measuring residuals")
+            self._report_progress("Measuring residuals")
             self._write_residuals()
 
     def _loader(self) -> ViewLoader:
@@ -497,7 +497,7 @@ class _Session:
         def stops(done: int, total: int) -> bool:
             if seconds is not None and tracking is not self.trainer.tracking:
                 self.fitting_s = seconds * (1 - done / total)
-            is_stopped = self._tell(f"Tracking by the avatar: {done} of {total}")
+            is_stopped = self._report_progress(f"Tracking by the avatar: {done} of {total}")
             return is_stopped or bool(self.interrupts)
 
         settings = self.run.settings
@@ -572,7 +572,7 @@ class _Session:
     def _is_finished(self) -> bool:
         return self.evaluator.is_finished(self._spent())
 
-    def _tell(self, stage: str, **more: float) -> bool:
+    def _report_progress(self, stage: str, **more: float) -> bool:
         """Report how far the run is, with more figures; returns whether to stop."""
         spent = self._spent()
         evaluator = self.evaluator
