@@ -255,8 +255,9 @@ class EstimateLight(RunAddition, bpy.types.Operator):
 
 class MakeExact(RunAddition, bpy.types.Operator):
     """Fit the avatar's colors to EEVEE and Cycles, which blend splats in linear light: takes
-    seconds; as trained, it stays the same"""
+    seconds. The display As Trained stays the same"""
 
+    bl_label = "Bake for Linear Blending"
     request = MakeExactRequest
     needs = (idle(Kind.EXACT), _needs_own_splats)
 

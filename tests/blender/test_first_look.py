@@ -131,7 +131,7 @@ def test_images_by_other_engines(extension, tmp_path):
     assert compat.NATIVE_SPLATS or scene.eevee.taa_samples == 4
     best = NATIVE if compat.NATIVE_SPLATS else QUADS
     assert (display_mode(shown), cycles.transparent_max_bounces) == (best, 64)
-    assert ("Make Exact" in draw(extension, "show")) == compat.NATIVE_SPLATS
+    assert ("Bake for Linear Blending" in draw(extension, "show")) == compat.NATIVE_SPLATS
     with failure("displayed as trained"):
         ops.preview_images()
     set_input(shown, DISPLAY, AS_TRAINED)

@@ -194,7 +194,7 @@ LIMITS = {
     POINTS: "Fast: a dot for each splat, in one color; for Material Preview",
     QUADS: "For EEVEE and Cycles; right through the scene's camera only",
     NATIVE: "Blender's own splats, for EEVEE and Cycles through any camera; "
-    "edges are lighter than trained until Make Exact fits the colors",
+    "edges are lighter than trained until Bake for Linear Blending fits the colors",
 }
 """Display -> what it is for and what it is not, in its tooltip and in the panel."""
 
