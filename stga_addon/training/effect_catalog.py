@@ -80,7 +80,7 @@ _EFFECTS = (
         "density",
         "Finer detail",
         "slower",
-        "up to a quarter more splats, more in the preset final",
+        "up to 1.25 times the full lattice and visual-hull points; 1.6 in the preset final",
         off={"density_interval": 0},
     ),
     Effect(

@@ -29,7 +29,7 @@ class DensityControl:
     The first five are those of `TrainingSettings`, whose defaults measured best at equal time
     (docs/method.md). A triangle with bound splats keeps one.
 
-    interval       iterations between turns, 0: never; default 100, as in 3D Gaussian Splatting
+    interval       iterations between rounds, 0: never; default 100, as in 3D Gaussian Splatting
                    (Kerbl et al. 2023), 200 with the paper's settings
     span           fractions of the budget from and before which it works; default (0.1, 0.6)
     split_share    largest fraction of the splats that is split at a time; default 0.2, ours
@@ -37,7 +37,7 @@ class DensityControl:
                    visual-hull points; default 0.25, ours
     seed           of the halves' distances
     region_fraction   `split_share` where a region is trained, as in a refinement, which has few
-                      turns
+                      rounds
     min_opacity    0…1, below which splats are pruned; ours, 0.005 in 3D Gaussian
                    Splatting. A half has twice as much at least
     narrowing      by which halves are narrower than their parent along its longest axis; 1.6 in 3D
