@@ -13,10 +13,25 @@ from fuzz.arguments import COMMANDS as FUZZED
 from PIL import Image
 
 from stga_addon import api
+from stga_addon.avatar import lattice, strain
 from stga_addon.avatar.splats import SH_C0
 from stga_addon.cli.main import make_parser
 from stga_addon.export.formats import FORMATS
 from stga_addon.export.ply import write_ply
+from stga_addon.selection import SelectionOptions
+from stga_addon.training.optimize import (
+    floaters,
+    hidden_layers,
+    initial_splats,
+    outlines,
+    surface,
+    surface_prior,
+    unseen_hair,
+    unseen_sides,
+)
+from stga_addon.training.optimize import occlusion_layer as layer
+from stga_addon.training.optimize.density import DensityControl
+from stga_addon.training.settings import MAX_FINE_TRIANGLES, PRESETS, TrainingSettings
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = [
@@ -177,6 +192,105 @@ def test_every_format_is_documented_and_fuzzed():
     assert words.issuperset(FORMATS)
     assert set(re.findall(r"`--format ([a-z-]+)`", page)) <= set(FORMATS)
     assert set(FORMATS) <= set(re.findall(r"'([a-z-]+)'", str(FUZZED["export"])))
+
+
+def test_every_section_of_the_method_names_code_test_and_benchmark():
+    """Catches a section without the three files, and a file of another kind in their place."""
+    _, *sections = re.split(r"^## ", TEXTS[ROOT / "docs/method.md"], flags=re.MULTILINE)
+    for section in sections:
+        title, _, text = section.partition("\n\n")
+        line = re.match(r"\*`(.+?)`, `(.+?)`, `(.+?)`\*\n", text)
+        assert line, title
+        code, test, benchmark = (only(BY_PATH[path]) for path in line.groups())
+        assert code.is_relative_to(ROOT / "stga_addon"), title
+        assert test.is_relative_to(ROOT / "tests"), title
+        assert benchmark.is_relative_to(ROOT / "stga_addon/development/benchmark"), title
+
+
+def only(items):
+    (item,) = items
+    return item
+
+
+def degrees(cosine):
+    return f"{np.degrees(np.arccos(cosine)):.0f}°"
+
+
+def percent(fraction):
+    return f"{100 * fraction:g} %"
+
+
+def test_figures_of_the_method_are_those_of_the_code():
+    """Catches a threshold that was changed in the code and not on the page."""
+    page = " ".join(TEXTS[ROOT / "docs/method.md"].split())
+    missing = [
+        figure for figure in (*figures_of_training(), *figures_of_priors()) if figure not in page
+    ]
+    assert not missing
+
+
+def figures_of_training():
+    settings = TrainingSettings()
+    density = DensityControl(*([0] * 5))
+    grid_mm = 1000 * initial_splats.VOXEL_SIZE_M
+    yield f"up to {MAX_FINE_TRIANGLES:,} triangles"
+    yield f"moved {percent(lattice.INSET)} toward the centroid"
+    yield f"Standard deviation: {lattice.SCALE}·ℓ/n"
+    yield f"on a {grid_mm:g} mm grid"
+    yield f"more than {1000 * initial_splats.MIN_MESH_DISTANCE_M:g} mm from the mesh"
+    yield f"its scale limit is {settings.unbound_scale_limit * grid_mm:g} mm"
+    yield f"mean offset exceeds {1000 * SelectionOptions().threshold:g} mm"
+    yield f"after {percent(settings.warm_up_share)} of the budget"
+    yield f"{1 - settings.ssim_weight}·L1 + {settings.ssim_weight}·(1 − SSIM)"
+    yield f"s − {settings.scale_limit:g}ℓ"
+    yield f"{settings.unseen_opacity_weight} · mean over all splats"
+    yield f"every {settings.stray_reset_interval} iterations, splats farther than"
+    yield f"farther than {settings.stray_limit:g}ℓ"
+    yield " and ".join(f"{100 * time:g}" for time in floaters.PRUNING_TIMES) + " % of the budget"
+    yield f"up to {floaters.MAX_WEIGHED_VIEWS} views"
+    yield f"or {floaters.MIN_WEIGHT_FRACTION} of the median"
+    yield f"more than {percent(outlines.TOLERANCE_FRACTION)} of the image height"
+    yield f"most of {outlines.MAX_OUTLINES} views"
+    yield f"β 0.9 / {settings.adam_beta2}"
+    yield f"ε is {settings.adam_epsilon} of the weight"
+    yield f"The first {percent(settings.coarse_share)} of the budget"
+    yield f"positions to {percent(settings.rates.position_end)}"
+    yield f"all others to {percent(settings.rates.end)}"
+    yield "{:.0f}, {:.0f} and {:.0f} %".format(*(100 * step for step in settings.sh_steps))
+    yield f"decay {1 - settings.ema_share}"
+    yield f"runs every {settings.density_interval} iterations"
+    yield "between {:.0f} and {:.0f} % of the budget".format(
+        *(100 * end for end in settings.density_span)
+    )
+    yield f"until there are {percent(settings.growth)} more splats"
+    yield f"preset `final`: {percent(PRESETS['final'].changes['growth'])}"
+    yield f"each half is 1/{density.narrowing} as long"
+    yield f"has {density.narrowing / 2} of the opacity"
+    yield f"opacity below {density.min_opacity}"
+    yield f"times {strain.STRAIN_GAIN:g}, clipped at ±{strain.MAX_STRAIN:g}"
+    yield f"both stretches at −{strain.MIN_COMPRESSION} from above"
+    yield f"to {strain.RANGE_MARGIN} times the range"
+
+
+def figures_of_priors():
+    grid_mm = 1000 * initial_splats.VOXEL_SIZE_M
+    yield f"Every {surface_prior.SurfacePrior.interval} iterations"
+    yield f"halfway at {surface_prior.DOUBT} of the gradient"
+    yield f"up to {initial_splats.FEW_CAMERAS} cameras"
+    yield f"fixed beyond {degrees(surface.UNSEEN_COSINE)}"
+    yield f"pulled beyond {degrees(surface.GRAZING_COSINE)}"
+    yield f"up to {surface.MAX_HEIGHT_VOXELS * grid_mm / 10:g} cm above"
+    yield f"limited to {surface_prior.FLAT_VOXELS * grid_mm:g} mm"
+    yield f"{hidden_layers.HIDDEN_SPACING_VOXELS * grid_mm:g} mm apart"
+    yield f"at least {surface_prior.LEAST_WIDTH_FRACTION} of their width"
+    least_mm = layer.DEPTH_VOXELS * grid_mm
+    yield f"lies {least_mm:g} to {layer.MAX_DEPTHS * least_mm:g} mm behind"
+    yield f"(beyond {degrees(unseen_sides.SHOWN_COSINE)})"
+    yield f"{unseen_sides.OFF_AXIS_WEIGHT} · sin²"
+    yield f"(cosine {unseen_sides.SOURCE_COSINE})"
+    yield f"the {unseen_sides.NEAREST} nearest"
+    yield f"face beyond {degrees(unseen_sides.WELL_SHOWN_COSINE)}"
+    yield f"(beyond {degrees(unseen_hair.STRAND_COSINE)})"
 
 
 def test_readme_trains_exports_and_renders(toy_root, tmp_path, monkeypatch):
