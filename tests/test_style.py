@@ -1,6 +1,7 @@
 """Rules of CONTRIBUTING.md, "How we write", that ruff has no rule for."""
 
 import ast
+import re
 from functools import cache
 from pathlib import Path
 
@@ -9,7 +10,20 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 FOLDERS = ("stga_addon", "operators", "ui", "tests")
 FILES = [path for folder in FOLDERS for path in sorted((ROOT / folder).rglob("*.py"))]
+PAGES = [ROOT / "README.md", ROOT / "CHANGELOG.md", *sorted((ROOT / "docs").glob("*.md"))]
 MAX_FUNCTION_LINES = 60
+DIALECT = r"dust|strays?|backing|inner layer|likeness|crew|team|usual|tells?|told|make exact"
+"""Words for which the field has others: floaters, outliers, occlusion layer, semantic regions,
+workers, typical, report, bake for linear blending."""
+KEPT_NAMES = {
+    "stray_limit",
+    "stray_reset_interval",
+    "stray_reset_share",
+    "make_exact",
+    "MakeExact",
+    "MakeExactRequest",
+}
+"""Names that files and scripts of earlier versions contain: settings, and a request."""
 
 
 def names(node):
@@ -53,7 +67,26 @@ def fragments(nodes):
             yield node.lineno
 
 
-RULES = (described_in_groups, packed_values, long_functions, fragments)
+def dialect(nodes):
+    """Names with a word of DIALECT that are defined, not those of other libraries."""
+    for node in nodes:
+        name = None
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef):
+            name = node.name
+        elif isinstance(node, ast.arg):
+            name = node.arg
+        elif isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store):
+            name = node.id
+        if name and name not in KEPT_NAMES and has_dialect(name):
+            yield f"{name} (line {node.lineno})"
+
+
+def has_dialect(text):
+    words = re.sub(r"(?<=[a-z0-9])(?=[A-Z])|_", " ", text)
+    return re.search(rf"\b({DIALECT})\b", words, re.IGNORECASE) is not None
+
+
+RULES = (described_in_groups, packed_values, long_functions, fragments, dialect)
 
 
 @cache
@@ -82,6 +115,20 @@ def test_a_docstring_describes_one_constant(folder):
 def test_docstrings_name_what_they_describe(folder):
     """Catches fragments that make sense only together with the name, such as "Of a frame."."""
     assert not breaking(fragments, folder)
+
+
+@pytest.mark.parametrize("folder", FOLDERS[:3])
+def test_names_are_the_fields_terms(folder):
+    """Catches a word of the project's own where engineers know another."""
+    assert not breaking(dialect, folder)
+
+
+def test_pages_use_the_fields_terms():
+    """Catches the same words on a page."""
+    lines = [
+        f"{page.name}: {line}" for page in PAGES for line in page.read_text("utf-8").splitlines()
+    ]
+    assert not [line for line in lines if has_dialect(line.replace("make-exact", ""))]
 
 
 @pytest.mark.parametrize("folder", FOLDERS)
