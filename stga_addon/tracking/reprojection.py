@@ -42,38 +42,38 @@ def median_px(errors: Errors) -> float:
 
 
 def misread_cameras(errors: Errors) -> list[str]:
-    """Cameras whose landmarks do not fit what others see, the worst first; fewer than half."""
-    fraction = {
-        name: float(np.median([part for _, part in own.values()]))
-        for name, own in errors.items()
-        if own
-    }
-    if not fraction:
-        return []
-    least = max(MIN_OUTLIER_FRACTION, OUTLIER_FACTOR * float(np.median(list(fraction.values()))))
-    return sorted(
-        (name for name, own in fraction.items() if own > least), key=lambda n: -fraction[n]
-    )
+    """Cameras whose landmarks miss the head by far more than those of the others, the worst
+    first."""
+    fraction = _fractions(errors)
+    found = []
+    for name, value in fraction.items():
+        others = [fraction[other] for other in fraction if other != name] or [value]
+        if value > max(MIN_OUTLIER_FRACTION, OUTLIER_FACTOR * float(np.median(others))):
+            found.append(name)
+    return sorted(found, key=lambda name: -fraction[name])
 
 
 def check_cameras(errors: Errors) -> None:
     """Raise StgaError for a camera that does not fit what others see, or where none fits."""
-    seen = {name: [part for _, part in own.values()] for name, own in errors.items() if own}
-    fraction = {name: float(np.median(own)) for name, own in seen.items()}
 
     def at_worst(name: str) -> str:
         worst, (pixels, _) = max(errors[name].items(), key=lambda error: error[1][1])
         return f"camera {name}: its landmarks are off by {pixels:.0f} pixels at timestep {worst}"
 
-    for name, value in fraction.items():
-        others = [fraction[other] for other in fraction if other != name] or [value]
-        if value > max(MIN_OUTLIER_FRACTION, OUTLIER_FACTOR * float(np.median(others))):
-            raise StgaError(
-                f"{at_worst(name)}, far more than those of the other cameras; "
-                "check its calibration, synchronization and mirroring"
-            )
+    for name in misread_cameras(errors):
+        raise StgaError(
+            f"{at_worst(name)}, far more than those of the other cameras; "
+            "check its calibration, synchronization and mirroring"
+        )
+    fraction = _fractions(errors)
     if len(fraction) > 1 and float(np.median(list(fraction.values()))) > MAX_MEDIAN_ERROR:
         raise StgaError(
             f"{at_worst(max(fraction, key=fraction.__getitem__))}, and those of the other cameras "
             "are too; check the calibration, and whether all are synchronized and none mirrored"
         )
+
+
+def _fractions(errors: Errors) -> dict[str, float]:
+    """Camera -> median distance of its landmarks from the head's, in face sizes."""
+    seen = {name: [part for _, part in own.values()] for name, own in errors.items() if own}
+    return {name: float(np.median(own)) for name, own in seen.items()}
