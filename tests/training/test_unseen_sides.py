@@ -12,6 +12,7 @@ from scipy.ndimage import binary_dilation, binary_erosion
 from scipy.spatial import cKDTree
 
 from stga_addon.avatar.embedding import face_areas, points_to_world, to_world
+from stga_addon.avatar.file import UNSEEN_REGION
 from stga_addon.avatar.lattice import NORMAL_AXIS, lattice_splats
 from stga_addon.avatar.splats import SH_C0, joined, sh_color
 from stga_addon.capture.camera import look_at
@@ -750,6 +751,32 @@ def test_a_torso_has_a_back(bundled, tmp_path):
     layer, frames = behind(of_bust)
     away = middles(bust)[0][layer.face] - points_to_world(layer.xyz, frames, layer.face)
     assert norm(away, axis=1).max() < 0.025
+
+
+def test_a_torso_is_whole_beyond_the_images(bundled, tmp_path):
+    """Catches blurred, half transparent cloth where a torso leaves the images, as no view splits
+    splats there; and what *Filmed Only* would show of it."""
+    torso = with_torso(bundled)
+    capture = filmed(torso, painted(torso), (-20, 0, 20), 0.0, tmp_path)
+    trainer = Trainer(capture, quick_settings(iterations=1), {})
+    surface = trainer.frames.surface
+    centers, _ = middles(capture)
+    within = np.zeros(len(centers), bool)
+    for view in capture.views["train"]:
+        pixels, _ = view.camera.project(centers)
+        within |= ((pixels > 0) & (pixels < [160, 200])).all(1)
+    in_front = surface.outside & (surface.facing > 0.3)
+    beyond = in_front & ~within
+    assert beyond.sum() > 100
+    avatar = trainer.avatar("center", None)
+    assert avatar.regions[UNSEEN_REGION][beyond].all()
+    assert not avatar.regions[UNSEEN_REGION][in_front & within].any()
+    own = avatar.splats
+    face = own.face[~own.unbound]
+    opacity = 1 / (1 + np.exp(-own.opacity[~own.unbound]))
+    count = np.bincount(face, minlength=len(centers))
+    assert np.median(count[beyond]) > 2 * np.median(count[in_front & within])
+    assert np.median(opacity[beyond[face]]) > 0.9
 
 
 def test_a_head_is_outside_with_any_torso(bundled, outside):

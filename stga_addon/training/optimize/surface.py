@@ -50,6 +50,8 @@ GRAZING_COSINE = 0.2
 """Cosine below which a triangle fills little of any image; many outlines show its shape."""
 OUTLINE_VIEWS = 16
 """Views, spread over all, whose outlines are measured."""
+IMAGE_VIEWS = 48
+"""Training views, spread over all, whose images' edges are looked at."""
 OUTLINE_COSINE = 0.2
 """Largest cosine between a camera and a triangle in the mesh's outline."""
 OUTSIDE_CAMERAS = 15
@@ -194,9 +196,19 @@ class Surface:
 
     @cached_property
     def hidden(self) -> np.ndarray:
-        """(F,) bool: triangles of the outside that face away from all cameras."""
+        """(F,) bool: triangles of the outside that face away from all cameras, or lie beyond the
+        edges of all images."""
         limit = HIDDEN_COSINE if self.has_few_cameras else UNSEEN_COSINE
-        return np.asarray(self.outside & (self.facing < limit))
+        return np.asarray(self.outside & ((self.facing < limit) | ~self._within_images))
+
+    @cached_property
+    def _within_images(self) -> np.ndarray:
+        """(F,) bool: triangles whose centers lie in the image of some of the training views."""
+        found = np.zeros(len(self.capture.faces), bool)
+        for view in evenly_spread(self.capture.views["train"], IMAGE_VIEWS):
+            centers, _ = _centers_and_normals(self.capture, view.timestep)
+            found |= pixels_of(centers, view.camera)[2]
+        return found
 
     @cached_property
     def closed(self) -> np.ndarray:
