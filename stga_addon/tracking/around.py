@@ -68,6 +68,8 @@ PAIR_S = 0.5
 """Time between the two frames of a video in which the room is compared."""
 TYPICAL_FPS = 30.0
 """Frames per second for a take without a rate."""
+MAX_HALVINGS = 3
+"""How often PAIR_S is halved where the camera moves too fast."""
 PAIR_TURN_DEG = 1.0, 25.0
 """Turns of the head between two frames that are compared."""
 MIN_MATCHES = 8
@@ -356,8 +358,7 @@ def recognize(camera: FootageCamera, fps: float | None, step: Step) -> dict[str,
         photos = isinstance(camera.frames, ImageFrames) and len(timesteps) <= MAX_PHOTOS
         ahead = 1 if photos else max(1, round(PAIR_S * (fps or TYPICAL_FPS)))
         for number, sample in samples.items():
-            other = min(number + ahead, len(timesteps) - 1)
-            later = look.at(timesteps[other]) if other != number else None
+            later = look.soon_after(sample, timesteps[number + 1 : number + 1 + ahead])
             pairs += [(sample, later)] if later is not None else []
         if photos:  # whose names may have no order
             row = {id(sample): sample for pair in pairs for sample in pair}
@@ -439,6 +440,17 @@ class _Look:
         described = np.zeros((0, 128), np.float32) if described is None else described
         at = lens.at_depth_one(pixels)
         return _Sample(rotation, middle[:2] / middle[2], at, described, _lip_gap(face))
+
+    def soon_after(self, sample: _Sample, timesteps: Sequence[int]) -> _Sample | None:
+        """The last of the timesteps after a sample; of a camera that moves too fast for these to be
+        compared, one in half of the time, and so on. None where none shows a face near enough."""
+        for count in (len(timesteps) >> halvings for halvings in range(MAX_HALVINGS + 1)):
+            later = self.at(timesteps[count - 1]) if count else None
+            if later is None:
+                continue
+            if _angle_deg(sample.rotation, later.rotation) <= PAIR_TURN_DEG[1]:
+                return later
+        return None
 
 
 def _lip_gap(face: np.ndarray) -> float:
