@@ -54,7 +54,7 @@ def test_no_mesh_is_read_on_the_training_thread(tmp_path, monkeypatch):
     none = np.zeros(count, bool)
     color = np.zeros((count, 3))
     sides = UnseenSides(none, ~none, color, none, color[:, 0], color)
-    monkeypatch.setattr(Surface, "facing", np.ones(count))
+    monkeypatch.setattr(Surface, "_observed", (np.ones(count), ~none))
     monkeypatch.setattr(Surface, "sticks_out", none)
     monkeypatch.setattr(frames, "unseen_sides", lambda _: sides)
     for name in ("prepare", "apply"):

@@ -50,8 +50,6 @@ GRAZING_COSINE = 0.2
 """Cosine below which a triangle fills little of any image; many outlines show its shape."""
 OUTLINE_VIEWS = 16
 """Views, spread over all, whose outlines are measured."""
-IMAGE_VIEWS = 48
-"""Training views, spread over all, whose images' edges are looked at."""
 OUTLINE_COSINE = 0.2
 """Largest cosine between a camera and a triangle in the mesh's outline."""
 OUTSIDE_CAMERAS = 15
@@ -122,15 +120,23 @@ class Surface:
     def facing(self) -> np.ndarray:
         """(F,) cosine of the angle between each triangle's normal and the camera of the training
         views that it faces most."""
+        return self._observed[0]
+
+    @cached_property
+    def _observed(self) -> tuple[np.ndarray, np.ndarray]:
+        """`facing`, and (F,) bool: triangles whose centers lie in the image of a training view."""
         capture = self.capture
         by_timestep = views_by_timestep(capture.views["train"])
         limit = FACING_TIMESTEPS if capture.flame is not None else FACING_MESHES
         cosine = np.full(len(capture.faces), -1.0)
+        within = np.zeros(len(capture.faces), bool)
         for timestep in evenly_spread(list(by_timestep), limit):
             center, normal = _centers_and_normals(capture, timestep)
             for view in by_timestep[timestep]:
                 np.maximum(cosine, facing(view.camera, center, normal), out=cosine)
-        return cosine
+                others = np.flatnonzero(~within)
+                within[others] = pixels_of(center[others], view.camera)[2]
+        return cosine, within
 
     @cached_property
     def outside(self) -> np.ndarray:
@@ -199,16 +205,7 @@ class Surface:
         """(F,) bool: triangles of the outside that face away from all cameras, or lie beyond the
         edges of all images."""
         limit = HIDDEN_COSINE if self.has_few_cameras else UNSEEN_COSINE
-        return np.asarray(self.outside & ((self.facing < limit) | ~self._within_images))
-
-    @cached_property
-    def _within_images(self) -> np.ndarray:
-        """(F,) bool: triangles whose centers lie in the image of some of the training views."""
-        found = np.zeros(len(self.capture.faces), bool)
-        for view in evenly_spread(self.capture.views["train"], IMAGE_VIEWS):
-            centers, _ = _centers_and_normals(self.capture, view.timestep)
-            found |= pixels_of(centers, view.camera)[2]
-        return found
+        return np.asarray(self.outside & ((self.facing < limit) | ~self._observed[1]))
 
     @cached_property
     def closed(self) -> np.ndarray:
