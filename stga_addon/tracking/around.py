@@ -443,14 +443,16 @@ class _Look:
 
     def soon_after(self, sample: _Sample, timesteps: Sequence[int]) -> _Sample | None:
         """The last of the timesteps after a sample; of a camera that moves too fast for these to be
-        compared, one in half of the time, and so on. None where none shows a face near enough."""
+        compared, one in half of the time, and so on. None where none shows a face."""
+        found = None
         for count in (len(timesteps) >> halvings for halvings in range(MAX_HALVINGS + 1)):
             later = self.at(timesteps[count - 1]) if count else None
             if later is None:
                 continue
-            if _angle_deg(sample.rotation, later.rotation) <= PAIR_TURN_DEG[1]:
-                return later
-        return None
+            found = later
+            if _angle_deg(sample.rotation, found.rotation) <= PAIR_TURN_DEG[1]:
+                break
+        return found
 
 
 def _lip_gap(face: np.ndarray) -> float:
