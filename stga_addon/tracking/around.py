@@ -69,7 +69,7 @@ PAIR_S = 0.5
 TYPICAL_FPS = 30.0
 """Frames per second for a take without a rate."""
 MAX_HALVINGS = 3
-"""How often PAIR_S is halved where the camera moves too fast."""
+"""How often PAIR_S is halved if the head turns too far before the camera in that time."""
 PAIR_TURN_DEG = 1.0, 25.0
 """Turns of the head between two frames that are compared."""
 MIN_MATCHES = 8
@@ -358,7 +358,7 @@ def recognize(camera: FootageCamera, fps: float | None, step: Step) -> dict[str,
         photos = isinstance(camera.frames, ImageFrames) and len(timesteps) <= MAX_PHOTOS
         ahead = 1 if photos else max(1, round(PAIR_S * (fps or TYPICAL_FPS)))
         for number, sample in samples.items():
-            later = look.soon_after(sample, timesteps[number + 1 : number + 1 + ahead])
+            later = look.later_sample(sample, timesteps[number + 1 : number + 1 + ahead])
             pairs += [(sample, later)] if later is not None else []
         if photos:  # whose names may have no order
             row = {id(sample): sample for pair in pairs for sample in pair}
@@ -441,9 +441,11 @@ class _Look:
         at = lens.at_depth_one(pixels)
         return _Sample(rotation, middle[:2] / middle[2], at, described, _lip_gap(face))
 
-    def soon_after(self, sample: _Sample, timesteps: Sequence[int]) -> _Sample | None:
-        """The last of the timesteps after a sample; of a camera that moves too fast for these to be
-        compared, one in half of the time, and so on. None where none shows a face."""
+    def later_sample(self, sample: _Sample, timesteps: Sequence[int]) -> _Sample | None:
+        """A frame to compare a sample with: the last of the timesteps that follow it. If that shows
+        no face, or one that has turned by more than PAIR_TURN_DEG, the one at half of the way, and
+        so on up to MAX_HALVINGS. The nearest one if all have turned too far; None without a face.
+        """
         found = None
         for count in (len(timesteps) >> halvings for halvings in range(MAX_HALVINGS + 1)):
             later = self.at(timesteps[count - 1]) if count else None

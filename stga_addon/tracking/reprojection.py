@@ -60,9 +60,10 @@ def check_cameras(errors: Errors) -> None:
         worst, (pixels, _) = max(errors[name].items(), key=lambda error: error[1][1])
         return f"camera {name}: its landmarks are off by {pixels:.0f} pixels at timestep {worst}"
 
-    for name in misread_cameras(errors):
+    misread = misread_cameras(errors)
+    if misread:
         raise StgaError(
-            f"{at_worst(name)}, far more than those of the other cameras; "
+            f"{at_worst(misread[0])}, far more than those of the other cameras; "
             "check its calibration, synchronization and mirroring"
         )
     fraction = _fractions(errors)

@@ -125,8 +125,8 @@ class FrameStore:
 
     @cached_property
     def hair_layer_scale(self) -> np.ndarray:
-        """(F,) scale of hair's outer layer where it faces away from all cameras, in local units; 0
-        elsewhere. A smaller one would leave gaps that show the head's inside."""
+        """(F,) scale of hair's outer layer on hidden triangles, in local units; 0 elsewhere. A
+        smaller one would leave gaps that show the head's inside."""
         is_hair = self.surface.hidden & (self.surface.hair_height > 0)
         return np.asarray(np.where(is_hair, SCALE * self.units * self.hair_widening, 0))
 

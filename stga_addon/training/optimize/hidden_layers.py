@@ -35,8 +35,8 @@ a lattice of order 1; a finer one reaches less beyond."""
 
 
 def above_unseen_hair(frames: FrameStore, splats: Splats) -> np.ndarray:
-    """(N,) bool: unbound splats above hair that no camera faces. Masks from the front do not limit
-    the hull behind a head, so these splats would hang in the air in off-axis views."""
+    """(N,) bool: unbound splats above hidden hair. Masks from the front do not limit the hull
+    behind a head, so these splats would hang in the air in off-axis views."""
     surface = frames.surface
     top = (surface.hair_height + frames.voxel) / frames.unit_lengths
     height = splats.xyz[:, NORMAL_AXIS[frames.convention]]
