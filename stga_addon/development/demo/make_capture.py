@@ -75,8 +75,9 @@ class Act:
 
 RELAXED = {"eyeBlink": 0.13, "eyeSquint": 0.08, "mouthSmile": 0.18}
 """Weights of an act that does not set them otherwise."""
-CONVERGENCE_DEG = 2.5
-"""Angle by which each eye turns to the nose."""
+DIVERGENCE_DEG = 2.5
+"""Angle by which each eyeball turns to the temple: a person looks some 5° to the nose of the
+eyeball's axis, so the axes of eyes that look at a near camera do not meet there."""
 TRAIN_ACTS = (
     Act({}),
     Act(
@@ -191,7 +192,7 @@ def frame_of_act(act: Act, names: tuple[str, ...]) -> FlameFrame:
         for side in ("", "Left", "Right")
     }
     expr = np.array([sided.get(name, 0.0) for name in names])
-    yaw, pitch, inwards = np.radians([*act.gaze, CONVERGENCE_DEG])
+    yaw, pitch, outwards = np.radians([*act.gaze, DIVERGENCE_DEG])
 
     def turned(angles: tuple[float, float]) -> np.ndarray:
         return np.radians([angles[1], angles[0], 0.0])
@@ -203,7 +204,7 @@ def frame_of_act(act: Act, names: tuple[str, ...]) -> FlameFrame:
         neck_pose=turned(act.neck),
         jaw_pose=zero,
         translation=zero,
-        eyes_pose=np.array([pitch, yaw - inwards, 0.0, pitch, yaw + inwards, 0.0]),
+        eyes_pose=np.array([pitch, yaw + outwards, 0.0, pitch, yaw - outwards, 0.0]),
     )
 
 

@@ -93,17 +93,23 @@ BROW_HEIGHTS_CM = 1.95, 2.6, 2.1
 """Height of a brow above the eyes at its inner end, its arch and its outer end."""
 REDNESS = 0.5
 """Redness of the hair's melanin, 0…1."""
-LID_EDGE_CM = 0.1
-"""Distance from a lid's edge within which lashes grow."""
-LID_HALF_WIDTH_CM = 1.15
+LID_GAP_CM = 0.25
+"""Largest distance of the upper lid's edge from the eyeball."""
+LID_EDGE_CM = 0.06
+"""Height above that edge up to which lashes grow."""
+LID_CORNER_CM = -0.1
+"""Height of the corners between lids, over the eyeball's middle."""
+LID_HALF_WIDTH_CM = 1.05
 """Half the width of a lid's edge with lashes."""
+LID_COLUMNS = 15
+"""Places along a lid whose edge is looked for."""
 HAIRS_PER_CLUMP = 30
 """Hairs that lean toward one of them."""
 POINTS_PER_HAIR = 9
 """Points of the line that a hair is."""
 LASHES = 260
 """Lashes of both eyes."""
-LASH_LENGTH_M = 0.007
+LASH_LENGTH_M = 0.006
 """Typical length of a lash."""
 LASH_RADIUS_M = 0.00008
 """Radius of a lash."""
@@ -314,15 +320,24 @@ class _Paint:
         return np.asarray(inside * (along > -0.02) * (along < 1) * (at[:, 2] > 3))
 
     def lid_edges(self, at: np.ndarray) -> np.ndarray:
-        """Density (N,) of lashes at points (N, 3): 1 where the upper lids' skin touches the
-        eyeball."""
+        """Density (N,) of lashes at points (N, 3): 1 on the upper lids' edges. The skin above them
+        that touches the eyeball is the lids' inner side."""
+        out, up, is_lid = self._on_upper_lid(self.at[slice(*FACE)])
+        columns = np.linspace(-LID_HALF_WIDTH_CM, LID_HALF_WIDTH_CM, LID_COLUMNS)
+        half = LID_HALF_WIDTH_CM / (LID_COLUMNS - 1)
+        edge = [up[is_lid & (abs(out - column) <= half)].min() for column in columns]
+        out, up, is_lid = self._on_upper_lid(at)
+        on_edge = up < np.interp(out, columns, edge) + LID_EDGE_CM
+        return np.asarray((is_lid & on_edge & (abs(out) < LID_HALF_WIDTH_CM)).astype(float))
+
+    def _on_upper_lid(self, at: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Of points (N, 3): centimeters (N,) from the eyeball's middle to the temple, centimeters
+        above it, and whether they are near the eyeball's upper front."""
         away = at - np.where(at[:, :1] > 0, self.eye_at, self.eye_at * [-1, 1, 1])
+        out = away[:, 0] * np.sign(at[:, 0])
         gap = np.linalg.norm(away, axis=1) - self.eye_radius
-        return np.asarray(
-            ((gap < LID_EDGE_CM) & (abs(away[:, 0]) < LID_HALF_WIDTH_CM) & (away[:, 1] > 0)).astype(
-                float
-            )
-        )
+        above = (away[:, 1] > LID_CORNER_CM) & (away[:, 2] > 0)
+        return out, away[:, 1], above & (gap < LID_GAP_CM)
 
 
 def _scatter(
@@ -420,7 +435,7 @@ def _lashes(paint: _Paint, neutral: np.ndarray, rng: np.random.Generator) -> Str
     ahead = away * [0.75, 0.35, 1.0] + rng.normal(0, 0.06, away.shape)
     ahead /= np.linalg.norm(ahead, axis=1, keepdims=True)
     length = LASH_LENGTH_M * rng.uniform(0.7, 1.1, len(root))
-    curl = np.array([0.0, 0.75, 0.0])
+    curl = np.array([0.0, 0.6, 0.0])
     t = np.linspace(0, 1, POINTS_PER_HAIR)[None, :, None]
     points = root[:, None] + length[:, None, None] * (t * ahead[:, None] + t**2 * curl)
     return Strands("lashes", points, triangle, LASH_RADIUS_M, 0.97, REDNESS)
