@@ -271,8 +271,9 @@ def track(request: Track, report: Report, log: Log) -> Written:
         return _track_head(request, report)
 
 
-def _track_head(request: Track, report: Report) -> Written:
-    """The head of a stranger, or that of the capture which the request names."""
+def _track_head(request: Track, report: Report, kind: tuple[str, str] | None = None) -> Written:
+    """The head of a stranger, or that of the capture which the request names. kind: what `take_of`
+    found, where it is known."""
     from ..tracking.track import track as track_footage
 
     steps = _Steps(report)
@@ -281,7 +282,7 @@ def _track_head(request: Track, report: Report) -> Written:
     if request.avatar is not None:
         person, model = _captured_person(request.avatar, model)
         options = replace(options, person=person)
-    footage, messages = _open(request, steps)
+    footage, messages = _open(request, steps, kind)
     found = track_footage(footage, model, request.out, options, steps.report, steps.show)
     return _written(request.out, found, report, messages)
 
@@ -324,8 +325,10 @@ def _track_by_avatar(request: Track, run: Path, report: Report) -> Written:
     return _written(out, found, report, lines)
 
 
-def _open(request: Track, steps: "_Steps") -> tuple["Footage", tuple[str, ...]]:
-    """The footage, and lines on how it was understood."""
+def _open(
+    request: Track, steps: "_Steps", kind: tuple[str, str] | None = None
+) -> tuple["Footage", tuple[str, ...]]:
+    """The footage, and lines on how it was understood. kind: as of `_track_head`."""
     from ..tracking.footage.open import open_footage, sized
     from ..tracking.footage.sequences import FrameRange
 
@@ -347,7 +350,7 @@ def _open(request: Track, steps: "_Steps") -> tuple["Footage", tuple[str, ...]]:
         # a few frames do not tell how the room moves, and are too far apart for cameras
         is_whole = request.most is None or request.take == "talk"
         whole = footage if is_whole else opened(frames=replace(frames, most=None))
-        found, messages = _with_found_cameras(whole, request, steps)
+        found, messages = _with_found_cameras(whole, request, steps, kind)
         is_found = is_whole or found.finds_cameras
         footage = found if is_found else replace(footage, warnings=found.warnings)
     steps.plan(footage)
@@ -355,7 +358,7 @@ def _open(request: Track, steps: "_Steps") -> tuple["Footage", tuple[str, ...]]:
 
 
 def _with_found_cameras(
-    footage: "Footage", request: Track, steps: "_Steps"
+    footage: "Footage", request: Track, steps: "_Steps", kind: tuple[str, str] | None
 ) -> tuple["Footage", tuple[str, ...]]:
     """As `around.with_found_cameras`; what is refused leaves nothing."""
     from ..tracking.around import with_found_cameras
@@ -366,7 +369,7 @@ def _with_found_cameras(
     try:
         with Helpers(folder=out / KEPT_FOLDER) as helpers:
             workers = Workers(helpers, steps.report, steps.show)
-            return with_found_cameras(footage, out, request.take, workers)
+            return with_found_cameras(footage, out, request.take, workers, kind)
     except StgaError:
         if is_new and is_begun(out):
             clear(out)
@@ -509,7 +512,7 @@ def _track_takes(request: MakeAvatar, report: Report, log: Log) -> list[Path]:
         write_json(out / INPUTS, _inputs(request.track, request.takes))
     try:
         tracks = _planned(request, report, log)
-        for number, own in enumerate(tracks):
+        for number, (own, kind) in enumerate(tracks):
 
             def report_take(progress: Progress, before: int = number) -> bool:
                 fraction = (before + progress.fraction) / len(tracks)
@@ -517,7 +520,7 @@ def _track_takes(request: MakeAvatar, report: Report, log: Log) -> list[Path]:
 
             if not is_written(own.out):
                 with hold_folder(own.out, LOCK_FILE, WRITER):
-                    for line in _track_head(own, report_take).lines:
+                    for line in _track_head(own, report_take, kind).lines:
                         log(line)
     except (StgaError, OSError):
         # nothing was tracked yet, so that the inputs may be mended
@@ -526,24 +529,28 @@ def _track_takes(request: MakeAvatar, report: Report, log: Log) -> list[Path]:
             if is_new:
                 out.rmdir()
         raise
-    return sorted((own.out for own in tracks), key=lambda path: path != request.track.out)
+    return sorted((own.out for own, _ in tracks), key=lambda path: path != request.track.out)
 
 
-def _planned(request: MakeAvatar, report: Report, log: Log) -> list[Track]:
-    """The takes in the order in which they are tracked: one around a still head first, the others
-    with its head. The first talk is in CAPTURE_FOLDER: it is what the avatar plays."""
+def _planned(
+    request: MakeAvatar, report: Report, log: Log
+) -> list[tuple[Track, tuple[str, str] | None]]:
+    """The takes in the order in which they are tracked, with what `take_of` found: one around a
+    still head first, the others with its head. The first talk is in CAPTURE_FOLDER: it is what the
+    avatar plays."""
     track = request.track
     if not request.takes:
-        return [track]
+        return [(track, None)]
     footage = [track.footage, *request.takes]
-    kinds = _kinds(request, report, log)
+    found = _kinds(request, report, log)
+    kinds = [kind for kind, _ in found]
     shown = kinds.index("talk") if "talk" in kinds else 0
     person = kinds.index("around") if "around" in kinds else 0
     folders = [f"{CAPTURE_FOLDER}_{number + 1}" for number in range(1, len(footage))]
     folders.insert(shown, CAPTURE_FOLDER)
     outs = [request.out / name for name in folders]
     order = [person, *(number for number in range(len(footage)) if number != person)]
-    return [
+    tracks = [
         replace(
             track,
             footage=footage[number],
@@ -553,11 +560,15 @@ def _planned(request: MakeAvatar, report: Report, log: Log) -> list[Track]:
         )
         for number in order
     ]
+    return [
+        (own, found[number] if found[number][1] else None)
+        for own, number in zip(tracks, order, strict=True)
+    ]
 
 
-def _kinds(request: MakeAvatar, report: Report, log: Log) -> list[str]:
+def _kinds(request: MakeAvatar, report: Report, log: Log) -> list[tuple[str, str]]:
     """What each take is, "around" or "talk": found out once and kept, or as given for the first, of
-    which the others are none."""
+    which the others are none. With the reason; "" where it was kept or given."""
     from ..tracking.around import take_of
     from ..tracking.footage.open import open_footage
     from ..tracking.stages import Workers
@@ -567,20 +578,20 @@ def _kinds(request: MakeAvatar, report: Report, log: Log) -> list[str]:
     footage = [track.footage, *request.takes]
     known = stored.get(KINDS)
     if isinstance(known, list) and len(known) == len(footage) and {*known} <= {*TAKES}:
-        return known
+        return [(kind, "") for kind in known]
     opened = [open_footage(path) for path in footage]
     if track.take != "auto":
-        kinds = [track.take, *("talk" for _ in request.takes)]
+        kinds = [(track.take, ""), *(("talk", "") for _ in request.takes)]
     else:
         kinds = []
         steps = _Steps(report)
         with Helpers() as helpers:
             for own, path in zip(opened, footage, strict=True):
                 kind, why = take_of(own, Workers(helpers, steps.report, steps.show))
-                kinds.append(kind)
+                kinds.append((kind, why))
                 what = "around a still head" if kind == "around" else "a head that moves"
                 log(f"take: {path.name}: {what} ({why})")
-    write_json(request.out / INPUTS, {**stored, KINDS: kinds})
+    write_json(request.out / INPUTS, {**stored, KINDS: [kind for kind, _ in kinds]})
     return kinds
 
 

@@ -131,14 +131,18 @@ class Recognition:
 
 
 def with_found_cameras(
-    footage: Footage, out: Path, take: str, workers: Workers
+    footage: Footage,
+    out: Path,
+    take: str,
+    workers: Workers,
+    known: tuple[str, str] | None = None,
 ) -> tuple[Footage, tuple[str, ...]]:
     """The footage of a single camera without a calibration and, if it was filmed around a still
     head, with a camera for each image; and sentences about that.
 
     out: folder of the capture, in which what an interruption leaves is kept. take: "auto",
-    "around" or "talk". Raises StgaError for a folder that is no place for a capture, and
-    CamerasNotFound for a take that is said to be one around a head.
+    "around" or "talk". known: what `take_of` found. Raises StgaError for a folder that is no place
+    for a capture, and CamerasNotFound for a take that is said to be one around a head.
     """
     if take == "talk":
         return footage, ()
@@ -152,7 +156,7 @@ def with_found_cameras(
             )
         found, line = _with_cameras(footage, out, workers)
         return found, (f"take: around a still head, as given; {line}",)
-    kind, why = take_of(footage, workers)
+    kind, why = known or take_of(footage, workers)
     if kind == "talk":
         return footage, (
             f"take: a head that moves before a camera ({why}; else give --take around)",

@@ -113,7 +113,8 @@ def asked(out, footage, **more):
 )
 def test_the_order_of_takes(tmp_path, monkeypatch, take, kinds, order):
     """Catches a head that is sought in a talk although it was filmed all around, an avatar that
-    plays a still head, a word that does not decide, and an order that changes when it goes on."""
+    plays a still head, a word that does not decide, a take that is recognized twice, and an order
+    that changes when it goes on."""
     names = ["a/1.png", "b/1.png", "c/1.png"]
     folder = lay_out(tmp_path, *names)
     footage = [folder / name for name in "abc"]
@@ -122,8 +123,10 @@ def test_the_order_of_takes(tmp_path, monkeypatch, take, kinds, order):
     request = asked(tmp_path / "out", footage, take=take)
     jobs.write_json(request.out / jobs.INPUTS, jobs._inputs(request.track, request.takes))
     said = []
-    for _ in range(2):
-        tracks = jobs._planned(request, ignore, said.append)
+    for known in (sorted(kinds or ()), []):
+        planned = jobs._planned(request, ignore, said.append)
+        assert sorted(kind[0] for _, kind in planned if kind) == known
+        tracks = [own for own, _ in planned]
         assert [own.out.name for own in tracks] == order
         first, *others = tracks
         assert first.avatar is None
