@@ -4,8 +4,9 @@ A matte is the coverage of each pixel by the person whose head was tracked. What
 person (by a network, or by the difference from a clean plate) and the tracked head are the seeds of
 OpenCV's GrabCut (Rother et al. 2004), which finds the outline in between. In a band along it,
 coverage is that fraction of the way from the backdrop's color around the pixel to the person's that
-the pixel's color lies at; where both colors are alike, the band is a smooth edge. Hair that stands
-off the head, before an even backdrop, has a wider band: the backdrop is seen between its strands.
+the pixel's color lies at; where both colors are alike or uneven, it is that of the cut. Hair that
+stands off the head, before an even backdrop, has a wider band: the backdrop is seen between its
+strands. A guided filter (He et al. 2013) then draws the band to the edges of the image.
 """
 
 import math
@@ -38,7 +39,7 @@ SURE = 0.9
 """Probability from which it certainly is."""
 UNLIKELY = 0.1
 """Probability below which it certainly is not."""
-MAX_CUT_SIDE_PX = 400
+MAX_CUT_SIDE_PX = 600
 """Side of the images that GrabCut works on, whose time grows with the pixels; the band has all of
 them."""
 CUT_ITERATIONS = 1
@@ -61,7 +62,7 @@ OPAQUE_HAIR_FRACTION = 0.9
 is a little nearer to a bright backdrop."""
 EVEN_COLORS_WEIGHT = 4.0
 """Weight of the variance of both sides' colors, beside SIMILAR_COLORS_LEVELS, in the confidence of
-hair's coverage: before a room and in dyed hair, a pixel's color is no evidence."""
+coverage by color: before a room and in dyed hair, a pixel's color is no evidence."""
 NEIGHBORHOOD_FRACTIONS = (0.03, 0.12)
 """Standard deviations of the neighborhoods that colors are means of, as fractions of the head's
 size."""
@@ -69,7 +70,14 @@ REACH_FRACTION = 1.0
 """Distance from the head that hair reaches, as a fraction of its size; clothes reach farther,
 below."""
 SIMILAR_COLORS_LEVELS = 30.0
-"""Difference of both sides' colors at which half of the coverage is a smooth edge's."""
+"""Difference of both sides' colors at which half of the coverage is that of the cut."""
+GUIDE_FRACTION = 0.012
+"""Half the side of the squares in which coverage is a linear function of color, as a fraction of
+the head's size."""
+GUIDE_PX = 2
+"""The same in the smaller image in which these functions are found."""
+GUIDE_VARIANCE = 1e-3
+"""Variance of colors in 0…1 that noise makes: squares of less contrast have a smooth edge."""
 PLATE_NOISE_LEVELS = 10.0
 """Difference from a clean plate, of 255, that noise makes."""
 PLATE_SURE_LEVELS = 40.0
@@ -249,7 +257,6 @@ def find_matte(image: np.ndarray, probability: np.ndarray, head: np.ndarray) -> 
         return matte
     places = np.stack([own + side.start for own, side in zip(unknown, near, strict=True)], axis=1)
     deviations = [fraction * size for fraction in NEIGHBORHOOD_FRACTIONS]
-    in_hair = is_hair[unknown]
     squares = cv2.pow(image.astype(np.float32), 2)
     means = []
     variance = np.zeros(len(places), np.float32)
@@ -257,21 +264,50 @@ def find_matte(image: np.ndarray, probability: np.ndarray, head: np.ndarray) -> 
         everywhere = np.full(person.shape, beyond, np.uint8)
         everywhere[near] = known
         means.append(mean_around(image, everywhere, deviations, places))
-        if in_hair.any():
-            square = mean_around(squares, everywhere, deviations, places[in_hair])
-            variance[in_hair] += np.maximum(square - means[-1][in_hair] ** 2, 0).sum(axis=1)
+        square = mean_around(squares, everywhere, deviations, places)
+        variance += np.maximum(square - means[-1] ** 2, 0).sum(axis=1)
     (backdrop, color) = means
     towards = color - backdrop
     contrast = (towards**2).sum(axis=1)
     colors = image[near][unknown]
     fraction = ((colors - backdrop) * towards).sum(axis=1) / np.maximum(contrast, 1e-3)
-    fraction[in_hair] /= OPAQUE_HAIR_FRACTION
-    edge = cv2.GaussianBlur(outline.astype(np.float32), (0, 0), max(0.7, band / 3))
+    fraction[is_hair[unknown]] /= OPAQUE_HAIR_FRACTION
     doubt = 3 * SIMILAR_COLORS_LEVELS**2 + EVEN_COLORS_WEIGHT * variance
     trust = contrast / (contrast + doubt)
-    coverage = trust * np.clip(fraction, 0, 1) + (1 - trust) * edge[unknown]
-    matte[near][unknown] = (255 * coverage + 0.5).astype(np.uint8)
+    rough = outline.astype(np.float32)
+    rough[unknown] += trust * (np.clip(fraction, 0, 1) - rough[unknown])
+    coverage = _guided(cv2, image[near], rough, GUIDE_FRACTION * size)
+    coverage = np.where(narrow | outside, rough, coverage)
+    matte[near][unknown] = (255 * coverage[unknown] + 0.5).astype(np.uint8)
     return matte
+
+
+def _guided(cv2: Any, image: np.ndarray, rough: np.ndarray, radius: float) -> np.ndarray:
+    """Coverage (H, W) float32 in 0…1, from a rough one, that in squares of 2 · radius pixels is a
+    linear function of the colors of an image (H, W, 3) uint8: the guided filter of He et al.
+    (2013), whose functions are found in a smaller image (He and Sun 2015)."""
+    whole = image.shape[1::-1]
+    scale = min(1.0, GUIDE_PX / radius)
+    small = tuple(max(1, round(scale * side)) for side in whole)
+    image = image.astype(np.float32) / 255
+    color, covered = (
+        cv2.resize(each, small, interpolation=cv2.INTER_AREA) for each in (image, rough)
+    )
+
+    def mean(values: np.ndarray) -> np.ndarray:
+        side = 2 * GUIDE_PX + 1
+        return np.asarray(cv2.blur(values, (side, side), borderType=cv2.BORDER_REFLECT))
+
+    products = color[..., :, None] * color[..., None, :]
+    middle = mean(color)
+    mixed = mean(color * covered[..., None]) - middle * mean(covered)[..., None]
+    spread = np.stack([mean(products[..., row, :]) for row in range(3)], axis=-2)
+    spread -= middle[..., :, None] * middle[..., None, :]
+    spread += GUIDE_VARIANCE * np.eye(3, dtype=np.float32)
+    slope = np.linalg.solve(spread, mixed[..., None])[..., 0]
+    offset = mean(covered) - (slope * middle).sum(axis=-1)
+    slope, offset = (cv2.resize(mean(each), whole) for each in (slope, offset))
+    return np.asarray(np.clip((slope * image).sum(axis=-1) + offset, 0, 1))
 
 
 def _may_be_hair(cv2: Any, head: np.ndarray, margin: float) -> np.ndarray:

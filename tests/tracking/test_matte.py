@@ -70,6 +70,21 @@ def test_hair_is_soft():
     assert np.abs(matte - coverage)[edge].mean() < 0.6 * hard
 
 
+def test_a_papered_wall():
+    """Catches an outline that the stains of a wall fray: the mean colors of both sides say little
+    about a pixel there, but the image has an edge."""
+    coverage, head, colors = person(softness=2.0)
+    errors = []
+    for seed in range(2):
+        stains = gaussian_filter(default_rng(seed).normal(size=(HEIGHT, WIDTH)), 2.5)
+        wall = np.clip(110 + 60 * stains[..., None] / stains.std() - [0, 5, 15], 0, 255)
+        image = filmed(coverage, colors, wall)
+        errors.append(np.abs(find_matte(image, coverage.astype(np.float32), head) / 255 - coverage))
+    edge = np.abs(gaussian_filter(coverage, 3) - 0.5) < 0.45
+    hard = np.abs((coverage > 0.5) - coverage)[edge].mean()
+    assert np.mean(errors, axis=0)[edge].mean() < 0.8 * hard
+
+
 def test_the_wall_is_seen_between_strands():
     """Catches hair that stands off the head as an opaque lump in the wall's color: a network and
     GrabCut see one person there. Gloss on hair beside it stays opaque."""
