@@ -236,6 +236,7 @@ class RenderPanel(bpy.types.Panel):
         layout.operator_menu_enum("stga.choose_set", "shown", text=f"Set: {shown}")
         if lens.is_blurred(context.scene):
             layout.prop(context.scene.eevee, "taa_render_samples", text="Samples")
+            layout.label(text="Each sample takes the time of an image", icon="INFO")
         layout.prop(context.scene.render, "film_transparent", text="Transparent Film")
         layout.prop(context.view_layer, "use_pass_z", text="Depth Pass")
         layout.prop(context.view_layer, "use_pass_vector", text="Vector Pass")

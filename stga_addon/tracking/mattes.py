@@ -22,7 +22,7 @@ from ..capture.model import evenly_spread, parts_of
 from ..errors import listed
 from ..files import read_json, write_json
 from ..worker.helpers import Step
-from .appearance import box_of, mean_around, reduced
+from .appearance import box_of, mean_around, reduced, sampled
 from .face_networks import PersonNetwork
 from .folder import MATTES_FILE, mask_name
 from .footage.model import Footage, FootageCamera, write_png
@@ -40,8 +40,10 @@ SURE = 0.9
 UNLIKELY = 0.1
 """Probability below which it certainly is not."""
 MAX_CUT_SIDE_PX = 600
-"""Side of the images that GrabCut works on, whose time grows with the pixels; the band has all of
-them."""
+"""Largest side of the image that GrabCut works on, whose time grows with the pixels; the band has
+all of them."""
+MAX_CUT_HEAD_PX = 200
+"""Largest size of the head in that image."""
 CUT_ITERATIONS = 1
 """Iterations of GrabCut."""
 CUT_MARGIN_FRACTION = 0.04
@@ -235,7 +237,7 @@ def find_matte(image: np.ndarray, probability: np.ndarray, head: np.ndarray) -> 
 
     size = np.sqrt(max(head.sum(), 1.0))
     whole = image.shape[1::-1]
-    scale = min(1.0, MAX_CUT_SIDE_PX / max(whole))
+    scale = min(1.0, MAX_CUT_SIDE_PX / max(whole), MAX_CUT_HEAD_PX / size)
     small = tuple(max(1, round(scale * side)) for side in whole)
     pixels = cv2.resize(image, small, interpolation=cv2.INTER_AREA)
     seeds = probability, head.astype(np.float32)
@@ -276,23 +278,27 @@ def find_matte(image: np.ndarray, probability: np.ndarray, head: np.ndarray) -> 
     trust = contrast / (contrast + doubt)
     rough = outline.astype(np.float32)
     rough[unknown] += trust * (np.clip(fraction, 0, 1) - rough[unknown])
-    coverage = _guided(cv2, image[near], rough, GUIDE_FRACTION * size)
-    coverage = np.where(narrow | outside, rough, coverage)
-    matte[near][unknown] = (255 * coverage[unknown] + 0.5).astype(np.uint8)
+    on_edge = ~narrow[unknown]
+    edge = np.stack(unknown, axis=1)[on_edge]
+    rough[tuple(edge.T)] = _guided(cv2, image[near], rough, GUIDE_FRACTION * size, edge)
+    matte[near][unknown] = (255 * rough[unknown] + 0.5).astype(np.uint8)
     return matte
 
 
-def _guided(cv2: Any, image: np.ndarray, rough: np.ndarray, radius: float) -> np.ndarray:
-    """Coverage (H, W) float32 in 0…1, from a rough one, that in squares of 2 · radius pixels is a
-    linear function of the colors of an image (H, W, 3) uint8: the guided filter of He et al.
-    (2013), whose functions are found in a smaller image (He and Sun 2015)."""
+def _guided(
+    cv2: Any, image: np.ndarray, rough: np.ndarray, radius: float, places: np.ndarray
+) -> np.ndarray:
+    """Coverage (N,) float32 in 0…1 at places (N, 2), rows and columns, from a rough one (H, W):
+    in squares of 2 · radius pixels it is a linear function of the colors of an image (H, W, 3)
+    uint8. This is the guided filter of He et al. (2013), whose functions are found in a smaller
+    image (He and Sun 2015)."""
     whole = image.shape[1::-1]
     scale = min(1.0, GUIDE_PX / radius)
     small = tuple(max(1, round(scale * side)) for side in whole)
-    image = image.astype(np.float32) / 255
     color, covered = (
         cv2.resize(each, small, interpolation=cv2.INTER_AREA) for each in (image, rough)
     )
+    color = color.astype(np.float32) / 255
 
     def mean(values: np.ndarray) -> np.ndarray:
         side = 2 * GUIDE_PX + 1
@@ -306,8 +312,10 @@ def _guided(cv2: Any, image: np.ndarray, rough: np.ndarray, radius: float) -> np
     spread += GUIDE_VARIANCE * np.eye(3, dtype=np.float32)
     slope = np.linalg.solve(spread, mixed[..., None])[..., 0]
     offset = mean(covered) - (slope * middle).sum(axis=-1)
-    slope, offset = (cv2.resize(mean(each), whole) for each in (slope, offset))
-    return np.asarray(np.clip((slope * image).sum(axis=-1) + offset, 0, 1))
+    at = (places[:, ::-1] + 0.5) * (np.array(small) / whole)
+    slopes, offsets = sampled([mean(slope), mean(offset)], at)
+    colors = image[tuple(places.T)].astype(np.float32) / 255
+    return np.asarray(np.clip((slopes * colors).sum(axis=-1) + offsets, 0, 1))
 
 
 def _may_be_hair(cv2: Any, head: np.ndarray, margin: float) -> np.ndarray:
