@@ -331,8 +331,8 @@ class _Paint:
         return np.asarray((is_lid & on_edge & (abs(out) < LID_HALF_WIDTH_CM)).astype(float))
 
     def _on_upper_lid(self, at: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Of points (N, 3): centimeters (N,) from the eyeball's middle to the temple, centimeters
-        above it, and whether they are near the eyeball's upper front."""
+        """Where points (N, 3) are: centimeters (N,) from the eyeball's middle to the temple and up,
+        and whether they are near the eyeball's upper front."""
         away = at - np.where(at[:, :1] > 0, self.eye_at, self.eye_at * [-1, 1, 1])
         out = away[:, 0] * np.sign(at[:, 0])
         gap = np.linalg.norm(away, axis=1) - self.eye_radius

@@ -4,6 +4,7 @@ from argparse import ArgumentParser
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import replace
+from itertools import cycle
 from pathlib import Path
 from time import perf_counter
 from typing import Any
@@ -16,15 +17,17 @@ from ...avatar.file import Avatar, read_avatar
 from ...avatar.splats import SH_C0
 from ...capture.camera import UP, Camera, orbited
 from ...capture.images import read_image
-from ...capture.model import Capture, evenly_spread
+from ...capture.model import Capture, View
 from ...capture.open import open_capture
 from ...cli.commands import carry_out
 from ...driving.demo_speech import SPEECH_FILE, demo_speech
 from ...driving.inverse import write_performance
+from ...driving.open_motion import MotionOptions, performed
 from ...errors import StgaError
 from ...export.formats import export_avatar
 from ...export.playback import Playback
 from ...files import replacing, write_json
+from ...flame.sequence import sequence_mesh
 from ...jobs.export import capture_views
 from ...jobs.track import RUN_FOLDER
 from ...jobs.train import Train
@@ -43,8 +46,10 @@ POSES_PER_SECOND = 1.5
 """Rate at which the web page plays the capture's expressions, which are single poses."""
 FRAMES_PER_SECOND = 8
 """Frame rate of demo.blend: its capture has a second of motion at this rate."""
-ANGLES_DEG = (0.0, 45.0, 90.0, 135.0, 180.0)
-"""Angles from the talk's camera, around the head, of the pictures in phone.png."""
+MOVING_PICTURE_FPS = 6
+"""Frame rate of phone.webp: a second of talk at the takes' rate, a little slower."""
+MOVING_PICTURE_ROWS = 0.7
+"""Fraction of the talk's height that phone.webp shows: the person ends below it."""
 MAX_POSITION_ERROR_M = 1e-5
 """Largest distance between a splat in Blender and in numpy."""
 
@@ -110,30 +115,43 @@ def avatar_from_footage(out: Path, budget: Mapping[str, Any], device: str = "cpu
 
 def avatar_from_phone(out: Path, budget: Mapping[str, Any], device: str = "cpu") -> None:
     """Make an avatar in OUT/phone from two videos as a phone films them, one around a still head
-    and one of a talk, and phone.png: a frame of the talk, then the avatar at `ANGLES_DEG`.
-    budget: as of `run_demo`.
+    and one of a talk, and phone.webp: the talk, the avatar in the same views, and the avatar driven
+    by the demo's speech before a camera that circles it. budget: as of `run_demo`.
 
     Raises StgaError.
     """
     takes = unpack_takes(out / "takes")
     _avatar_command([str(take) for take in takes], out / "phone", budget, device)
-    _picture_of_phone(out / "phone" / RUN_FOLDER, out / "phone.png")
-    print(f"{out / 'phone.png'}: the talk, and the avatar from its sides")
+    _moving_picture(out / "phone" / RUN_FOLDER, out / "phone.webp")
+    print(f"{out / 'phone.webp'}: the talk, its avatar, and the avatar driven by a performance")
 
 
-def _picture_of_phone(run: Path, path: Path) -> None:
-    """Write a frame of the run's talk, and the avatar at `ANGLES_DEG` beside it."""
+def _moving_picture(run: Path, path: Path) -> None:
+    """Write the moving picture of `avatar_from_phone`."""
     capture = open_refined(run)
+    assert capture.flame is not None
     views = capture.views["train"]
     ((most, _),) = Counter(view.camera_index for view in views).most_common(1)
-    talk = [view for view in views if view.camera_index == most]
+    talk = sorted((view for view in views if view.camera_index == most), key=_timestep)
     avatar = read_avatar(run / AVATAR)
-    pictures = [read_image(talk[0])]
-    for angle, view in zip(ANGLES_DEG, evenly_spread(talk, len(ANGLES_DEG)), strict=True):
-        mesh = capture.mesh(view.timestep)
-        camera = orbited(view.camera, mesh.mean(0), UP, np.radians(angle))
-        pictures.append(to_uint8(render_avatar(avatar, mesh, camera)))
-    _save(path, side_by_side(pictures))
+    driven = performed(demo_speech(), capture.flame, SPEECH_FILE, MotionOptions(), fps=24.0)
+    rows = slice(round(MOVING_PICTURE_ROWS * talk[0].camera.height))
+    frames: list[Image.Image] = []
+    for view, timestep in zip(talk, cycle(driven.sequence.timesteps[::3]), strict=False):
+        mesh = sequence_mesh(driven.sequence, timestep)
+        angle = 2 * np.pi * len(frames) / len(talk)
+        around = orbited(talk[0].camera, (mesh.min(0) + mesh.max(0)) / 2, UP, angle)
+        same = render_avatar(avatar, capture.mesh(view.timestep), view.camera)
+        pictures = [read_image(view), to_uint8(same), to_uint8(render_avatar(avatar, mesh, around))]
+        frames.append(Image.fromarray(side_by_side([picture[rows] for picture in pictures])))
+    with replacing(path) as partial:
+        duration = round(1000 / MOVING_PICTURE_FPS)
+        options = {"append_images": frames[1:], "duration": duration, "loop": 0, "method": 6}
+        frames[0].save(partial, format="WEBP", save_all=True, **options)
+
+
+def _timestep(view: View) -> int:
+    return view.timestep
 
 
 def _avatar_command(footage: list[str], out: Path, budget: Mapping[str, Any], device: str) -> None:

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from PIL import Image
+from PIL import Image, ImageSequence
 
 from stga_addon.avatar.file import read_avatar
 from stga_addon.capture.images import read_mask
@@ -133,7 +133,7 @@ def test_the_demos_budget_is_iterations(given, budget, monkeypatch, tmp_path):
     monkeypatch.setattr(run, "run_demo", lambda out, own, **_: budgets.append(own))
     command = replace(COMMANDS["avatar"], run=lambda options, head: requests.append(options))
     monkeypatch.setitem(COMMANDS, "avatar", command)
-    monkeypatch.setattr(run, "_picture_of_phone", lambda *_: None)
+    monkeypatch.setattr(run, "_moving_picture", lambda *_: None)
     more = ["--device", "cpu", "--footage", "--phone", *given]
     assert main(["demo", "--out", str(tmp_path), *more]) == 0
     (own,) = budgets
@@ -150,16 +150,17 @@ def test_demo_of_a_phone(tmp_path):
     and shows no skin where the face is."""
     pytest.importorskip("pycolmap")
     run.avatar_from_phone(tmp_path, {"iterations": 300})
-    picture = np.asarray(Image.open(tmp_path / "phone.png")).astype(int)
-    width = (picture.shape[1] + 6) // (len(run.ANGLES_DEG) + 1)  # with the gap after it
-    front = picture[:, width : 2 * width - 6]
-    back = picture[:, -width + 6 :]
+    with Image.open(tmp_path / "phone.webp") as moving:
+        frames = [np.asarray(frame.convert("RGB"), int) for frame in ImageSequence.Iterator(moving)]
+    width = (frames[0].shape[1] - 2 * 6) // 3  # gaps between the pictures
+    front = frames[0][:, -width:]
+    back = frames[len(frames) // 2][:, -width:]
     around = open_capture(tmp_path / "phone/capture_2").views["train"]  # the first is of the talk
     assert len({view.camera_index for view in around}) > 30
     masks = [read_mask(view) for view in around]
     assert max(mask[:, [*range(30), *range(-30, 0)]].mean() for mask in masks) < 0.01 * 255
     widths = [(shown.min(axis=2) < 200).any(axis=0).sum() for shown in (front, back)]
     assert widths[1] == pytest.approx(widths[0], rel=0.25)
-    middle = slice(picture.shape[0] // 4, picture.shape[0] // 2)
+    middle = slice(len(front) // 4, len(front) // 2)
     skin = [(np.ptp(shown[middle], axis=2) > 60).mean() for shown in (front, back)]
     assert skin[1] < skin[0] / 2
