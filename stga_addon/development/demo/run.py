@@ -17,7 +17,7 @@ from ...avatar.file import Avatar, read_avatar
 from ...avatar.splats import SH_C0
 from ...capture.camera import UP, Camera, orbited
 from ...capture.images import read_image
-from ...capture.model import Capture, View
+from ...capture.model import Capture
 from ...capture.open import open_capture
 from ...cli.commands import carry_out
 from ...driving.demo_speech import SPEECH_FILE, demo_speech
@@ -47,7 +47,7 @@ POSES_PER_SECOND = 1.5
 FRAMES_PER_SECOND = 8
 """Frame rate of demo.blend: its capture has a second of motion at this rate."""
 MOVING_PICTURE_FPS = 6
-"""Frame rate of phone.webp: a second of talk at the takes' rate, a little slower."""
+"""Frame rate of phone.webp; the takes have 5."""
 MOVING_PICTURE_ROWS = 0.7
 """Fraction of the talk's height that phone.webp shows: the person ends below it."""
 MAX_POSITION_ERROR_M = 1e-5
@@ -132,7 +132,8 @@ def _moving_picture(run: Path, path: Path) -> None:
     assert capture.flame is not None
     views = capture.views["train"]
     ((most, _),) = Counter(view.camera_index for view in views).most_common(1)
-    talk = sorted((view for view in views if view.camera_index == most), key=_timestep)
+    own = [view for view in views if view.camera_index == most]
+    talk = sorted(own, key=lambda view: view.timestep)
     avatar = read_avatar(run / AVATAR)
     driven = performed(demo_speech(), capture.flame, SPEECH_FILE, MotionOptions(), fps=24.0)
     rows = slice(round(MOVING_PICTURE_ROWS * talk[0].camera.height))
@@ -148,10 +149,6 @@ def _moving_picture(run: Path, path: Path) -> None:
         duration = round(1000 / MOVING_PICTURE_FPS)
         options = {"append_images": frames[1:], "duration": duration, "loop": 0, "method": 6}
         frames[0].save(partial, format="WEBP", save_all=True, **options)
-
-
-def _timestep(view: View) -> int:
-    return view.timestep
 
 
 def _avatar_command(footage: list[str], out: Path, budget: Mapping[str, Any], device: str) -> None:
