@@ -1,6 +1,6 @@
 """Time from a person's video to an avatar, step by step.
 
-    python -m stga_addon.development.benchmark.video_to_avatar VIDEO [--frames 300]
+    python -m stga_addon.development.benchmark.video_to_avatar VIDEO [--frames N]
         [--seconds 300] [--out FOLDER]
 
 Carries out `stga avatar VIDEO` with its defaults and prints a row in Markdown for each step: what
@@ -27,7 +27,7 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("video", type=Path)
-    parser.add_argument("--frames", type=int, default=300)
+    parser.add_argument("--frames", type=int, help="first ones that are used (default: all)")
     parser.add_argument("--seconds", type=float, default=300.0, help="of training")
     parser.add_argument("--out", type=Path)
     options = parser.parse_args()
