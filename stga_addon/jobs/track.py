@@ -3,6 +3,7 @@
 import math
 import os
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -69,7 +70,7 @@ INPUTS = "inputs.json"
 """File in the folder of `MakeAvatar`: capture, run, and what was asked for when they began, which
 alone continues."""
 KINDS = "kinds"
-"""Key in that file of each take's kind, once it is known."""
+"""Key in that file of what `take_of` found of each take, once it is known."""
 
 
 def _parsed_mattes(text: str) -> str:
@@ -271,9 +272,9 @@ def track(request: Track, report: Report, log: Log) -> Written:
         return _track_head(request, report)
 
 
-def _track_head(request: Track, report: Report, kind: tuple[str, str] | None = None) -> Written:
-    """The head of a stranger, or that of the capture which the request names. kind: what `take_of`
-    found, where it is known."""
+def _track_head(request: Track, report: Report, known: tuple[str, str] | None = None) -> Written:
+    """The head of a stranger, or that of the capture which the request names. known: what `take_of`
+    found, of several takes."""
     from ..tracking.track import track as track_footage
 
     steps = _Steps(report)
@@ -282,7 +283,7 @@ def _track_head(request: Track, report: Report, kind: tuple[str, str] | None = N
     if request.avatar is not None:
         person, model = _captured_person(request.avatar, model)
         options = replace(options, person=person)
-    footage, messages = _open(request, steps, kind)
+    footage, messages = _open(request, steps, known)
     found = track_footage(footage, model, request.out, options, steps.report, steps.show)
     return _written(request.out, found, report, messages)
 
@@ -326,9 +327,9 @@ def _track_by_avatar(request: Track, run: Path, report: Report) -> Written:
 
 
 def _open(
-    request: Track, steps: "_Steps", kind: tuple[str, str] | None = None
+    request: Track, steps: "_Steps", known: tuple[str, str] | None = None
 ) -> tuple["Footage", tuple[str, ...]]:
-    """The footage, and lines on how it was understood. kind: as of `_track_head`."""
+    """The footage, and lines on how it was understood. known: as of `_track_head`."""
     from ..tracking.footage.open import open_footage, sized
     from ..tracking.footage.sequences import FrameRange
 
@@ -350,7 +351,7 @@ def _open(
         # a few frames do not tell how the room moves, and are too far apart for cameras
         is_whole = request.most is None or request.take == "talk"
         whole = footage if is_whole else opened(frames=replace(frames, most=None))
-        found, messages = _with_found_cameras(whole, request, steps, kind)
+        found, messages = _with_found_cameras(whole, request, steps, known)
         is_found = is_whole or found.finds_cameras
         footage = found if is_found else replace(footage, warnings=found.warnings)
     steps.plan(footage)
@@ -358,7 +359,7 @@ def _open(
 
 
 def _with_found_cameras(
-    footage: "Footage", request: Track, steps: "_Steps", kind: tuple[str, str] | None
+    footage: "Footage", request: Track, steps: "_Steps", known: tuple[str, str] | None
 ) -> tuple["Footage", tuple[str, ...]]:
     """As `around.with_found_cameras`; what is refused leaves nothing."""
     from ..tracking.around import with_found_cameras
@@ -369,7 +370,7 @@ def _with_found_cameras(
     try:
         with Helpers(folder=out / KEPT_FOLDER) as helpers:
             workers = Workers(helpers, steps.report, steps.show)
-            return with_found_cameras(footage, out, request.take, workers, kind)
+            return with_found_cameras(footage, out, request.take, workers, known)
     except StgaError:
         if is_new and is_begun(out):
             clear(out)
@@ -512,7 +513,7 @@ def _track_takes(request: MakeAvatar, report: Report, log: Log) -> list[Path]:
         write_json(out / INPUTS, _inputs(request.track, request.takes))
     try:
         tracks = _planned(request, report, log)
-        for number, (own, kind) in enumerate(tracks):
+        for number, (own, known) in enumerate(tracks):
 
             def report_take(progress: Progress, before: int = number) -> bool:
                 fraction = (before + progress.fraction) / len(tracks)
@@ -520,7 +521,7 @@ def _track_takes(request: MakeAvatar, report: Report, log: Log) -> list[Path]:
 
             if not is_written(own.out):
                 with hold_folder(own.out, LOCK_FILE, WRITER):
-                    for line in _track_head(own, report_take, kind).lines:
+                    for line in _track_head(own, report_take, known).lines:
                         log(line)
     except (StgaError, OSError):
         # nothing was tracked yet, so that the inputs may be mended
@@ -560,15 +561,12 @@ def _planned(
         )
         for number in order
     ]
-    return [
-        (own, found[number] if found[number][1] else None)
-        for own, number in zip(tracks, order, strict=True)
-    ]
+    return [(own, found[number]) for own, number in zip(tracks, order, strict=True)]
 
 
 def _kinds(request: MakeAvatar, report: Report, log: Log) -> list[tuple[str, str]]:
     """What each take is, "around" or "talk": found out once and kept, or as given for the first, of
-    which the others are none. With the reason; "" where it was kept or given."""
+    which the others are none. With the reason, "" where it was given."""
     from ..tracking.around import take_of
     from ..tracking.footage.open import open_footage
     from ..tracking.stages import Workers
@@ -576,9 +574,10 @@ def _kinds(request: MakeAvatar, report: Report, log: Log) -> list[tuple[str, str
     track = request.track
     stored = read_inputs(request.out)
     footage = [track.footage, *request.takes]
-    known = stored.get(KINDS)
-    if isinstance(known, list) and len(known) == len(footage) and {*known} <= {*TAKES}:
-        return [(kind, "") for kind in known]
+    with suppress(TypeError, ValueError):  # none yet, or as earlier versions kept them
+        known = [(str(kind), str(why)) for kind, why in stored.get(KINDS, ())]
+        if len(known) == len(footage) and {kind for kind, _ in known} <= {*TAKES}:
+            return known
     opened = [open_footage(path) for path in footage]
     if track.take != "auto":
         kinds = [(track.take, ""), *(("talk", "") for _ in request.takes)]
@@ -591,7 +590,7 @@ def _kinds(request: MakeAvatar, report: Report, log: Log) -> list[tuple[str, str
                 kinds.append((kind, why))
                 what = "around a still head" if kind == "around" else "a head that moves"
                 log(f"take: {path.name}: {what} ({why})")
-    write_json(request.out / INPUTS, {**stored, KINDS: [kind for kind, _ in kinds]})
+    write_json(request.out / INPUTS, {**stored, KINDS: kinds})
     return kinds
 
 

@@ -254,10 +254,10 @@ def find_matte(image: np.ndarray, probability: np.ndarray, head: np.ndarray) -> 
     is_hair = narrow & ~_shrunk(cv2, outline, HAIR_BAND_FRACTION * size)
     is_hair &= _may_be_hair(cv2, head, band)[near]
     inside = narrow & ~is_hair
-    unknown = np.nonzero(~inside & ~outside)
-    if not (len(unknown[0]) and inside.any() and outside.any()):
+    unknown = ~inside & ~outside
+    if not (unknown.any() and inside.any() and outside.any()):
         return matte
-    places = np.stack([own + side.start for own, side in zip(unknown, near, strict=True)], axis=1)
+    places = np.argwhere(unknown) + [side.start for side in near]
     deviations = [fraction * size for fraction in NEIGHBORHOOD_FRACTIONS]
     squares = cv2.pow(image.astype(np.float32), 2)
     means = []
@@ -278,9 +278,9 @@ def find_matte(image: np.ndarray, probability: np.ndarray, head: np.ndarray) -> 
     trust = contrast / (contrast + doubt)
     rough = outline.astype(np.float32)
     rough[unknown] += trust * (np.clip(fraction, 0, 1) - rough[unknown])
-    on_edge = ~narrow[unknown]
-    edge = np.stack(unknown, axis=1)[on_edge]
-    rough[tuple(edge.T)] = _guided(cv2, image[near], rough, GUIDE_FRACTION * size, edge)
+    edge = ~narrow & ~outside
+    radius = GUIDE_FRACTION * size
+    rough[edge] = _guided(cv2, image[near], rough, radius, np.argwhere(edge))
     matte[near][unknown] = (255 * rough[unknown] + 0.5).astype(np.uint8)
     return matte
 

@@ -154,6 +154,17 @@ def test_a_head_that_turns_before_a_camera_is_none(tmp_path):
     assert "the room does not move with it" in line
 
 
+def test_a_take_that_is_known_is_not_recognized_again(tmp_path, monkeypatch):
+    """Catches takes of one avatar whose frames are looked at twice."""
+    folder = write_pictures(tmp_path / "photos", [np.zeros((8, 8, 3), np.uint8)] * COUNT)
+    monkeypatch.delattr(around, "take_of")
+    asked = track.Track(folder, None, tmp_path / "out")
+    steps = track._Steps(lambda progress: None)
+    footage, lines = track._open(asked, steps, ("talk", "as seen before"))
+    assert len(footage.timesteps) == COUNT
+    assert "a head that moves before a camera (as seen before; " in lines[0]
+
+
 @pytest.mark.parametrize(
     ("seen", "expected"),
     [

@@ -47,9 +47,9 @@ POSES_PER_SECOND = 1.5
 FRAMES_PER_SECOND = 8
 """Frame rate of demo.blend: its capture has a second of motion at this rate."""
 MOVING_PICTURE_FPS = 6
-"""Frame rate of phone.webp; the takes have 5."""
+"""Frame rate of phone.webp, near that of the takes."""
 MOVING_PICTURE_ROWS = 0.7
-"""Fraction of the talk's height that phone.webp shows: the person ends below it."""
+"""Upper fraction of the talk's frames that phone.webp shows: the rendered person has no body."""
 MAX_POSITION_ERROR_M = 1e-5
 """Largest distance between a splat in Blender and in numpy."""
 
@@ -135,10 +135,11 @@ def _moving_picture(run: Path, path: Path) -> None:
     own = [view for view in views if view.camera_index == most]
     talk = sorted(own, key=lambda view: view.timestep)
     avatar = read_avatar(run / AVATAR)
-    driven = performed(demo_speech(), capture.flame, SPEECH_FILE, MotionOptions(), fps=24.0)
+    fps = float(MOVING_PICTURE_FPS)
+    driven = performed(demo_speech(), capture.flame, SPEECH_FILE, MotionOptions(), fps=fps)
     rows = slice(round(MOVING_PICTURE_ROWS * talk[0].camera.height))
     frames: list[Image.Image] = []
-    for view, timestep in zip(talk, cycle(driven.sequence.timesteps[::3]), strict=False):
+    for view, timestep in zip(talk, cycle(driven.sequence.timesteps), strict=False):
         mesh = sequence_mesh(driven.sequence, timestep)
         angle = 2 * np.pi * len(frames) / len(talk)
         around = orbited(talk[0].camera, (mesh.min(0) + mesh.max(0)) / 2, UP, angle)
@@ -146,7 +147,7 @@ def _moving_picture(run: Path, path: Path) -> None:
         pictures = [read_image(view), to_uint8(same), to_uint8(render_avatar(avatar, mesh, around))]
         frames.append(Image.fromarray(side_by_side([picture[rows] for picture in pictures])))
     with replacing(path) as partial:
-        duration = round(1000 / MOVING_PICTURE_FPS)
+        duration = round(1000 / fps)
         options = {"append_images": frames[1:], "duration": duration, "loop": 0, "method": 6}
         frames[0].save(partial, format="WEBP", save_all=True, **options)
 
