@@ -29,13 +29,14 @@ def drawn():
 
 def buttons():
     """ "Panel: text" of each button in sidebar, menus and preferences -> operator and options."""
-    menus = {"Import": Layout(), "Export": Layout()}
     operators = module("operators")
-    operators._import_menu(SimpleNamespace(layout=menus["Import"]), bpy.context)
-    operators._export_menu(SimpleNamespace(layout=menus["Export"]), bpy.context)
-    found = {}
+    found = {
+        f"{menu}: {text}": (operator, {})
+        for menu, entries in (("Import", operators.IMPORTS), ("Export", operators.EXPORTS))
+        for operator, text in entries
+    }
     preferences = draw(module("ui.properties").Preferences)
-    for panel, layout in {**drawn(), **menus, "Preferences": preferences}.items():
+    for panel, layout in {**drawn(), "Preferences": preferences}.items():
         for leaf in layout.leaves:
             if leaf.kind == "operator":
                 text = leaf.text or leaf.options.get("icon")
