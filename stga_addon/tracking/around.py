@@ -331,11 +331,12 @@ def _cameras(camera: FootageCamera, structure: Structure) -> tuple[FootageCamera
 
 def _recognized(footage: Footage, camera: FootageCamera, workers: Workers) -> Recognition:
     """`Recognition` from some of the frames."""
-    found = workers.helpers.run(
-        recognize,
-        (camera, footage.fps),
-        lambda steps: workers.report(Stage.OPENING, min(steps, SAMPLES), SAMPLES),
-    )
+
+    def report(steps: int) -> None:
+        total = SAMPLES if steps <= SAMPLES else SAMPLES + MORE_SAMPLES
+        workers.report(Stage.OPENING, steps, total)
+
+    found = workers.helpers.run(recognize, (camera, footage.fps), report)
     return Recognition(*found["recognition"].tolist())
 
 

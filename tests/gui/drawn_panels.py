@@ -1,10 +1,8 @@
 """The panels of the sidebar as their layouts are filled, and the buttons in them."""
 
-from types import SimpleNamespace
-
 import bpy
 from in_window import in_viewport, module, viewport
-from layouts import Layout, filled
+from layouts import filled
 
 PANEL_MARGIN = 36
 """Of a sidebar's width: tabs, and the borders of panel and sub-panel."""

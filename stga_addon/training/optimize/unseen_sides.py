@@ -45,7 +45,7 @@ MIN_SHOWN_FRACTION = 0.1
 """Fraction of the median of the pixels that show as much of the surface, below which it is not
 visible: a folded eyelid has less."""
 NEAREST = 24
-"""Visible triangles of whose colors a hidden one has the median."""
+"""Visible triangles of whose colors a hidden one has the median; teeth around one that is shown."""
 SOURCE_TRIANGLES = 100
 """Triangles over which hair's color off axis, and that of the layer behind skin, are medians."""
 COLLAR_SLOPE = 0.6
@@ -99,6 +99,7 @@ def unseen_sides(surface: Surface) -> UnseenSides:
     facing = density[cosine > WELL_SHOWN_COSINE]
     median = np.median(facing[facing > 0]) if facing.any() else 0.0
     shown = density > MIN_SHOWN_FRACTION * median
+    shown |= _around_shown_teeth(surface, shown)
     is_source = (pixels > 0) & is_outside & (cosine > SOURCE_COSINE) & ~surface.lids
     if not is_source.any():
         none = np.zeros_like(shown)
@@ -282,6 +283,17 @@ def _unseen_inside(capture: Capture, shown: np.ndarray, is_outside: np.ndarray) 
     touched[capture.faces[shown]] = True
     may_line = ~skin_of(capture) | lining_of(capture)
     return np.asarray(may_line & ~is_outside & ~touched[capture.faces].any(1))
+
+
+def _around_shown_teeth(surface: Surface, shown: np.ndarray) -> np.ndarray:
+    """(F,) bool: teeth near those that are shown: they may be smaller than the pixels, between
+    whose centers they lie."""
+    teeth = np.flatnonzero(teeth_of(surface.capture))
+    found = np.zeros(len(shown), bool)
+    if len(teeth):
+        places = surface.centers[teeth]
+        found[teeth] = shown[teeth][nearest_rows(places, places, NEAREST)].any(1)
+    return found
 
 
 def _unseen_teeth(capture: Capture, pixels: np.ndarray, shown: np.ndarray) -> np.ndarray:
