@@ -15,7 +15,7 @@ from ..errors import StgaError
 from ..files import write_json
 from ..flame.quaternions import continuous, from_matrices
 from . import arrays, tags
-from .compat import is_made_by_hand, mark_imported
+from .kept_animation import is_made_by_hand, mark_imported
 from .objects import Warn, log_warning, place, remove, set_frames_per_second
 
 UP = (0.0, 0.0, 1.0)

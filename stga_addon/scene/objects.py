@@ -13,8 +13,8 @@ import bpy
 from ..errors import StgaError
 from ..format import format_name
 from . import tags
-from .compat import is_made_by_hand
 from .evaluation import kept_evaluated
+from .kept_animation import is_made_by_hand
 from .record import rebase_file
 
 Warn = Callable[[str], None]

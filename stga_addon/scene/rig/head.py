@@ -23,7 +23,7 @@ from ...flame.model import JOINTS, FlameModel
 from ...flame.sequence import MIN_JOINT_ANGLE_DEG, FlameSequence, joint_angles
 from .. import arrays, tags
 from ..arrays import Z_UP_TO_Y_UP, add_driver, flat_floats, key_points
-from ..compat import (
+from ..kept_animation import (
     KeptAnimation,
     give_added_curves,
     give_animation,
