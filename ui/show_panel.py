@@ -236,14 +236,14 @@ class RenderPanel(bpy.types.Panel):
         layout.operator_menu_enum("stga.choose_set", "shown", text=f"Set: {shown}")
         if lens.is_blurred(context.scene):
             layout.prop(context.scene.eevee, "taa_render_samples", text="Samples")
-            layout.label(text="Each sample takes the time of an image", icon="INFO")
+            draw_text(layout, context, "Each sample takes the time of an image", "INFO")
         layout.prop(context.scene.render, "film_transparent", text="Transparent Film")
         layout.prop(context.view_layer, "use_pass_z", text="Depth Pass")
         layout.prop(context.view_layer, "use_pass_vector", text="Vector Pass")
         if missing_packages() and not has_gpu_context():
             renderer = "Rendered by another Python" if has_python else "No Python here can render"
             lacks = f"Blender's Python lacks {', '.join(missing_packages())}"
-            layout.label(text=f"{renderer}: {lacks}", icon="INFO")
+            draw_text(layout, context, f"{renderer}: {lacks}", "INFO")
 
 
 def register(at_end: AtEnd) -> None:

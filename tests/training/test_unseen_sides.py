@@ -242,6 +242,26 @@ def test_hair_goes_round_the_head(angles, height, fringe, hair, bundled, tmp_pat
         assert (off < 25).mean() > 0.9, part
 
 
+def test_a_chest_goes_on_below_the_image(bundled, tmp_path):
+    """Catches a chest that has the color of the hair on the shoulders beside it."""
+    color = painted(bundled)
+    centers, level = middles(bundled)
+    beside = np.abs(centers[:, 0])
+    below = level < -1.8
+    color[below] = np.where(beside[below, None] < 0.06, SKIN, HAIR)
+    capture = filmed(bundled, color, (0,), 0.0, tmp_path)
+    (view,) = capture.views["train"]
+    rows = 165
+    for file in (view.image, view.mask):
+        Image.fromarray(np.asarray(Image.open(file))[:rows]).save(file)
+    camera = replace(view.camera, height=rows)
+    sides = sides_of(replace(capture, views={"train": (replace(view, camera=camera),)}))
+    beyond = camera.project(centers)[0][:, 1] > rows
+    chest = beyond & (beside < 0.04) & (centers[:, 2] > 0.02)
+    assert chest.sum() > 20
+    assert (np.abs(255 * sides.color[chest] - SKIN).max(1) < 25).mean() > 0.95
+
+
 @pytest.mark.parametrize("convention", ["stga", "gaussian_avatars"])
 def test_unseen_hair_grows_in_locks(convention, bundled, tmp_path):
     """Catches a helmet of one color, strands across the direction of growth or with gaps, locks

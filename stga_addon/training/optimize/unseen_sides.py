@@ -117,11 +117,12 @@ def unseen_sides(surface: Surface) -> UnseenSides:
     is_hair = np.zeros_like(shown)
     may_be_mirrored = unseen.copy()
     if surface.at is not None:
-        kinds = {"body": surface.kinds["body"], "ears": ears}
-        for kind, own in kinds.items():
-            if (own & is_source).any() and (own & hidden).any():
-                is_level = kind == "body"
-                found[own & hidden] = sides.nearest(own & is_source, own & hidden, is_level)
+        # what faces a camera beyond its image goes on as the image ends
+        body = surface.kinds["body"]
+        of_kind = (body, body & ~unseen, False), (body, body & unseen, True), (ears, ears, False)
+        for like, own, is_level in of_kind:
+            if (like & is_source).any() and (own & hidden).any():
+                found[own & hidden] = sides.nearest(like & is_source, own & hidden, is_level)
         if surface.has_few_cameras:
             turns_away = sides.of_face & is_outside & (cosine < WELL_SHOWN_COSINE)
             off_axis[turns_away] = sides.nearest(is_source & ~ears, turns_away)
