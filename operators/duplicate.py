@@ -36,6 +36,7 @@ class AttachToBone(Edit, bpy.types.Operator):
     """Let the avatar follow a bone of another armature, such as a body's neck, from where it is
     now; its own bones stay"""
 
+    bl_label = "Attach to Bone"
     needs = (needs_local_head,)
 
     armature: options.text("Armature", "Name of the armature; empty: detach", options=ONCE)

@@ -51,7 +51,12 @@ class FaceShapes:
 
 @cache
 def face_shapes() -> FaceShapes:
-    """The shapes that come with this package."""
+    """The shapes that come with this package. Raises StgaError in an edition without them."""
+    if not SHAPES_FILE.is_file():
+        raise StgaError(
+            "face performances need data of ICT-FaceKit, which the bare edition leaves out; install "
+            "the small or the complete edition"
+        )
     arrays = read_npz(SHAPES_FILE)
     shapes = np.zeros((COUNT, *arrays["points"].shape))
     shapes[[COLUMN[name] for name in ARKIT_SHAPES if name not in OPTIONAL]] = arrays["shapes"]

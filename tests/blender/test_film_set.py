@@ -112,8 +112,8 @@ def test_sets_are_combined_with_splats_by_depth(shot, tmp_path):
 
 
 def test_sets_keep_what_the_compositor_does(shot, tmp_path):
-    """Catches nodes of the artist that are replaced or get the splats alone, and a set that leaves
-    nodes or scenes behind once it is left out."""
+    """Catches nodes of the artist that are replaced or get the splats alone, a set that leaves
+    nodes or scenes behind once it is left out, and one with other samples than were chosen."""
     board("wall", BEHIND, wall(6.0, -20.0, 20.0))
     tree, exposure = image_nodes(shot)
     before = links_of(tree)
@@ -123,8 +123,10 @@ def test_sets_keep_what_the_compositor_does(shot, tmp_path):
     (link,) = exposure.inputs[0].links
     assert link.from_node.name == film_set.NODE
     exposure.inputs["Exposure"].default_value = 1.0
+    shot.eevee.taa_render_samples = 3
     corner = render(tmp_path)["R"][0, 0]
     assert_allclose(corner, 2 * BEHIND[0], atol=1e-3)
+    assert shot[tags.SET].eevee.taa_render_samples == 3
     film_set.leave_out_set(shot)
     assert not film_set.shows_set(shot)
     assert len(bpy.data.scenes) == scenes

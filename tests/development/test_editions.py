@@ -33,6 +33,7 @@ from stga_addon.development.wheels import (
     locked_wheels,
     needs,
 )
+from stga_addon.driving.shapes import face_shapes
 from stga_addon.tracking.face_networks import PersonNetwork
 from stga_addon.worker.training_python import CAMERAS_REQUIREMENT, GPU_REQUIREMENT, REQUIREMENTS
 
@@ -271,6 +272,10 @@ def test_the_bare_edition_has_no_data_of_others(tmp_path, monkeypatch):
     monkeypatch.setattr("stga_addon.tracking.face_networks.PERSON_FILE", tmp_path / "none.tflite")
     with refusal(r"none\.tflite: cannot be read"):
         assert PersonNetwork()._network
+    face_shapes.cache_clear()
+    monkeypatch.setattr("stga_addon.driving.shapes.SHAPES_FILE", tmp_path / "none.npz")
+    with refusal("the bare edition leaves out; install the small"):
+        face_shapes()
 
 
 @pytest.mark.parametrize("edition", [SMALL, complete(LINUX)], ids=["small", "complete"])

@@ -110,6 +110,8 @@ def update_set(scene: Any) -> None:
         other.view_layers[0].update()  # else Blender 5.3 crashes as it renders the scene
     if other.render.engine not in (compat.EEVEE, "CYCLES"):
         other.render.engine = compat.EEVEE
+    if other.eevee.taa_render_samples != scene.eevee.taa_render_samples:
+        other.eevee.taa_render_samples = scene.eevee.taa_render_samples
     values = {"camera": _camera(scene), "world": scene.world}
     for name, value in values.items():
         if getattr(other, name) != value:
