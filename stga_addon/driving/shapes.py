@@ -54,8 +54,8 @@ def face_shapes() -> FaceShapes:
     """The shapes that come with this package. Raises StgaError in an edition without them."""
     if not SHAPES_FILE.is_file():
         raise StgaError(
-            "face performances need data of ICT-FaceKit, which the bare edition leaves out; install "
-            "the small or the complete edition"
+            "face performances need data of ICT-FaceKit, which the bare edition leaves out; "
+            "install the small or the complete edition"
         )
     arrays = read_npz(SHAPES_FILE)
     shapes = np.zeros((COUNT, *arrays["points"].shape))
