@@ -8,8 +8,8 @@ from numpy.testing import assert_allclose, assert_array_equal
 from scipy.spatial.transform import Rotation
 
 from light.scenes import lit_avatar
-from stga_addon.avatar.splats import sh_color
-from stga_addon.capture.color import srgb_to_linear
+from stga_addon.avatar.splats import SH_C0, sh_color
+from stga_addon.capture.color import linear_to_srgb, srgb_to_linear
 from stga_addon.capture.mesh_geometry import vertex_normals
 from stga_addon.light import relight
 from stga_addon.light.harmonics import basis, even_directions, rotated, uniform
@@ -44,6 +44,26 @@ def test_albedo_is_what_was_recorded_without_its_light(relighter):
     assert down.sum() > 100
     expected = np.array(ALBEDO) * 2 * -normals[down, 1:2] / np.pi
     assert_allclose(lit[down], expected, rtol=0.03, atol=0.004)
+
+
+def test_hair_does_not_shine_as_skin_does():
+    """Catches hair that a lamp behind the head whitens, and skin without its highlight there."""
+    avatar = lit_avatar(ALBEDO)
+    center = avatar.neutral[avatar.faces].mean(1)
+    hair = center[:, 1] > 0.0
+    color = srgb_to_linear(sh_color(avatar.splats.sh, np.zeros((1, 3))))
+    color[hair] *= 0.15
+    avatar.splats.sh[:, 0] = (linear_to_srgb(color) - 0.5) / SH_C0
+    avatar = replace(avatar, regions={"nose": (center[:, 2] > 0.09) & ~hair})
+    relighter = Relighter(avatar)
+    lamp = Light("sun", np.full(3, 5.0), direction=(1.0, 0.0, 0.4), casts_shadow=False)
+    with_shine, without = (
+        relighter.radiance(avatar.neutral, EYE, Lighting(lights=(lamp,), specular=specular))
+        for specular in (1.0, 0.0)
+    )
+    shine = (with_shine - without).max(1)
+    beside = center[:, 0] < -0.05
+    assert shine[beside & hair].max() < 0.1 * shine[beside & ~hair].max()
 
 
 def normals_of(relighter):
