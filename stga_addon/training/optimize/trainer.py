@@ -199,7 +199,7 @@ class Trainer:
         splats = state.splats(averaged=True)
         along = self.frames.surface.filmed_along if splats.sh_degree == 0 else None
         if along is not None:
-            splats = plausible_off_axis(splats, along, self.frames.sides)
+            splats = plausible_off_axis(splats, along, self.frames.sides, self.frames.neutral)
         return Avatar(
             splats=splats,
             convention=settings.convention,

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ...avatar.embedding import MIN_DIVISOR, face_areas
+from ...avatar.embedding import MIN_DIVISOR, FaceFrames, face_areas, points_to_world
 from ...avatar.splats import Splats, colored_off_axis, sh_color
 from ...capture.mesh_geometry import connected_parts
 from ...capture.model import Capture, View, evenly_spread, views_by_timestep
@@ -62,6 +62,8 @@ OFF_AXIS_WEIGHT = 0.75
 BEHIND_STEEPNESS = 1.73
 """`steepness` of the way to the off-axis color where hair behind a face looks as if it were on it:
 two thirds at 45°."""
+ALSO_BEHIND_STEEPNESS = 0.5
+"""`steepness` of the way to a color that a splat also has from behind: 40 % at 45°."""
 
 
 @dataclass(frozen=True)
@@ -147,22 +149,31 @@ def unseen_sides(surface: Surface) -> UnseenSides:
     return UnseenSides(triangles, shown, found, is_hair, np.where(is_hair, 1.0, turned), off_axis)
 
 
-def plausible_off_axis(splats: Splats, along: np.ndarray, sides: UnseenSides) -> Splats:
+def plausible_off_axis(
+    splats: Splats, along: np.ndarray, sides: UnseenSides, neutral: FaceFrames
+) -> Splats:
     """Splats that views show along one direction only, that of their triangle (F, 3), with their
-    prior's color off-axis: hair, and elsewhere the splats that lie on the surface, not those that
-    hang in front of it. A hair-colored splat on skin that turns away belongs to hair behind it:
-    off-axis it is skin."""
+    prior's color off-axis: hair, and elsewhere the splats that lie on the surface. Free splats of
+    shoulders have the median color of those around: the front ones hide what colors others have. A
+    hair-colored splat on skin that turns away belongs to hair behind it: off-axis it is skin."""
     face = splats.face
     fraction = OFF_AXIS_WEIGHT * sides.view_dependence[face]
-    fraction[splats.unbound & ~sides.is_hair[face]] = 0
     fraction[sides.triangles[face]] = 0  # they have one color from everywhere, and hair its locks
     plausible = sides.off_axis[face]
     steepness = np.ones(len(face))
+    shown = sh_color(splats.sh, along[face])
+    beside = np.flatnonzero(splats.unbound & ~sides.is_hair[face])
+    if len(beside):
+        places = points_to_world(splats.xyz[beside], neutral, face[beside])
+        around = beside[nearest_rows(places, places, NEAREST)]
+        plausible[beside] = np.median(shown[around], axis=1)
+        fraction[beside] = 1
+        steepness[beside] = ALSO_BEHIND_STEEPNESS
     if sides.is_hair.any():
-        shown = sh_color(splats.sh, along[face])
         hair = np.median(sides.off_axis[sides.is_hair], axis=0)
         from_hair, from_skin = (np.linalg.norm(shown - own, axis=1) for own in (hair, plausible))
         is_behind = (fraction > 0) & ~sides.is_hair[face] & (from_hair < from_skin)
+        is_behind[beside] = False
         fraction[is_behind] = 1
         steepness[is_behind] = BEHIND_STEEPNESS
     return colored_off_axis(splats, along[face], fraction, plausible, steepness)
