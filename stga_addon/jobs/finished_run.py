@@ -79,11 +79,15 @@ def add_light(
     StgaError, also while another process works on the run."""
     from ..light.estimate import Known, estimate_light
     from ..training.evaluate.metrics import known_exposure
+    from ..training.optimize.surface import Surface
+    from ..training.optimize.unseen_sides import unseen_sides
 
     with run_folder.locked(avatar_file.parent):
         avatar = read_avatar(avatar_file)
         exposure = known_exposure(avatar.settings.get("exposure") or (), ())
-        light = estimate_light(capture, replace(known or Known(), exposure=exposure), report)
+        known = replace(known or Known(), exposure=exposure)
+        hair = unseen_sides(Surface(capture)).is_hair
+        light = estimate_light(capture, known, report, hair)
         write_avatar(avatar_file, replace(avatar, light=light))
     return describe_light(light)
 

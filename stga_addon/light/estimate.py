@@ -15,7 +15,7 @@ from ..progress import Progress, Report, ignore
 from .harmonics import COUNT, DARK, LAMBERT, basis, least_squares, uniform
 from .lamps import ShadowMap
 from .surface import Bounce, transfer_of
-from .values import Light
+from .values import HAIR_ROUGHNESS, Light
 
 MAX_TIMESTEPS = 10
 """Timesteps, evenly spread, whose images are read."""
@@ -115,6 +115,8 @@ MAX_DAMPING = 0.6
 CARD_REFLECTANCE = 0.18
 """Reflectance of photographers' gray card."""
 
+HAIR_BRIGHTNESS = 1 / 3
+"""Albedo, as a fraction of the nose's, below which triangles show hair, brows or dark cloth."""
 EYE_ROUGHNESS = 0.2
 """Roughness of eyes, whose highlights are as sharp as splats of half a millimeter can show."""
 MIN_RADIUS_M = 0.007
@@ -144,9 +146,13 @@ class Known:
 
 
 def estimate_light(
-    capture: Capture, known: Known = Known(), report: Report = ignore
+    capture: Capture,
+    known: Known = Known(),
+    report: Report = ignore,
+    hair: np.ndarray | None = None,
 ) -> AvatarLight:
-    """The light of the capture and how its head receives it. Raises StgaError without views."""
+    """The light of the capture and how its head receives it. hair (F,) bool: triangles with hair,
+    beside those that are as dark; None: unknown. Raises StgaError without views."""
     by_time = views_by_timestep(capture.views.get("train", ()))
     if not by_time:
         raise StgaError(
@@ -173,12 +179,13 @@ def estimate_light(
     irradiance = recorded_irradiance(direct, cameras, faces, bounce)
     hardness = (residual - HARD_RESIDUAL) / (VERY_HARD_RESIDUAL - HARD_RESIDUAL)
     damping = MAX_DAMPING * float(np.clip(hardness, 0, 1))
+    dark = dark_triangles(color, irradiance[faces].mean(1), capture.regions.get("nose"))
     return AvatarLight(
         radiance=radiance.astype(np.float32),
         transfer=transfer,
         occlusion=occlusion,
         irradiance=irradiance.astype(np.float32),
-        roughness=wet_roughness(capture.neutral, faces),
+        roughness=roughness_of(capture.neutral, faces, dark if hair is None else dark | hair),
         residual=residual,
         damping=round(damping, 3),
         source=source,
@@ -241,11 +248,29 @@ def fit_light(
     return radiance, residual
 
 
-def wet_roughness(neutral: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """(V,) float32: EYE_ROUGHNESS on eyeballs: parts that are nearly spheres of an eye's size; else
-    0."""
+def dark_triangles(
+    color: np.ndarray, irradiance: np.ndarray, nose: np.ndarray | None
+) -> np.ndarray:
+    """(F,) bool: triangles darker than HAIR_BRIGHTNESS, by linear colors (T, F, 3), NaN where they
+    are not seen, and the light that they received (F, 3); none where no nose (F,) bool is."""
+    seen = np.isfinite(color[..., :1])
+    mean = np.where(seen, color, 0).sum(0) / np.maximum(seen.sum(0), 1)
+    albedo = np.where(seen.any(0), mean / np.maximum(irradiance, DARK), np.nan).mean(1)
+    if nose is None or not np.isfinite(albedo[nose]).any():
+        return np.zeros(len(albedo), bool)
+    return np.asarray(albedo < HAIR_BRIGHTNESS * np.nanmedian(albedo[nose]))
+
+
+def roughness_of(
+    neutral: np.ndarray, faces: np.ndarray, hair: np.ndarray | None = None
+) -> np.ndarray:
+    """(V,) float32: EYE_ROUGHNESS on eyeballs: parts that are nearly spheres of an eye's size;
+    HAIR_ROUGHNESS within the triangles of hair (F,) bool; else 0."""
     part = connected_parts(len(neutral), faces)
     found = np.zeros(len(neutral), np.float32)
+    if hair is not None:
+        found[faces[hair]] = HAIR_ROUGHNESS
+        found[faces[~hair]] = 0
     used = np.zeros(len(neutral), bool)
     used[faces] = True
     for label in np.unique(part[used]):

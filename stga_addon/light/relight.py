@@ -16,7 +16,7 @@ from ..errors import StgaError
 from .harmonics import COUNT, GLOSSY, LAMBERT, basis, least_squares, rotated
 from .lamps import LIFT_M, Lamps, distant_light
 from .surface import Bounce, Lashes, at_splats, find_lashes, row_dot, surface_points
-from .values import SKIN_ROUGHNESS, Caster, Lighting
+from .values import HAIR_ROUGHNESS, SKIN_ROUGHNESS, Caster, Lighting
 
 UNLIKE_LIGHT = 0.2
 """Relative difference of two lights from which on nothing is kept."""
@@ -79,10 +79,6 @@ HIGHLIGHT_FRACTION = 0.034
 recorded colors."""
 WET_HIGHLIGHT_FRACTION = 0.14
 """The same from wet eyes."""
-DULL_BRIGHTNESS = 1 / 3
-"""Brightness of albedo, as a fraction of the nose's, below which splats are hair or dark cloth."""
-DULL_ROUGHNESS = 1.0
-"""Roughness of these, which do not shine as skin does: a lamp behind would whiten hair."""
 MIN_DIFFUSE_FRACTION = 0.1
 """Fraction of recorded colors that remains at least."""
 VIEW_MEANS = (1.0, 0.65, 0.195, -0.089375)
@@ -116,19 +112,11 @@ class Relighter:
 
     @cached_property
     def roughness(self) -> np.ndarray:
-        """(N,) of highlights; 0: that of the lighting, on skin."""
-        nose = self.avatar.regions.get("nose", np.zeros(len(self.avatar.faces), bool))[self.face]
-        if not nose.any():
-            return self._eye_roughness
-        color = srgb_to_linear(np.maximum(self.diffuse_color, 0))
-        brightness = (color / self.irradiance).mean(1)
-        is_dull = brightness < DULL_BRIGHTNESS * np.median(brightness[nose])
-        is_dull &= self._eye_roughness == 0
-        return np.where(is_dull, np.float32(DULL_ROUGHNESS), self._eye_roughness)
-
-    @cached_property
-    def _eye_roughness(self) -> np.ndarray:
-        return self._at_splats(self.light.roughness[:, None])[:, 0]
+        """(N,) of highlights; 0: that of the lighting. Between hair and skin, the nearer counts."""
+        corners = self.light.roughness[self.corners]
+        mean = self._at_splats(self.light.roughness[:, None])[:, 0]
+        hair = np.float32(HAIR_ROUGHNESS) * (mean > HAIR_ROUGHNESS / 2)
+        return np.where(corners.max(1) > HAIR_ROUGHNESS / 2, hair, mean)
 
     @cached_property
     def irradiance(self) -> np.ndarray:
@@ -166,9 +154,7 @@ class Relighter:
     @cached_property
     def lashes(self) -> Lashes:
         """What throws shadows beside the mesh."""
-        return find_lashes(
-            self.avatar, self.corners, self.weights, self._eye_roughness, self.albedo
-        )
+        return find_lashes(self.avatar, self.corners, self.weights, self.roughness, self.albedo)
 
     def lash_casters(self, mesh: np.ndarray, lighting: Lighting) -> tuple[Caster, ...]:
         """The lashes of a head posed as `mesh` (V, 3), if a light throws shadows."""
@@ -258,7 +244,8 @@ class Relighter:
         linear = srgb_to_linear(np.maximum(color, 0))
         wet = np.float32(WET_HIGHLIGHT_FRACTION)
         skin = np.float32(HIGHLIGHT_FRACTION)
-        highlight = np.where(self._eye_roughness > 0, wet, skin)[:, None] * self.irradiance / np.pi
+        is_wet = (self.roughness > 0) & (self.roughness < HAIR_ROUGHNESS / 2)
+        highlight = np.where(is_wet, wet, skin)[:, None] * self.irradiance / np.pi
         diffuse = np.maximum(linear - highlight, MIN_DIFFUSE_FRACTION * linear)
         albedo = np.pi * diffuse / self.irradiance
         damping = self.light.damping

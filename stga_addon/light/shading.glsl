@@ -60,12 +60,12 @@ vec3 sky_highlight(int first, vec3 normal, vec3 view, float roughness, float occ
 }
 
 /* Linear color of a surface that reflects what arrives, and shows some of what was recorded. color: sRGB without what
-   depends on the view, roughness (0: skin; DULL_ROUGHNESS: hair); old: irradiance of the capture; typical: mean
-   albedo, damping; kept: gain and share of the recorded sRGB. */
+   depends on the view, roughness (0: skin; HAIR_ROUGHNESS); old: irradiance of the capture; typical: mean albedo,
+   damping; kept: gain and share of the recorded sRGB. */
 vec3 lit_color(vec4 color, vec3 old, vec3 arriving, vec3 highlight, vec3 recorded, vec4 typical, vec4 kept)
 {
   vec3 base = srgb_to_linear(max(color.rgb, vec3(0.0)));
-  bool is_wet = color.a > 0.0 && color.a < DULL_ROUGHNESS;
+  bool is_wet = color.a > 0.0 && color.a < 0.5 * HAIR_ROUGHNESS;
   vec3 glossy = (is_wet ? WET_HIGHLIGHT_FRACTION : HIGHLIGHT_FRACTION) / PI * old;
   vec3 albedo = PI * max(base - glossy, MIN_DIFFUSE_FRACTION * base) / max(old, vec3(1e-6));
   if (typical.a > 0.0) {

@@ -14,8 +14,7 @@ _CONSTANTS |= {
 _FRACTIONS = "HIGHLIGHT_FRACTION", "WET_HIGHLIGHT_FRACTION", "MIN_DIFFUSE_FRACTION"
 for _name in ("REFLECTANCE", *_FRACTIONS, "ALIKE_AT_SPLAT", "UNLIKE_AT_SPLAT"):
     _CONSTANTS[_name] = getattr(relight, _name)
-_CONSTANTS["SKIN_ROUGHNESS"] = values.SKIN_ROUGHNESS
-_CONSTANTS["DULL_ROUGHNESS"] = relight.DULL_ROUGHNESS
+_CONSTANTS |= {name: getattr(values, name) for name in ("SKIN_ROUGHNESS", "HAIR_ROUGHNESS")}
 _CONSTANTS |= {f"VIEW_MEAN_{degree}": mean for degree, mean in enumerate(relight.VIEW_MEANS)}
 SHADING_DEFINES = printed_constants(_CONSTANTS, "glsl")
 SRGB_FUNCTIONS = """

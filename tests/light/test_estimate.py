@@ -7,7 +7,13 @@ from scipy.spatial.transform import Rotation
 
 from light.scenes import ball_and_plate, blocked
 from stga_addon.capture.mesh_geometry import vertex_normals
-from stga_addon.light.estimate import HARD_RESIDUAL, fit_light, recorded_irradiance, wet_roughness
+from stga_addon.light.estimate import (
+    HARD_RESIDUAL,
+    dark_triangles,
+    fit_light,
+    recorded_irradiance,
+    roughness_of,
+)
 from stga_addon.light.harmonics import LAMBERT, basis, even_directions, rotated, uniform
 from stga_addon.light.lamps import LIFT_M
 from stga_addon.light.surface import Bounce, transfer_of
@@ -97,7 +103,7 @@ def test_eyeballs_are_found(shared_data):
     from stga_addon.capture.open import open_capture
 
     capture = open_capture(shared_data / "studio_head")
-    wet = wet_roughness(capture.neutral, capture.faces) > 0
+    wet = roughness_of(capture.neutral, capture.faces) > 0
     eyes = np.zeros(len(wet), bool)
     eyes[capture.faces[capture.regions["left_eye"] | capture.regions["right_eye"]]] = True
     assert wet.sum() > 100
@@ -125,3 +131,18 @@ def test_transfer_and_occlusion_are_those_of_cast_rays():
     assert below.sum() > 100
     assert_allclose(transfer[below], basis(normals[below]) * LAMBERT, atol=0.03)
     assert_allclose(occlusion[below], 1, atol=0.01)
+
+
+def test_dark_triangles_are_hair():
+    """Catches hair in bright light that counts as skin, skin in the dark as hair, and a nose or
+    triangles that no view shows."""
+    albedo = np.array([0.4, 0.4, 0.08, 0.08, 0.4, 0.4])
+    light = np.array([1.0, 1.0, 3.0, 0.5, 0.1, 1.0])
+    color = np.tile((albedo * light)[None, :, None], (2, 1, 3))
+    color[0, 1] = color[:, 5] = np.nan
+    nose = np.arange(6) < 2
+    received = np.tile(light[:, None], 3)
+    found = dark_triangles(color, received, nose)
+    assert found.tolist() == [False, False, True, True, False, False]
+    for unknown in (None, np.arange(6) == 5):
+        assert not dark_triangles(color, received, unknown).any()

@@ -8,10 +8,11 @@ from numpy.testing import assert_allclose, assert_array_equal
 from scipy.spatial.transform import Rotation
 
 from light.scenes import lit_avatar
-from stga_addon.avatar.splats import SH_C0, sh_color
-from stga_addon.capture.color import linear_to_srgb, srgb_to_linear
+from stga_addon.avatar.splats import sh_color
+from stga_addon.capture.color import srgb_to_linear
 from stga_addon.capture.mesh_geometry import vertex_normals
 from stga_addon.light import relight
+from stga_addon.light.estimate import roughness_of
 from stga_addon.light.harmonics import basis, even_directions, rotated, uniform
 from stga_addon.light.relight import Relighter, kept, kept_fractions
 from stga_addon.light.values import Light, Lighting
@@ -47,23 +48,26 @@ def test_albedo_is_what_was_recorded_without_its_light(relighter):
 
 
 def test_hair_does_not_shine_as_skin_does():
-    """Catches hair that a lamp behind the head whitens, and skin without its highlight there."""
+    """Catches hair that a lamp behind the head whitens, eyes that are found in it, and skin beside
+    it that shines like eyes."""
     avatar = lit_avatar(ALBEDO)
-    center = avatar.neutral[avatar.faces].mean(1)
-    hair = center[:, 1] > 0.0
-    color = srgb_to_linear(sh_color(avatar.splats.sh, np.zeros((1, 3))))
-    color[hair] *= 0.15
-    avatar.splats.sh[:, 0] = (linear_to_srgb(color) - 0.5) / SH_C0
-    avatar = replace(avatar, regions={"nose": (center[:, 2] > 0.09) & ~hair})
-    relighter = Relighter(avatar)
+    above = avatar.neutral[:, 1] > 0
+    is_hair = above[avatar.faces].all(1)
+    roughness = roughness_of(avatar.neutral, avatar.faces, is_hair)
+    relighter = Relighter(replace(avatar, light=replace(avatar.light, roughness=roughness)))
+    assert set(relighter.roughness) == {0.0, 1.0}
+    assert (relighter.roughness[is_hair] == 1).mean() > 0.9
+    assert (relighter.roughness[~is_hair] == 0).all()
+    assert_allclose(relighter.albedo, Relighter(avatar).albedo)
+    assert not len(relighter.lashes.face)
     lamp = Light("sun", np.full(3, 5.0), direction=(1.0, 0.0, 0.4), casts_shadow=False)
     with_shine, without = (
         relighter.radiance(avatar.neutral, EYE, Lighting(lights=(lamp,), specular=specular))
         for specular in (1.0, 0.0)
     )
     shine = (with_shine - without).max(1)
-    beside = center[:, 0] < -0.05
-    assert shine[beside & hair].max() < 0.1 * shine[beside & ~hair].max()
+    is_dull = relighter.roughness == 1
+    assert shine[is_dull].max() < 0.2 * shine[~is_dull].max()
 
 
 def normals_of(relighter):

@@ -278,6 +278,7 @@ function keptColors(recorded, shown) {
 // GLOSSY).
 const GLOSSY = [1, 0.85, 0.85, 0.85, 0.62, 0.62, 0.62, 0.62, 0.62];
 const MIN_RIGID = 1e-3; // weight of covered vertices where the turn of the head is found
+const HAIR_ROUGHNESS = 1;
 const MIN_IRRADIANCE = 0.15; // of the capture, as a share of its mean
 
 export class LightPass {
@@ -471,6 +472,9 @@ function surfaceTexels(arrays, frames) {
         values[to + 12 + k] = weight;
       }
       for (let k = 0; k < 3; k++) values[to + 4 + k] = Math.max(values[to + 4 + k], least[k]);
+      // between hair and skin, the nearer counts
+      if (corners.some(vertex => roughness[vertex] > HAIR_ROUGHNESS / 2))
+        values[to + 3] = values[to + 3] > HAIR_ROUGHNESS / 2 ? HAIR_ROUGHNESS : 0;
     }
   }
   return values;
