@@ -14,7 +14,8 @@ import numpy as np
 
 KINDS = "sun", "point", "spot", "area"
 SHAPES = "rectangle", "ellipse"
-SKIN_ROUGHNESS = 0.45  # Roughness of the highlight on skin (GGX, Blender's Principled BSDF)
+SKIN_ROUGHNESS = 0.45
+"""Roughness of the highlight on skin (GGX, Blender's Principled BSDF)."""
 HAIR_ROUGHNESS = 1.0
 """Roughness of hair, which does not shine as skin does: a lamp behind would whiten it."""
 
