@@ -13,7 +13,9 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 KINDS = "sun", "point", "spot", "area"
+"""Kinds of lights."""
 SHAPES = "rectangle", "ellipse"
+"""Shapes of area lights."""
 SKIN_ROUGHNESS = 0.45
 """Roughness of the highlight on skin (GGX, Blender's Principled BSDF)."""
 HAIR_ROUGHNESS = 1.0
