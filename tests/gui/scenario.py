@@ -41,6 +41,11 @@ def is_training():
     return state() == "working" and figures().get("iteration", 0) > 0
 
 
+def avatar():
+    """The file that the panel names, relative to the .blend file where it can be."""
+    return bpy.path.abspath(chosen().avatar)
+
+
 def splats():
     return 0 if chosen().splats is None else len(chosen().splats.data.vertices)
 
@@ -70,7 +75,7 @@ def first():
 
     bpy.ops.stga.cancel(request="training")
     yield lambda: state() == "cancelled" and chosen().result_shown
-    seen["cancelled"] = {"avatar": Path(chosen().avatar).exists(), "splats": splats()}
+    seen["cancelled"] = {"avatar": Path(avatar()).exists(), "splats": splats()}
 
     bpy.ops.stga.train(directory="//run", resume=True)
     yield is_training
@@ -115,7 +120,7 @@ def second():
     seen["more"] = figures()["iteration"] - before
     bpy.ops.stga.train(directory="//run", iterations=30)  # into the next free folder
     yield lambda: state() == "finished" and chosen().result_shown
-    seen["finished"] = {"avatar": chosen().avatar, "splats": splats()}
+    seen["finished"] = {"avatar": avatar(), "splats": splats()}
     yield from videos()
     bpy.ops.stga.dismiss(request="training")
     seen["dismissed"] = chosen().training_run == ""
