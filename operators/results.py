@@ -281,8 +281,8 @@ def _show_avatar(scene: Any, state: RequestState) -> Answer:
             splat_object.hide_object(head, scene)
     if is_result:
         store_path(owner_of(scene, head), tags.AVATAR, str(state.loading_path))
-        is_footage = head.get(tags.TRACKED) and not head.get(tags.SHOWN_UNSEEN)
-        if is_footage and splat_object.is_partly_filmed(shown):
+        is_first = head.get(tags.TRACKED) and not head.get(tags.SHOWN_UNSEEN)
+        if is_first and splat_object.is_partly_filmed(shown):
             head[tags.SHOWN_UNSEEN] = True
             splat_object.set_input(shown, splat_nodes.SHOW_UNSEEN, True)
     if scene.stga.head == head:

@@ -83,7 +83,7 @@ class AvatarLight:
     occlusion   (V,) float32, 0…1: cosine-weighted fraction of the sky that the head leaves open
     irradiance  (V, 3) float32: of the capture, with light that the head reflects onto itself, mean
                 over its timesteps; an albedo is π times linear color over this
-    roughness   (V,) float32: of highlights; 0: skin, whose roughness is in the scene's lighting
+    roughness   (V,) float32: of highlights; 1: hair; 0: skin, whose roughness the lighting has
     residual    how far recorded colors are from what `radiance` explains, as a fraction of them
                 (robust deviation)
     damping     0…1 by which albedo is pulled to its mean, because the light is too hard to take

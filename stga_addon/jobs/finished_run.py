@@ -86,7 +86,8 @@ def add_light(
         avatar = read_avatar(avatar_file)
         exposure = known_exposure(avatar.settings.get("exposure") or (), ())
         known = replace(known or Known(), exposure=exposure)
-        hair = unseen_sides(Surface(capture)).is_hair
+        has_views = bool(capture.views.get("train"))
+        hair = unseen_sides(Surface(capture)).is_hair if has_views else None
         light = estimate_light(capture, known, report, hair)
         write_avatar(avatar_file, replace(avatar, light=light))
     return describe_light(light)

@@ -16,7 +16,7 @@ from ..errors import StgaError
 from .harmonics import COUNT, GLOSSY, LAMBERT, basis, least_squares, rotated
 from .lamps import LIFT_M, Lamps, distant_light
 from .surface import Bounce, Lashes, at_splats, find_lashes, row_dot, surface_points
-from .values import HAIR_ROUGHNESS, SKIN_ROUGHNESS, Caster, Lighting
+from .values import HAIR_ROUGHNESS, SKIN_ROUGHNESS, Caster, Lighting, is_wet
 
 UNLIKE_LIGHT = 0.2
 """Relative difference of two lights from which on nothing is kept."""
@@ -244,8 +244,8 @@ class Relighter:
         linear = srgb_to_linear(np.maximum(color, 0))
         wet = np.float32(WET_HIGHLIGHT_FRACTION)
         skin = np.float32(HIGHLIGHT_FRACTION)
-        is_wet = (self.roughness > 0) & (self.roughness < HAIR_ROUGHNESS / 2)
-        highlight = np.where(is_wet, wet, skin)[:, None] * self.irradiance / np.pi
+        fraction = np.where(is_wet(self.roughness), wet, skin)
+        highlight = fraction[:, None] * self.irradiance / np.pi
         diffuse = np.maximum(linear - highlight, MIN_DIFFUSE_FRACTION * linear)
         albedo = np.pi * diffuse / self.irradiance
         damping = self.light.damping

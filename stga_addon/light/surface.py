@@ -11,7 +11,7 @@ from ..capture.mesh_geometry import connected_parts, vertex_normals
 from ..flame.quaternions import to_matrices
 from .harmonics import basis, even_directions
 from .lamps import ShadowMap
-from .values import HAIR_ROUGHNESS, Caster, Light
+from .values import Caster, Light, is_wet
 
 DIRECTIONS = 192
 # As in `lamps`, for maps of half the size
@@ -200,10 +200,10 @@ def find_lashes(
     splats = avatar.splats
     neutral = avatar.neutral.astype(np.float64)
     frames = face_frames(neutral, avatar.faces, neutral, avatar.convention)
-    dark = (albedo.mean(1) < MAX_ALBEDO) & (roughness == 0) & (splats.opacities() > MIN_OPACITY)
+    dark = (albedo.mean(1) < MAX_ALBEDO) & ~is_wet(roughness) & (splats.opacities() > MIN_OPACITY)
     found = np.flatnonzero(dark)
     points = points_to_world(splats.xyz[found], frames, splats.face[found])
-    wet = (avatar.light.roughness > 0) & (avatar.light.roughness < HAIR_ROUGHNESS / 2)
+    wet = is_wet(avatar.light.roughness)
     part = connected_parts(len(neutral), avatar.faces[wet[avatar.faces].all(1)])
     near = np.zeros(len(points), bool)
     for label in np.unique(part[wet]):

@@ -22,6 +22,11 @@ HAIR_ROUGHNESS = 1.0
 """Roughness of hair, which does not shine as skin does: a lamp behind would whiten it."""
 
 
+def is_wet(roughness: np.ndarray) -> np.ndarray:
+    """(N,) bool: where roughness (N,) of `AvatarLight` is that of eyes, not of skin (0) or hair."""
+    return np.asarray((roughness > 0) & (roughness < HAIR_ROUGHNESS / 2))
+
+
 @dataclass(frozen=True)
 class Light:
     """One light of a scene.
@@ -89,7 +94,7 @@ class Lighting:
     exposure   stops (powers of two) by which relit colors are made brighter
     white      (3,) linear color that the capture shows of what is white under its own light,
                relative to the estimate: relit colors are divided by it (the eyedropper)
-    roughness  of highlights on skin; 0.05…1. Eyeballs have their own (`AvatarLight.roughness`)
+    roughness  of highlights on skin; 0.05…1. Eyeballs and hair have their own (`AvatarLight`)
     specular   factor of highlights; 0: none
     shadows    whether lights are blocked by head and casters; the head always occludes the world
     """

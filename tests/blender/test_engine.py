@@ -19,7 +19,7 @@ from stga_addon.export.ply import write_ply
 from stga_addon.light.harmonics import uniform
 from stga_addon.light.relight import Relighter
 from stga_addon.light.surface import transfer_of
-from stga_addon.light.values import Light, Lighting
+from stga_addon.light.values import HAIR_ROUGHNESS, Light, Lighting
 from stga_addon.render.render import render_avatar
 from stga_addon.scene import compat
 from stga_addon.scene.arrays import evaluated_vertices
@@ -246,7 +246,7 @@ def no_context():
 def with_light(avatar):
     transfer, occlusion = transfer_of(avatar.neutral, avatar.faces, 32)
     radiance = uniform(np.full(3, 0.3)).astype(np.float32)
-    roughness = np.zeros(len(occlusion), np.float32)
+    roughness = np.where(avatar.neutral[:, 0] > 0, HAIR_ROUGHNESS, 0).astype(np.float32)
     light = AvatarLight(radiance, transfer, occlusion, transfer @ radiance, roughness, 0.05)
     return replace(avatar, light=light)
 

@@ -89,9 +89,10 @@ def test_a_training_is_whole_without_what_follows_it(error, root, tmp_path, monk
 
 
 def test_a_gray_card_sets_the_level_and_a_running_trainings_avatar_is_kept(
-    run, tmp_path, monkeypatch, capsys
+    run, root, tmp_path, monkeypatch, capsys
 ):
-    """Catches a card that is ignored, and a light in an older avatar than a training's."""
+    """Catches a card that is ignored, a light in an older avatar than a training's, and a traceback
+    for a capture without views."""
     copy = tmp_path / "run"
     shutil.copytree(run, copy)
     before = (copy / "avatar.npz").read_bytes()
@@ -107,6 +108,9 @@ def test_a_gray_card_sets_the_level_and_a_running_trainings_avatar_is_kept(
         return estimate_light(*given)
 
     monkeypatch.setattr("stga_addon.light.estimate.estimate_light", estimate)
+    without_views = replace(open_capture(root), views={})
+    with refusal("has no training views"):
+        add_light(copy / "avatar.npz", without_views)
     found = []
     for level in (0.5, 0.25):
         value = str(1.055 * level ** (1 / 2.4) - 0.055)

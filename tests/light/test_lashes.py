@@ -14,7 +14,7 @@ from stga_addon.capture.mesh_geometry import vertex_normals
 from stga_addon.light.harmonics import uniform
 from stga_addon.light.relight import Relighter
 from stga_addon.light.surface import surface_points, transfer_of
-from stga_addon.light.values import Light, Lighting
+from stga_addon.light.values import HAIR_ROUGHNESS, Light, Lighting
 from stga_addon.scene.gpu.packing import relit_scene
 from stga_addon.scene.layers import Relit, SceneLayer
 
@@ -102,7 +102,8 @@ def test_the_viewport_draws_lashes_into_its_shadow_maps():
 
 
 def test_only_what_is_dark_and_stands_off_near_an_eye_is_a_lash():
-    """Catches shadows of bright skin, of splats on the mesh, and of hair far from the eyes."""
+    """Catches shadows of bright skin, of splats on the mesh, and of hair far from the eyes, and
+    lashes that are not found where they darken the lids."""
     avatar = avatar_with((0, 0.003, 0.006))
     dry = replace(avatar.light, roughness=np.zeros_like(avatar.light.roughness))
     others = {
@@ -113,6 +114,9 @@ def test_only_what_is_dark_and_stands_off_near_an_eye_is_a_lash():
     }
     for name, other in others.items():
         assert not len(Relighter(other).lashes.face), name
+    darkened = np.where(avatar.light.roughness > 0, avatar.light.roughness, HAIR_ROUGHNESS)
+    on_dark = replace(avatar, light=replace(avatar.light, roughness=darkened))
+    assert_array_equal(Relighter(on_dark).lashes.face, Relighter(avatar).lashes.face)
 
 
 def test_splats_are_at_the_nearest_point_of_the_mesh():

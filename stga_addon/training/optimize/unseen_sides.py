@@ -45,7 +45,7 @@ MIN_SHOWN_FRACTION = 0.1
 """Fraction of the median of the pixels that show as much of the surface, below which it is not
 visible: a folded eyelid has less."""
 NEAREST = 24
-"""Visible triangles of whose colors a hidden one has the median; teeth around one that is shown."""
+"""Neighbors whose colors' median hidden triangles and free splats have, and that show a tooth."""
 SOURCE_TRIANGLES = 100
 """Triangles over which hair's color off axis, and that of the layer behind skin, are medians."""
 COLLAR_SLOPE = 0.6
@@ -139,7 +139,7 @@ def unseen_sides(surface: Surface) -> UnseenSides:
     found[rows] = mirrored
     shown[rows] = False
     inside = _unseen_inside(capture, pixels > 0, is_outside) | _unseen_teeth(capture, pixels, shown)
-    within = inside | (~is_outside & ~shown)
+    within = inside | (~is_outside & (~shown | (pixels == 0)))
     found[within] = inside_colors(capture, color, shown, within)
     lids, of_skin = _lid_colors(surface, well_shown, color)
     found[lids] = of_skin

@@ -15,7 +15,7 @@ from stga_addon.export.skinned_gltf import skinned_glb
 from stga_addon.light.harmonics import rotated, uniform
 from stga_addon.light.relight import Relighter
 from stga_addon.light.surface import Bounce, transfer_of
-from stga_addon.light.values import Light, Lighting
+from stga_addon.light.values import HAIR_ROUGHNESS, Light, Lighting
 from stga_addon.render.render import posed_avatar, render_layers, to_uint8
 
 from .conftest import make_head, show
@@ -42,8 +42,8 @@ COLORS = """(() => {
 
 
 def lit_head(damping=0.0, lashes=False, **options):
-    """A head whose light is known: brighter from above, with a part of the mesh as wet as eyes.
-    lashes: around a nose that is wet as well."""
+    """A head whose light is known: brighter from above, with a part of the mesh as wet as eyes, and
+    tufts of hair. lashes: around a nose that is wet as well."""
     head = make_head(**options)
     neutral = head.avatar.neutral.astype(np.float64)
     faces = head.avatar.faces
@@ -54,6 +54,8 @@ def lit_head(damping=0.0, lashes=False, **options):
     arriving = arriving + Bounce(neutral, faces, occlusion).light(arriving)
     eye = lashes & (np.linalg.norm(neutral - neutral[neutral[:, 2].argmax()], axis=1) < 0.012)
     wet = np.where((neutral[:, 0] > 0.05) | eye, 0.2, 0).astype(np.float32)
+    tufts = (neutral[:, 0] < -0.02) & (np.arange(len(neutral)) % 2 == 0)
+    wet[tufts] = HAIR_ROUGHNESS
     radiance = radiance.astype(np.float32)
     arriving = arriving.astype(np.float32)
     light = AvatarLight(radiance, transfer, occlusion, arriving, wet, 0.05, damping)

@@ -278,7 +278,7 @@ function keptColors(recorded, shown) {
 // GLOSSY).
 const GLOSSY = [1, 0.85, 0.85, 0.85, 0.62, 0.62, 0.62, 0.62, 0.62];
 const MIN_RIGID = 1e-3; // weight of covered vertices where the turn of the head is found
-const HAIR_ROUGHNESS = 1;
+const HAIR_ROUGHNESS = 1; // which does not shine as skin does
 const MIN_IRRADIANCE = 0.15; // of the capture, as a share of its mean
 
 export class LightPass {
