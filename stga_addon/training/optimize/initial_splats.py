@@ -27,7 +27,7 @@ from ...flame.parts import PARTS
 from ...flame.sequence import below_neck
 from ...tracking.folder import read_torso_points
 from ..settings import TrainingSettings
-from .semantic_regions import face_of, head_coordinates
+from .semantic_regions import CHIN_LEVEL, face_of, head_coordinates, kinds_of
 
 SAMPLED_HEIGHT_PIXELS = 400
 """Images higher than this are shrunk to it: triangles are then two or three pixels wide."""
@@ -76,7 +76,9 @@ SEEN_SPREAD = 0.5
 """Standard deviation in voxels of these splats from their point."""
 
 
-def initial_splats(capture: Capture, settings: TrainingSettings) -> Splats:
+def initial_splats(
+    capture: Capture, settings: TrainingSettings, has_long_hair: bool = False
+) -> Splats:
     """The lattice on the neutral mesh and, if the settings say so, visual-hull points of the first
     training timestep (`flat_points` where a single camera shows it)."""
     convention = settings.convention
@@ -92,7 +94,9 @@ def initial_splats(capture: Capture, settings: TrainingSettings) -> Splats:
     parts = [lattice]
     first = [view for view in views if view.timestep == views[0].timestep]
     if settings.hull_points and len(first) == 1:
-        parts.append(flat_points(capture, first[0], convention, degree, settings.torso))
+        parts.append(
+            flat_points(capture, first[0], convention, degree, settings.torso, has_long_hair)
+        )
     elif settings.hull_points:
         parts.append(visual_hull_points(capture, first, convention, degree, settings.torso))
     return joined(parts)
@@ -233,7 +237,12 @@ def visual_hull_points(
 
 
 def flat_points(
-    capture: Capture, view: View, convention: str, sh_degree: int, torso: bool = False
+    capture: Capture,
+    view: View,
+    convention: str,
+    sh_degree: int,
+    torso: bool = False,
+    has_long_hair: bool = False,
 ) -> Splats:
     """Unbound splats for what a single camera shows beside the mesh: one layer at the depth of the
     mesh's outline.
@@ -241,7 +250,8 @@ def flat_points(
     A single camera does not show how far away hair or shoulders are. Each splat lies on the ray of
     its pixel, as deep as the part of the mesh that is nearest in the image, but for the face: hair
     and collars are behind the jaw that they are seen beside. It follows the same triangle as a hull
-    point there, and has its size and distance. torso: what the image cuts off below the neck is
+    point there, and has its size and distance. has_long_hair: what is beside the head down to the
+    neck is as deep as the scalp's outline, and not as shoulders behind it. torso: what the image cuts off below the neck is
     continued beyond it, as its border looks, for other timesteps that show more; where none does,
     it stays so.
     """
@@ -249,8 +259,8 @@ def flat_points(
     camera = view.camera
     voxel = voxel_size(mesh)
     samples = _mesh_samples(mesh, capture.faces)
-    pixels, depth = camera.project(samples)
-    step = max(1.0, voxel * (camera.fl_x + camera.fl_y) / 2 / float(np.median(depth)))
+    distance = float(np.median(camera.project(samples)[1]))
+    step = max(1.0, voxel * (camera.fl_x + camera.fl_y) / 2 / distance)
     neck = capture.flame if torso else None
     beyond = 0.0 if neck is None else round(CONTINUED_FRACTION * camera.width / step) * step
     rows, columns = np.meshgrid(
@@ -266,9 +276,11 @@ def flat_points(
     centers = np.stack([columns[beside], rows[beside]], axis=1)
     if not len(centers):
         return _new_splats(np.zeros((0, 3)), voxel, sh_degree)
-    usable = np.repeat(_without_face(capture), len(samples) // len(capture.faces))
-    nearest = cKDTree(pixels[usable]).query(centers)[1]
-    points = camera.unproject(centers, depth[usable][nearest])
+    points = _at_depth_of(_without_face(capture), camera, samples, centers)
+    if has_long_hair:
+        hanging = _at_depth_of(_head_without_face(capture), camera, samples, centers)
+        above = ~below_neck(neck, view.timestep, hanging) if neck else np.ones(len(hanging), bool)
+        points[above] = hanging[above]
     _, face = _followed(capture, view.timestep, points, torso)
     frames = face_frames(mesh, capture.faces, capture.neutral, convention)
     splats = _new_splats(points, voxel, sh_degree)
@@ -280,6 +292,27 @@ def flat_points(
     splats.opacity[cut] = CONTINUED_OPACITY
     below = below_neck(neck, view.timestep, points)
     return to_local(splats, frames, face).rows(~cut | below)
+
+
+def _at_depth_of(
+    triangles: np.ndarray, camera: Camera, samples: np.ndarray, pixels: np.ndarray
+) -> np.ndarray:
+    """World points (N, 3) on the rays of these pixels (N, 2), each as deep as the nearest in the
+    image of those `_mesh_samples` that lie on the triangles (F,) bool."""
+    places, depth = camera.project(samples[np.repeat(triangles, len(samples) // len(triangles))])
+    return camera.unproject(pixels, depth[cKDTree(places).query(pixels)[1]])
+
+
+def _head_without_face(capture: Capture) -> np.ndarray:
+    """(F,) bool: triangles of the head above the chin, outside the face; all of a mesh that has
+    none or whose parts are not known."""
+    at = head_coordinates(capture)
+    others = _without_face(capture)
+    if at is None:
+        return others
+    body = kinds_of(at, others)["body"]
+    head = others & ~body & (at.level > CHIN_LEVEL)
+    return head if head.any() else others
 
 
 def _without_face(capture: Capture) -> np.ndarray:

@@ -37,12 +37,10 @@ HAIRLINE_DEG = (84.0, 112.0, 140.0)
 """Angles from straight ahead of the hairline's points."""
 HAIRLINE = (0.15, -0.55, -1.15)
 """Heights over the eyes at HAIRLINE_DEG below which no hair grows; it begins above the ears."""
-LONG_HAIRLINE = (0.15, -1.0, -2.3)
+LONG_HAIRLINE = (-1.0, -2.3, -2.3)
 """Heights over the eyes at HAIRLINE_DEG below which no long hair hangs."""
-HANGING_DEG = (90.0, 140.0)
-"""Angles between which hanging hair reaches its full distance from the neck."""
-HANGING_RISE = 0.6
-"""Distance below the hairline at which it reaches that distance."""
+LONG_HAIR_SIDE = 1.1
+"""Distance from the middle plane beyond which long hair does not hide shoulders."""
 EAR_SIDE = 0.93
 """Distance of ears from the middle plane at least."""
 EAR_LEVEL = -0.33
@@ -158,19 +156,12 @@ def kinds_of(
     hairline = np.interp(angle, HAIRLINE_DEG, LONG_HAIRLINE if has_long_hair else HAIRLINE)
     hairy = (angle > SCALP_ANGLE_DEG) | (elevation > SCALP_ELEVATION_DEG)
     scalp = is_outside & ~ear & hairy & (at.level > hairline)
+    if has_long_hair:
+        scalp &= (at.side < LONG_HAIR_SIDE) | (at.level > JAW_LEVEL)
     beside = (angle > NECK_ANGLE_DEG) | (at.level < CHIN_LEVEL)
     below_jaw = at.level < np.interp(angle, JAW_DEG, JAW)
     body = is_outside & ~ear & ~scalp & beside & below_jaw
     return {"scalp": scalp, "body": body}
-
-
-def hanging_fraction(at: HeadCoordinates) -> np.ndarray:
-    """(F,) fraction of its full distance from the neck that long hair has: 0 at the hairline and
-    beside the neck, 1 behind it and further down."""
-    angle = at.angle_deg
-    below = np.interp(angle, HAIRLINE_DEG, HAIRLINE) - at.level
-    behind = np.interp(angle, HANGING_DEG, (0, 1))
-    return np.asarray(behind * np.clip(below / HANGING_RISE, 0, 1))
 
 
 def nearest_rows(known: np.ndarray, places: np.ndarray, count: int) -> np.ndarray:

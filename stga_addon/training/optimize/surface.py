@@ -29,7 +29,6 @@ from .semantic_regions import (
     JAW_LEVEL,
     TORSO_HEIGHT,
     HeadCoordinates,
-    hanging_fraction,
     head_coordinates,
     kinds_of,
     nearest_rows,
@@ -89,7 +88,7 @@ NECK_SIDE_DEG = 95.0
 NECK_HALF_WIDTH_DEG = 45.0
 """Half the angle over which they are measured."""
 HANGING_HEIGHT = 0.4
-"""Height of long hair above the scalp, in distances of the eyes from the mouth."""
+"""Least height of long hair beside the neck, in distances of the eyes from the mouth."""
 MAX_APART_DEG = 8.0
 """Largest angle between the directions in which one camera sees a triangle, and their mean."""
 MAX_BESIDE_FRACTION = 0.1
@@ -336,8 +335,7 @@ class Surface:
     @cached_property
     def hair_height(self) -> np.ndarray:
         """(F,) meters of hair above the scalp's triangles, 0 elsewhere: as measured, else as
-        measured in the neighborhood, equal on both sides of the head, but within masks. Long hair
-        is at least as high behind the neck as beside it."""
+        measured in the neighborhood, equal on both sides of the head, but within masks."""
         height = np.zeros(len(self.outside))
         scalp = np.flatnonzero(self._scalp)
         measured = scalp[self._is_measured[scalp]] if len(scalp) else scalp
@@ -347,12 +345,6 @@ class Surface:
         sources = np.concatenate([center[measured], mirrored(center)[measured]])
         near = measured[nearest_rows(sources, center[scalp], AROUND) % len(measured)]
         height[scalp] = np.median(self._measured_height[near], axis=1)
-        if self.at is not None and self._has_long_hair:
-            fraction = hanging_fraction(self.at)
-            hanging = self._scalp & (fraction > 0)
-            growing = self._scalp & ~hanging
-            median = np.median(height[growing]) if growing.any() else 0.0
-            height[hanging] = median + fraction[hanging] * (HANGING_HEIGHT * self.at.unit - median)
         # one side's hair may be higher than the other's, which it is mirrored from
         offsets = np.zeros((len(scalp), HEIGHTS + 1, 3))
         offsets[:, :, NORMAL_AXIS["stga"]] = height[scalp, None] * np.linspace(1, 0, HEIGHTS + 1)
@@ -384,10 +376,10 @@ class Surface:
         """`kinds_of` the triangles; none where it is not known where on a head they are."""
         if self.at is None:
             return {}
-        return kinds_of(self.at, self.outside, self._has_long_hair)
+        return kinds_of(self.at, self.outside, self.has_long_hair)
 
     @cached_property
-    def _has_long_hair(self) -> bool:
+    def has_long_hair(self) -> bool:
         """Whether something stands out on both sides of the neck, just below the ears, where no
         collar reaches."""
         if self.at is None:

@@ -247,7 +247,7 @@ def _placed_splats(frames: FrameStore, settings: TrainingSettings) -> tuple[Trai
     """The splats that a training begins with, and how many there would be on the whole lattice."""
     capture = frames.capture
     triangles = len(capture.faces)
-    splats = initial_splats(capture, settings)
+    splats = initial_splats(capture, settings, frames.surface.has_long_hair)
     replaced = ~splats.unbound & frames.surface.closed[splats.face]
     replaced |= above_unseen_hair(frames, splats)
     layer = hidden_splats(frames, settings)

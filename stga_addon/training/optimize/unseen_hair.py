@@ -11,6 +11,7 @@ from ...avatar.splats import Splats, joined
 from ...capture.mesh_geometry import vertex_normals
 from ...flame.quaternions import from_matrices, unit
 from .frames import SKIN_DEPTH, FrameStore
+from .hanging_hair import hanging_hair
 from .semantic_regions import HeadCoordinates
 
 STRAND_COSINE = -0.3
@@ -152,7 +153,8 @@ class UnseenHair:
 
     @cached_property
     def _surface(self) -> np.ndarray:
-        """(V, 3) the neutral mesh, where strands grow moved to the middle of the layer."""
+        """(V, 3) the neutral mesh, where strands grow moved to the middle of the layer, and long
+        hair's to where it hangs."""
         frames = self._frames
         neutral = frames.surface.neutral
         own = frames.capture.faces[self.has_strands]
@@ -161,7 +163,11 @@ class UnseenHair:
         for _ in range(SMOOTHING_STEPS):
             height = np.bincount(own.ravel(), np.repeat(of_triangles, 3), len(neutral)) / uses
             of_triangles = height[own].mean(1)
-        return neutral + height[:, None] * vertex_normals(neutral, frames.capture.faces)
+        layer = neutral + height[:, None] * vertex_normals(neutral, frames.capture.faces)
+        if frames.surface.has_long_hair:
+            rows = np.unique(own)
+            layer[rows] = hanging_hair(frames.surface, self._at, layer[rows]).around(layer[rows])
+        return layer
 
 
 def growth(at: HeadCoordinates, places: np.ndarray, normals: np.ndarray) -> np.ndarray:
