@@ -27,7 +27,7 @@ from ...flame.parts import PARTS
 from ...flame.sequence import below_neck
 from ...tracking.folder import read_torso_points
 from ..settings import TrainingSettings
-from .semantic_regions import face_of, head_coordinates
+from .semantic_regions import head_regions
 
 SAMPLED_HEIGHT_PIXELS = 400
 """Images higher than this are shrunk to it: triangles are then two or three pixels wide."""
@@ -285,8 +285,7 @@ def flat_points(
 def _without_face(capture: Capture) -> np.ndarray:
     """(F,) bool: triangles outside the face; all of a mesh that consists of a face or whose face is
     not known."""
-    at = head_coordinates(capture)
-    others = np.ones(len(capture.faces), bool) if at is None else ~face_of(at)
+    others = ~head_regions(capture).face
     return others if others.any() else ~others
 
 

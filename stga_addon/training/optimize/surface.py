@@ -29,9 +29,10 @@ from .semantic_regions import (
     JAW_LEVEL,
     TORSO_HEIGHT,
     HeadCoordinates,
-    hanging_fraction,
+    HeadRegions,
+    Region,
     head_coordinates,
-    kinds_of,
+    head_regions,
     nearest_rows,
     teeth_of,
 )
@@ -115,6 +116,11 @@ class Surface:
     def at(self) -> HeadCoordinates | None:
         """Where on the head the triangles are; None where that is not known."""
         return head_coordinates(self.capture)
+
+    @cached_property
+    def regions(self) -> HeadRegions:
+        """The parts of the head that the triangles belong to."""
+        return head_regions(self.capture)
 
     @cached_property
     def facing(self) -> np.ndarray:
@@ -348,7 +354,7 @@ class Surface:
         near = measured[nearest_rows(sources, center[scalp], AROUND) % len(measured)]
         height[scalp] = np.median(self._measured_height[near], axis=1)
         if self.at is not None and self._has_long_hair:
-            fraction = hanging_fraction(self.at)
+            fraction = self.regions.hanging
             hanging = self._scalp & (fraction > 0)
             growing = self._scalp & ~hanging
             median = np.median(height[growing]) if growing.any() else 0.0
@@ -381,10 +387,13 @@ class Surface:
 
     @cached_property
     def kinds(self) -> dict[str, np.ndarray]:
-        """`kinds_of` the triangles; none where it is not known where on a head they are."""
-        if self.at is None:
-            return {}
-        return kinds_of(self.at, self.outside, self._has_long_hair)
+        """Kind -> (F,) bool of the outside: "scalp", which includes the back of a neck that long
+        hair hides, and "body", neck and shoulders. Unseen parts of each kind look like visible ones
+        of it."""
+        hairy = (Region.SCALP, Region.NAPE) if self._has_long_hair else (Region.SCALP,)
+        scalp = self.outside & self.regions.within(*hairy)
+        body = self.outside & ~scalp & self.regions.within(Region.NAPE, Region.BODY)
+        return {"scalp": scalp, "body": body}
 
     @cached_property
     def _has_long_hair(self) -> bool:
@@ -403,7 +412,7 @@ class Surface:
 
     @property
     def _scalp(self) -> np.ndarray:
-        return self.kinds.get("scalp", np.zeros(len(self.outside), bool))
+        return self.kinds["scalp"]
 
     @property
     def _is_measured(self) -> np.ndarray:
