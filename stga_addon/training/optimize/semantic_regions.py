@@ -105,7 +105,7 @@ class Region(IntEnum):
     OTHER = 0
     """Forehead, temples and cheeks beside the face; all triangles where regions are not known."""
     FACE = 1
-    """Between brows and neck, ahead of the cheeks."""
+    """What is between brows and neck, ahead of the ears, but for MOUTH."""
     MOUTH = 2
     """Lips, teeth, gums and lining; the face's inner side around them."""
     EAR = 3
@@ -113,7 +113,7 @@ class Region(IntEnum):
     SCALP = 4
     """Where hair grows."""
     NAPE = 5
-    """Below it, where long hair hangs before a neck."""
+    """Back of the neck, which long hair hides; without it, part of the body."""
     BODY = 6
     """Neck and shoulders."""
 
@@ -136,14 +136,14 @@ class HeadRegions:
 
     @property
     def face(self) -> np.ndarray:
-        """(F,) bool: triangles between brows and neck, ahead of the cheeks."""
+        """(F,) bool: triangles between brows and neck, ahead of the ears."""
         return self.within(Region.FACE, Region.MOUTH)
 
 
 def head_regions(capture: Capture) -> HeadRegions:
     """Regions of a capture's triangles: the bundled head's own, of whatever identity; on other
-    meshes those of its nearest triangles, where eyes and mouth lie upon each other. OTHER where
-    eyes and mouth are not known, and without the bundled head."""
+    meshes those of its nearest triangles, when eyes and mouths lie upon each other. OTHER where
+    eyes or mouth are not known, and in an edition without the bundled head."""
     count = len(capture.faces)
     known = _bundled_regions()
     if known is not None and np.array_equal(capture.faces, known.faces):
@@ -176,7 +176,7 @@ class _BundledRegions:
 
 @cache
 def _bundled_regions() -> _BundledRegions | None:
-    """None in an edition without the bundled head."""
+    """The bundled head's regions; None in an edition without it."""
     if not REGIONS_FILE.is_file():
         return None
     model = flame_model(None)
