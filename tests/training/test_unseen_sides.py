@@ -32,7 +32,7 @@ from stga_addon.training.optimize.hidden_layers import (
 )
 from stga_addon.training.optimize.initial_splats import flat_points
 from stga_addon.training.optimize.occlusion_layer import GRAZED_COSINE
-from stga_addon.training.optimize.semantic_regions import ears_of, face_of, head_coordinates
+from stga_addon.training.optimize.semantic_regions import Region, head_regions
 from stga_addon.training.optimize.state import new_state, state_of_avatar
 from stga_addon.training.optimize.step_hook import Schedule
 from stga_addon.training.optimize.surface import GRAZING_COSINE, Surface
@@ -346,7 +346,7 @@ def test_a_beard_goes_on_beside_the_jaw(bundled, tmp_path):
     color = painted(bundled)
     surface = Surface(filmed(bundled, color, (0,), 0.0, tmp_path))
     of_cheek = surface.outside & (level < 0.1) & (level > -0.8) & (centers[:, 2] > 0.01)
-    of_cheek &= ~ears_of(surface.at) & ~surface.kinds["body"]
+    of_cheek &= ~surface.regions.within(Region.EAR) & ~surface.kinds["body"]
     beard = of_cheek & (surface.facing < 0.48)
     color[beard] = HAIR
     sides = sides_of(filmed(bundled, color, (0,), 0.0, tmp_path))
@@ -735,7 +735,7 @@ def test_what_is_beside_the_jaw_lies_behind_the_face(bundled, tmp_path):
 
 def test_a_mesh_of_a_face_alone_has_a_layer_beside_it(bundled, tmp_path):
     """Catches an error where no part of a mesh is behind the face."""
-    face = face_of(head_coordinates(bundled))
+    face = head_regions(bundled).face
     regions = {name: own[face] for name, own in bundled.regions.items()}
     alone = replace(bundled, faces=bundled.faces[face], regions=regions, flame=None)
     capture = filmed(alone, painted(bundled)[face], (0,), 0.0, tmp_path)

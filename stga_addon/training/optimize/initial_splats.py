@@ -27,7 +27,7 @@ from ...flame.parts import PARTS
 from ...flame.sequence import below_neck
 from ...tracking.folder import read_torso_points
 from ..settings import TrainingSettings
-from .semantic_regions import CHIN_LEVEL, face_of, head_coordinates, kinds_of
+from .semantic_regions import Region, head_regions
 
 SAMPLED_HEIGHT_PIXELS = 400
 """Images higher than this are shrunk to it: triangles are then two or three pixels wide."""
@@ -250,10 +250,10 @@ def flat_points(
     A single camera does not show how far away hair or shoulders are. Each splat lies on the ray of
     its pixel, as deep as the part of the mesh that is nearest in the image, but for the face: hair
     and collars are behind the jaw that they are seen beside. It follows the same triangle as a hull
-    point there, and has its size and distance. has_long_hair: what is beside the head down to the
-    neck is as deep as the scalp's outline, and not as shoulders behind it. torso: what the image cuts off below the neck is
+    point there, and has its size and distance. torso: what the image cuts off below the neck is
     continued beyond it, as its border looks, for other timesteps that show more; where none does,
-    it stays so.
+    it stays so. has_long_hair: what is beside the head, down to the base of the neck, is as deep as
+    the scalp's outline, not as the shoulders above which it is seen.
     """
     mesh = capture.mesh(view.timestep)
     camera = view.camera
@@ -304,22 +304,16 @@ def _at_depth_of(
 
 
 def _head_without_face(capture: Capture) -> np.ndarray:
-    """(F,) bool: triangles of the head above the chin, outside the face; all of a mesh that has
-    none or whose parts are not known."""
-    at = head_coordinates(capture)
-    others = _without_face(capture)
-    if at is None:
-        return others
-    body = kinds_of(at, others)["body"]
-    head = others & ~body & (at.level > CHIN_LEVEL)
-    return head if head.any() else others
+    """(F,) bool: triangles of the head, without face, neck and shoulders; `_without_face` where
+    there are none."""
+    head = head_regions(capture).within(Region.OTHER, Region.SIDE, Region.EAR, Region.SCALP)
+    return head if head.any() else _without_face(capture)
 
 
 def _without_face(capture: Capture) -> np.ndarray:
     """(F,) bool: triangles outside the face; all of a mesh that consists of a face or whose face is
     not known."""
-    at = head_coordinates(capture)
-    others = np.ones(len(capture.faces), bool) if at is None else ~face_of(at)
+    others = ~head_regions(capture).face
     return others if others.any() else ~others
 
 

@@ -13,7 +13,7 @@ from .semantic_regions import (
     CHIN_LEVEL,
     TORSO_HEIGHT,
     HeadCoordinates,
-    ears_of,
+    Region,
     nearest_rows,
     skin_of,
 )
@@ -108,7 +108,8 @@ def _behind_sides(
     moved inside the head until masks cover them."""
     faces = surface.capture.faces
     neutral = surface.neutral
-    allowed = allowed & surface.outside & skin_of(surface.capture) & ~ears_of(at)
+    allowed = allowed & surface.outside & skin_of(surface.capture)
+    allowed &= ~surface.regions.within(Region.EAR)
     grazed = allowed & _grazed(surface, at)
     clothes = allowed & surface.kinds["body"] & _is_off_border(surface) & ~grazed
     rows = np.flatnonzero(grazed | clothes)

@@ -1,21 +1,22 @@
 """Which visible triangles of a head unseen ones look like: hair like hair, a neck like a neck."""
 
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
+from enum import IntEnum
+from functools import cache
 
 import numpy as np
 from scipy.spatial import cKDTree
 
 from ...capture.mesh_geometry import connected_parts, head_axes
 from ...capture.model import Capture
-from ...flame.model import faces_within
+from ...files import read_npz
+from ...flame.model import BUNDLED_HEAD, faces_within
+from ...flame.parts import flame_model
 
-SCALP_ANGLE_DEG = 66.0
-"""Angle from straight ahead, from the middle of the head, behind which hair grows."""
-SCALP_ELEVATION_DEG = 38.0
-"""Elevation above which hair grows."""
-NECK_ANGLE_DEG = 60.0
-"""Angle from straight ahead behind which the neck begins."""
+REGIONS_FILE = BUNDLED_HEAD.with_name("head_regions.npz")
+"""The bundled head's triangles, made by `development/head_regions.py`: `region` (F,) of `Region`,
+and `place` (F, 3) of their centers as `head_places` has them."""
 EYES_TO_MIDDLE = 1.35
 """Distance of the head's middle behind the eyes, in distances of the eyes from the mouth, the unit
 of all lengths here."""
@@ -29,28 +30,6 @@ CHIN_LEVEL = -2.0
 """Height of the chin over the eyes."""
 TORSO_HEIGHT = 2.0
 """Least extent of a torso; the end of a bust has less."""
-JAW_DEG = (76.0, 90.0)
-"""Angles from straight ahead between which the jaw's lower end rises to what is behind it."""
-JAW = (-1.0, JAW_LEVEL)
-"""Heights over the eyes at JAW_DEG below which the neck begins."""
-HAIRLINE_DEG = (84.0, 112.0, 140.0)
-"""Angles from straight ahead of the hairline's points."""
-HAIRLINE = (0.15, -0.55, -1.15)
-"""Heights over the eyes at HAIRLINE_DEG below which no hair grows; it begins above the ears."""
-LONG_HAIRLINE = (-1.0, -2.3, -2.3)
-"""Heights over the eyes at HAIRLINE_DEG below which no long hair hangs."""
-LONG_HAIR_SIDE = 1.1
-"""Distance from the middle plane beyond which long hair does not hide shoulders."""
-EAR_SIDE = 0.93
-"""Distance of ears from the middle plane at least."""
-EAR_LEVEL = -0.33
-"""Height of the ears' middle over the eyes."""
-EAR_HEIGHT = 0.57
-"""Half the height of an ear."""
-EAR_ANGLE_DEG = 90.0
-"""Angle of the ears' middle from straight ahead."""
-EAR_WIDTH_DEG = 14.0
-"""Half the angle that an ear takes up."""
 MIN_HAIR_CONTRAST = 0.9
 """A triangle of the scalp has hair if its color is this far from the skin's, as a fraction of the
 scalp's most different ones, in standard deviations of skin."""
@@ -59,12 +38,6 @@ LEAST_SHADE = 0.02
 SMOOTHED = 24
 """Triangles around one over which a decision or color is smoothed."""
 
-LINING_REACH = 1.3
-"""Distance from the mouth's middle within which its lining and throat lie."""
-LINING_LEVEL = -0.4
-"""Height over the eyes below which they lie; the sockets of the eyes are as near."""
-TONGUE_REACH = 0.5
-"""Distance from the mouth's middle within which everything but skin is teeth, gums or tongue."""
 DEPTHS = (0.0, 0.25, 0.45, 0.75)
 """Distances from the visible lips at which the colors of a mouth's inside are given: it gets darker
 inward."""
@@ -86,20 +59,16 @@ WHITE = np.array([0.75, 0.67, 0.63])
 class HeadCoordinates:
     """Triangles' places around the neutral head, seen from its middle at the height of the brows.
 
-    azimuth    (F,) radians from straight ahead, positive on the left
-    elevation  (F,) radians
-    level      (F,) height over the eyes, in distances of the eyes from the mouth
-    side       (F,) distance from the middle plane, in the same unit
-    unit       meters from the eyes to the mouth
-    eyes       (3,) their middle
-    middle     (3,) of the head, at the height of the brows
-    axes       (3, 3) unit vectors to the head's left, up and ahead
+    azimuth  (F,) radians from straight ahead, positive on the left
+    level    (F,) height over the eyes, in distances of the eyes from the mouth
+    unit     meters from the eyes to the mouth
+    eyes     (3,) their middle
+    middle   (3,) of the head, at the height of the brows
+    axes     (3, 3) unit vectors to the head's left, up and ahead
     """
 
     azimuth: np.ndarray
-    elevation: np.ndarray
     level: np.ndarray
-    side: np.ndarray
     unit: float
     eyes: np.ndarray
     middle: np.ndarray
@@ -120,12 +89,9 @@ def head_coordinates(capture: Capture) -> HeadCoordinates | None:
     eyes, axes, unit = found
     across, up, ahead = axes
     middle = eyes + unit * (BROWS_OVER_EYES * up - EYES_TO_MIDDLE * ahead)
-    x, y, z = ((centers - middle) @ axis for axis in (across, up, ahead))
     return HeadCoordinates(
-        azimuth=np.arctan2(x, z),
-        elevation=np.arctan2(y, np.hypot(x, z)),
+        azimuth=np.arctan2((centers - middle) @ across, (centers - middle) @ ahead),
         level=(centers - eyes) @ up / unit,
-        side=np.abs(x) / unit,
         unit=unit,
         eyes=eyes,
         middle=middle,
@@ -133,35 +99,81 @@ def head_coordinates(capture: Capture) -> HeadCoordinates | None:
     )
 
 
-def ears_of(at: HeadCoordinates) -> np.ndarray:
-    """(F,) bool: triangles of ears."""
-    ear = (at.side > EAR_SIDE) & (abs(at.angle_deg - EAR_ANGLE_DEG) < EAR_WIDTH_DEG)
-    return np.asarray(ear & (abs(at.level - EAR_LEVEL) < EAR_HEIGHT))
+class Region(IntEnum):
+    """Regions of a head's triangles, by their numbers in the bundled head's file."""
+
+    OTHER = 0
+    """Forehead and temples; all triangles where regions are not known."""
+    FACE = 1
+    """What is between brows and neck, ahead of the ears, but for MOUTH."""
+    MOUTH = 2
+    """Lips, teeth, gums and lining; the face's inner side around them."""
+    EAR = 3
+    """Ears."""
+    SCALP = 4
+    """Where hair grows."""
+    NAPE = 5
+    """Back of the neck, which long hair hides; without it, part of the body."""
+    BODY = 6
+    """Neck and shoulders."""
+    SIDE = 7
+    """Cheeks before the ears, which long hair hides."""
 
 
-def face_of(at: HeadCoordinates) -> np.ndarray:
-    """(F,) bool: triangles between brows and neck, ahead of the ears."""
-    ahead = at.angle_deg < NECK_ANGLE_DEG
-    return np.asarray(ahead & (at.level < BROWS_LEVEL) & (at.level > CHIN_LEVEL))
+@dataclass(frozen=True)
+class HeadRegions:
+    """Which part of a head each triangle belongs to.
+
+    region  (F,) numbers of `Region`
+    """
+
+    region: np.ndarray
+
+    def within(self, *regions: Region) -> np.ndarray:
+        """(F,) bool: triangles of these regions."""
+        return np.isin(self.region, regions)
+
+    @property
+    def face(self) -> np.ndarray:
+        """(F,) bool: triangles between brows and neck, ahead of the ears."""
+        return self.within(Region.FACE, Region.MOUTH)
 
 
-def kinds_of(
-    at: HeadCoordinates, is_outside: np.ndarray, has_long_hair: bool = False
-) -> dict[str, np.ndarray]:
-    """Kind -> (F,) bool: "scalp", which includes the back of a neck that long hair hides, and
-    "body", neck and shoulders. Unseen parts of each kind look like visible ones of it."""
-    angle = at.angle_deg
-    elevation = np.degrees(at.elevation)
-    ear = ears_of(at)
-    hairline = np.interp(angle, HAIRLINE_DEG, LONG_HAIRLINE if has_long_hair else HAIRLINE)
-    hairy = (angle > SCALP_ANGLE_DEG) | (elevation > SCALP_ELEVATION_DEG)
-    scalp = is_outside & ~ear & hairy & (at.level > hairline)
-    if has_long_hair:
-        scalp &= (at.side < LONG_HAIR_SIDE) | (at.level > JAW_LEVEL)
-    beside = (angle > NECK_ANGLE_DEG) | (at.level < CHIN_LEVEL)
-    below_jaw = at.level < np.interp(angle, JAW_DEG, JAW)
-    body = is_outside & ~ear & ~scalp & beside & below_jaw
-    return {"scalp": scalp, "body": body}
+def head_regions(capture: Capture) -> HeadRegions:
+    """Regions of a capture's triangles: the bundled head's own, of whatever identity; on other
+    meshes those of its nearest triangles, when eyes and mouths lie upon each other. OTHER where
+    eyes or mouth are not known."""
+    region, place = _bundled_regions()
+    faces = _bundled_faces()
+    if faces is not None and np.array_equal(capture.faces, faces):
+        return HeadRegions(region)
+    places = head_places(np.asarray(capture.neutral)[capture.faces].mean(1), capture.regions)
+    if places is None:
+        return HeadRegions(np.full(len(capture.faces), Region.OTHER, np.uint8))
+    return HeadRegions(region[nearest_rows(place, places, 1)[:, 0]])
+
+
+def head_places(centers: np.ndarray, regions: Mapping[str, np.ndarray]) -> np.ndarray | None:
+    """Triangles' centers (F, 3) from the eyes along the head's axes, in distances of the eyes from
+    the mouth; None where these are not known."""
+    found = head_axes(centers, regions)
+    if found is None:
+        return None
+    eyes, axes, unit = found
+    return np.asarray((centers - eyes) @ axes.T / unit)
+
+
+@cache
+def _bundled_regions() -> tuple[np.ndarray, np.ndarray]:
+    """`region` and `place` of REGIONS_FILE."""
+    arrays = read_npz(REGIONS_FILE)
+    return arrays["region"], arrays["place"].astype(float)
+
+
+@cache
+def _bundled_faces() -> np.ndarray | None:
+    """(F, 3) of the bundled head; None in an edition without it."""
+    return flame_model(None).faces if BUNDLED_HEAD.is_file() else None
 
 
 def nearest_rows(known: np.ndarray, places: np.ndarray, count: int) -> np.ndarray:
@@ -212,9 +224,8 @@ def inside_colors(
     lips = mouth & skin & shown
     if not lips.any():
         return np.asarray(found)
-    away = np.linalg.norm(centers - centers[mouth].mean(0), axis=1) / at.unit
     part = connected_parts(len(capture.neutral), faces)[faces[:, 0]]
-    in_mouth = np.isin(part, part[~skin & (away < TONGUE_REACH)])
+    in_mouth = np.isin(part, part[~skin & head_regions(capture).within(Region.MOUTH)])
     within = inside & (in_mouth | lining_of(capture))
     depth = cKDTree(centers[lips]).query(centers[within])[0] / at.unit
     colors = np.vstack([LIP_FRACTION * np.median(color[lips], axis=0), GUM_FRACTIONS * white])
@@ -240,15 +251,8 @@ def skin_of(capture: Capture) -> np.ndarray:
 
 
 def lining_of(capture: Capture) -> np.ndarray:
-    """(F,) bool: skin so near to the middle of the mouth that it may line it; none where the mouth
-    is not known."""
-    at = head_coordinates(capture)
-    if at is None:
-        return np.zeros(len(capture.faces), bool)
-    centers = np.asarray(capture.neutral)[capture.faces].mean(1)
-    away = np.linalg.norm(centers - centers[capture.regions["mouth"]].mean(0), axis=1)
-    near = (away < LINING_REACH * at.unit) & (at.level < LINING_LEVEL)
-    return np.asarray(skin_of(capture) & near)
+    """(F,) bool: skin that may line the mouth; none where the mouth is not known."""
+    return np.asarray(skin_of(capture) & head_regions(capture).within(Region.MOUTH))
 
 
 def teeth_of(capture: Capture) -> np.ndarray:

@@ -29,8 +29,10 @@ from .semantic_regions import (
     JAW_LEVEL,
     TORSO_HEIGHT,
     HeadCoordinates,
+    HeadRegions,
+    Region,
     head_coordinates,
-    kinds_of,
+    head_regions,
     nearest_rows,
     teeth_of,
 )
@@ -114,6 +116,11 @@ class Surface:
     def at(self) -> HeadCoordinates | None:
         """Where on the head the triangles are; None where that is not known."""
         return head_coordinates(self.capture)
+
+    @cached_property
+    def regions(self) -> HeadRegions:
+        """The parts of the head that the triangles belong to."""
+        return head_regions(self.capture)
 
     @cached_property
     def facing(self) -> np.ndarray:
@@ -373,10 +380,12 @@ class Surface:
 
     @cached_property
     def kinds(self) -> dict[str, np.ndarray]:
-        """`kinds_of` the triangles; none where it is not known where on a head they are."""
-        if self.at is None:
-            return {}
-        return kinds_of(self.at, self.outside, self.has_long_hair)
+        """Kind -> (F,) bool of the outside: "scalp", which includes what long hair hides, and
+        "body", neck and shoulders. Unseen parts of each kind look like visible ones of it."""
+        hidden = (Region.SIDE, Region.NAPE) if self.has_long_hair else ()
+        scalp = self.outside & self.regions.within(Region.SCALP, *hidden)
+        body = self.outside & ~scalp & self.regions.within(Region.NAPE, Region.BODY)
+        return {"scalp": scalp, "body": body}
 
     @cached_property
     def has_long_hair(self) -> bool:
@@ -395,7 +404,7 @@ class Surface:
 
     @property
     def _scalp(self) -> np.ndarray:
-        return self.kinds.get("scalp", np.zeros(len(self.outside), bool))
+        return self.kinds["scalp"]
 
     @property
     def _is_measured(self) -> np.ndarray:

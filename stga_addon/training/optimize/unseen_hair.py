@@ -5,7 +5,7 @@ from functools import cache, cached_property
 
 import numpy as np
 
-from ...avatar.embedding import face_areas, points_to_world, to_local
+from ...avatar.embedding import face_areas, face_frames, points_to_world, to_local, to_world
 from ...avatar.lattice import NORMAL_AXIS, lattice_splats
 from ...avatar.splats import Splats, joined
 from ...capture.mesh_geometry import vertex_normals
@@ -53,16 +53,27 @@ class UnseenHair:
 
     def splats(self, sh_degree: int, opacity_logit: float) -> Splats:
         """Strands, which lie on the hair's surface in the direction of growth, and a splat under
-        them on each triangle; without color."""
+        them on each triangle, and between them where hair hangs; without color."""
         frames = self._frames
-        capture = frames.capture
-        scalp = lattice_splats(
-            capture.neutral, capture.faces, 0, sh_degree, opacity_logit, frames.convention
-        ).rows(self.has_strands)
+        neutral = frames.capture.neutral
+        scalp = self._one_each(neutral, self.has_strands, sh_degree, opacity_logit)
         if not len(scalp):
             return scalp
         scalp.xyz[:, NORMAL_AXIS[frames.convention]] = self._scalp_height[scalp.face]
-        return joined([scalp, self._strands(scalp)])
+        between = self._one_each(self._surface, self._hangs, sh_degree, opacity_logit)
+        return joined([scalp, between, self._strands(scalp)])
+
+    def _one_each(
+        self, mesh: np.ndarray, triangles: np.ndarray, sh_degree: int, opacity_logit: float
+    ) -> Splats:
+        """A splat on each of the triangles (F,) bool of the neutral head, moved to vertices (V,
+        3)."""
+        frames = self._frames
+        faces = frames.capture.faces
+        splats = lattice_splats(mesh, faces, 0, sh_degree, opacity_logit, frames.convention)
+        splats = splats.rows(triangles)
+        there = face_frames(mesh, faces, mesh, frames.convention)
+        return to_local(to_world(splats, there), frames.neutral, splats.face)
 
     def _strands(self, like: Splats) -> Splats:
         at = self._at
@@ -153,8 +164,24 @@ class UnseenHair:
 
     @cached_property
     def _surface(self) -> np.ndarray:
-        """(V, 3) the neutral mesh, where strands grow moved to the middle of the layer, and long
-        hair's to where it hangs."""
+        """(V, 3) `_grown`, and long hair where it hangs."""
+        surface = self._grown.copy()
+        if self._frames.surface.has_long_hair:
+            rows = np.unique(self._frames.capture.faces[self.has_strands])
+            hanging = hanging_hair(self._frames.surface, self._at, surface[rows])
+            surface[rows] = hanging.around(surface[rows])
+        return surface
+
+    @cached_property
+    def _hangs(self) -> np.ndarray:
+        """(F,) bool: triangles with strands that hang, too far away for the scalp's splats to close
+        gaps between them."""
+        moved = (self._surface != self._grown).any(1)
+        return np.asarray(self.has_strands & moved[self._frames.capture.faces].any(1))
+
+    @cached_property
+    def _grown(self) -> np.ndarray:
+        """(V, 3) the neutral mesh, where strands grow moved to the middle of the layer."""
         frames = self._frames
         neutral = frames.surface.neutral
         own = frames.capture.faces[self.has_strands]
@@ -163,11 +190,7 @@ class UnseenHair:
         for _ in range(SMOOTHING_STEPS):
             height = np.bincount(own.ravel(), np.repeat(of_triangles, 3), len(neutral)) / uses
             of_triangles = height[own].mean(1)
-        layer = neutral + height[:, None] * vertex_normals(neutral, frames.capture.faces)
-        if frames.surface.has_long_hair:
-            rows = np.unique(own)
-            layer[rows] = hanging_hair(frames.surface, self._at, layer[rows]).around(layer[rows])
-        return layer
+        return neutral + height[:, None] * vertex_normals(neutral, frames.capture.faces)
 
 
 def growth(at: HeadCoordinates, places: np.ndarray, normals: np.ndarray) -> np.ndarray:

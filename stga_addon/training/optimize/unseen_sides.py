@@ -14,8 +14,7 @@ from .initial_splats import mean_colors, mirror_images
 from .semantic_regions import (
     BROWS_LEVEL,
     HeadCoordinates,
-    ears_of,
-    face_of,
+    Region,
     hairy_triangles,
     inside_colors,
     lining_of,
@@ -112,7 +111,7 @@ def unseen_sides(surface: Surface) -> UnseenSides:
     sides = _Sides(surface, color)
     hidden = unseen | ~shown | surface.lids
     found = color.copy()
-    ears = np.zeros_like(shown) if surface.at is None else ears_of(surface.at)
+    ears = surface.regions.within(Region.EAR)
     found[hidden] = sides.nearest(is_source & ~ears, hidden)
     turned = np.where(is_outside, surface.turned_from(SHOWN_COSINE, SOURCE_COSINE), 0.0)
     off_axis = color.copy()
@@ -251,7 +250,7 @@ def _lid_colors(
     skin_color = np.full(color.shape, np.nan)
     at = surface.at
     if at is not None:
-        skin = face_of(at) & is_source
+        skin = surface.regions.face & is_source
         for half in (at.azimuth > 0, at.azimuth <= 0):
             if (skin & half).any():
                 skin_color[surface.folded_lids & half] = np.median(color[skin & half], axis=0)
