@@ -14,11 +14,7 @@ from .wheels import Target
 DEMO_FOLDER = "demo_capture"
 """Folder of the demo's capture in the zip."""
 ASSETS = {
-    "ICT-FaceKit": (
-        "stga_addon/flame/head.npz",
-        "stga_addon/flame/head_regions.npz",
-        "stga_addon/driving/arkit_shapes.npz",
-    ),
+    "ICT-FaceKit": ("stga_addon/flame/head.npz", "stga_addon/driving/arkit_shapes.npz"),
     "MediaPipe": ("stga_addon/tracking/networks/",),
 }
 """Data of others, by their name in the manifest's copyright -> files and folders in the zip."""

@@ -1,23 +1,25 @@
-"""Makes `flame/head_regions.npz`: which region of a head each triangle of the bundled one is in.
+"""Makes `flame/head_regions.npz`: in which region of a head the triangles of the bundled head and
+of FLAME lie.
 
-python -m stga_addon.development.head_regions
+python -m stga_addon.development.head_regions FLAME.npz
 """
 
+import argparse
 from pathlib import Path
 
 import numpy as np
 
 from ..capture.model import Capture
-from ..files import write_npz
-from ..flame.parts import flame_model, key_regions
+from ..files import read_npz, write_npz
+from ..flame.parts import flame_model, found_regions, key_regions
 from ..training.optimize.semantic_regions import (
     BROWS_LEVEL,
     CHIN_LEVEL,
     JAW_LEVEL,
     REGIONS_FILE,
     Region,
+    checksum,
     head_coordinates,
-    head_places,
 )
 from ..training.optimize.surface import Surface
 
@@ -58,15 +60,18 @@ LINING_LEVEL = -0.4
 
 def main() -> None:
     """Write the file."""
-    head = bundled_head()
-    places = head_places(head.neutral[head.faces].mean(1), head.regions)
-    assert places is not None
-    arrays = {"region": regions_of(head), "place": places.astype(np.float16)}
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("flame", type=Path, help="npz with FLAME's v_template and faces")
+    flame = flame_head(parser.parse_args().flame)
+    arrays = {}
+    for name, head in (("bundled", bundled_head()), ("flame", flame)):
+        arrays[f"{name}/region"] = regions_of(head)
+        arrays[f"{name}/checksum"] = np.array(checksum(head.faces))
     write_npz(REGIONS_FILE, arrays, compressed=True)
 
 
 def regions_of(head: Capture) -> np.ndarray:
-    """`Region` (F,) uint8 of the bundled head's triangles."""
+    """`Region` (F,) uint8 of a head's triangles."""
     centers = head.neutral[head.faces].mean(1)
     at = head_coordinates(head)
     assert at is not None
@@ -104,15 +109,26 @@ def regions_of(head: Capture) -> np.ndarray:
 def bundled_head() -> Capture:
     """The bundled head as a capture without views."""
     model = flame_model(None)
-    neutral = np.asarray(model.v_template, np.float64)
+    return _head(model.v_template, model.faces, key_regions(model))
+
+
+def flame_head(path: Path) -> Capture:
+    """FLAME without grafts as a capture without views."""
+    arrays = read_npz(path)
+    neutral, faces = arrays["v_template"], arrays["faces"].astype(np.int32)
+    return _head(neutral, faces, found_regions(neutral, faces))
+
+
+def _head(neutral: np.ndarray, faces: np.ndarray, regions: dict[str, np.ndarray]) -> Capture:
+    neutral = np.asarray(neutral, np.float64)
     return Capture(
         root=Path(),
         layout="flame",
-        faces=model.faces,
+        faces=faces,
         neutral=neutral,
         views={},
         timesteps=(0,),
-        regions=key_regions(model),
+        regions=regions,
         mesh=lambda timestep: neutral,
         expression_mesh=lambda timestep, zero_pose: neutral,
     )

@@ -324,6 +324,60 @@ def test_unseen_hair_grows_in_locks(convention, bundled, tmp_path):
     assert_array_equal(off_axis.sh[strands, 0], splats.sh[strands, 0])
 
 
+LONG_HAIR_M = 0.11
+"""Distance from the middle plane at which `with_long_hair` ends."""
+
+
+def with_long_hair(capture):
+    """A capture of one view, in which hair hangs beside the neck down to the shoulders."""
+    (view,) = capture.views["train"]
+    ears = np.array([[-LONG_HAIR_M, 0.04, -0.01], [LONG_HAIR_M, -0.15, -0.01]])
+    (left, right), (top, bottom) = np.round(np.sort(view.camera.project(ears)[0].T)).astype(int)
+    image, mask = (np.array(Image.open(file)) for file in (view.image, view.mask))
+    beside = np.zeros(mask.shape, bool)
+    beside[top:bottom, left:right] = mask[top:bottom, left:right] == 0
+    image[beside] = HAIR
+    mask[beside] = 255
+    Image.fromarray(image).save(view.image)
+    Image.fromarray(mask).save(view.mask)
+    return capture
+
+
+def test_long_hair_hangs_straight_down(bundled, tmp_path):
+    """Catches long hair that follows the neck as a helmet's rim does, that ends inside of what the
+    image shows or outside of it, and gaps in it."""
+    capture = with_long_hair(filmed(bundled, painted(bundled), (0,), 0.0, tmp_path))
+    frames = FrameStore(capture, "stga")
+    layer = hidden_splats(frames, quick_settings(sh_degree=0))
+    hair = layer.rows(frames.sides.is_hair[layer.face])
+    x, y, z = to_world(hair, frames.neutral).xyz.T
+    occiput = z[(y > 0) & (y < 0.06)].min()
+    neck = (y > -0.06) & (y < -0.02)
+    assert z[neck].min() == pytest.approx(occiput, abs=0.006)
+    assert LONG_HAIR_M - 0.045 < np.quantile(abs(x[neck]), 0.98) < LONG_HAIR_M - 0.015
+    camera = look_at([0, -0.02, -1], [0, -0.02, 0], 320, 400, 960)
+    corners = np.array([[-0.06, -0.08, -0.1], [0.06, 0.0, -0.1]])
+    (left, right), (top, bottom) = np.sort(camera.project(corners)[0].T).astype(int)
+    alpha = alpha_of(layer, camera, frames.neutral)[top:bottom, left:right]
+    assert alpha.min() > 0.98
+
+
+def test_long_hair_beside_the_neck_is_as_deep_as_the_ears(bundled, tmp_path):
+    """Catches hair that, from aside, is torn: as deep as the jaw above, and as the shoulders
+    below."""
+    capture = with_long_hair(filmed(bundled, painted(bundled), (0,), 0.0, tmp_path))
+    (view,) = capture.views["train"]
+    depth = []
+    for has_long_hair in (False, True):
+        splats = flat_points(capture, view, "stga", 0, has_long_hair=has_long_hair)
+        points = points_to_world(splats.xyz, FrameStore(capture, "stga").of(0), splats.face)
+        beside = (points[:, 1] < -0.04) & (abs(points[:, 0]) > 0.06)
+        depth.append(points[beside, 2])
+    assert min(len(each) for each in depth) > 100
+    assert [np.ptp(each) > 0.07 for each in depth] == [True, False]
+    assert depth[1].max() < 0.02
+
+
 def test_the_less_hair_is_unseen_the_fewer_strands(bundled, turning, tmp_path):
     """Catches as many strands behind a head that cameras show nearly all around."""
     around = filmed(bundled, painted(bundled), (*TURNS_DEG, -100, 150), 0.0, tmp_path)

@@ -253,7 +253,7 @@ def flat_points(
     point there, and has its size and distance. torso: what the image cuts off below the neck is
     continued beyond it, as its border looks, for other timesteps that show more; where none does,
     it stays so. has_long_hair: what is beside the head, down to the base of the neck, is as deep as
-    the scalp's outline, not as the shoulders above which it is seen.
+    ears and scalp, not as the shoulders above which it is seen.
     """
     mesh = capture.mesh(view.timestep)
     camera = view.camera
@@ -278,7 +278,7 @@ def flat_points(
         return _new_splats(np.zeros((0, 3)), voxel, sh_degree)
     points = _at_depth_of(_without_face(capture), camera, samples, centers)
     if has_long_hair:
-        hanging = _at_depth_of(_head_without_face(capture), camera, samples, centers)
+        hanging = _at_depth_of(_ears_and_scalp(capture), camera, samples, centers)
         above = ~below_neck(neck, view.timestep, hanging) if neck else np.ones(len(hanging), bool)
         points[above] = hanging[above]
     _, face = _followed(capture, view.timestep, points, torso)
@@ -303,10 +303,9 @@ def _at_depth_of(
     return camera.unproject(pixels, depth[cKDTree(places).query(pixels)[1]])
 
 
-def _head_without_face(capture: Capture) -> np.ndarray:
-    """(F,) bool: triangles of the head, without face, neck and shoulders; `_without_face` where
-    there are none."""
-    head = head_regions(capture).within(Region.OTHER, Region.SIDE, Region.EAR, Region.SCALP)
+def _ears_and_scalp(capture: Capture) -> np.ndarray:
+    """(F,) bool: triangles beside which hair grows; `_without_face` where none are known."""
+    head = head_regions(capture).within(Region.EAR, Region.SCALP)
     return head if head.any() else _without_face(capture)
 
 

@@ -4,6 +4,7 @@ from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from enum import IntEnum
 from functools import cache
+from zlib import crc32
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -12,11 +13,13 @@ from ...capture.mesh_geometry import connected_parts, head_axes
 from ...capture.model import Capture
 from ...files import read_npz
 from ...flame.model import BUNDLED_HEAD, faces_within
-from ...flame.parts import flame_model
+from ...flame.parts import flame_model, key_regions
 
 REGIONS_FILE = BUNDLED_HEAD.with_name("head_regions.npz")
-"""The bundled head's triangles, made by `development/head_regions.py`: `region` (F,) of `Region`,
-and `place` (F, 3) of their centers as `head_places` has them."""
+"""For each head of KNOWN_HEADS, made by `development/head_regions.py`: `NAME/region` (F,), the
+`Region` of its triangles, and `NAME/checksum` of these."""
+KNOWN_HEADS = ("bundled", "flame")
+"""Heads whose triangles are known by their `checksum`."""
 EYES_TO_MIDDLE = 1.35
 """Distance of the head's middle behind the eyes, in distances of the eyes from the mouth, the unit
 of all lengths here."""
@@ -100,7 +103,7 @@ def head_coordinates(capture: Capture) -> HeadCoordinates | None:
 
 
 class Region(IntEnum):
-    """Regions of a head's triangles, by their numbers in the bundled head's file."""
+    """Regions of a head's triangles, by their numbers in REGIONS_FILE."""
 
     OTHER = 0
     """Forehead and temples; all triangles where regions are not known."""
@@ -140,17 +143,27 @@ class HeadRegions:
 
 
 def head_regions(capture: Capture) -> HeadRegions:
-    """Regions of a capture's triangles: the bundled head's own, of whatever identity; on other
-    meshes those of its nearest triangles, when eyes and mouths lie upon each other. OTHER where
-    eyes or mouth are not known."""
-    region, place = _bundled_regions()
-    faces = _bundled_faces()
-    if faces is not None and np.array_equal(capture.faces, faces):
-        return HeadRegions(region)
-    places = head_places(np.asarray(capture.neutral)[capture.faces].mean(1), capture.regions)
-    if places is None:
-        return HeadRegions(np.full(len(capture.faces), Region.OTHER, np.uint8))
-    return HeadRegions(region[nearest_rows(place, places, 1)[:, 0]])
+    """Regions of a capture's triangles: those of KNOWN_HEADS, of whatever identity, with what is
+    grafted into the mouth; on other meshes the bundled head's nearest, when eyes and mouths lie
+    upon each other. OTHER where eyes or mouth, or the bundled head, are not known."""
+    faces = capture.faces
+    arrays = _arrays()
+    for name in KNOWN_HEADS:
+        known = arrays[f"{name}/region"]
+        if checksum(faces[: len(known)]) == arrays[f"{name}/checksum"]:
+            region = np.full(len(faces), Region.MOUTH, np.uint8)
+            region[: len(known)] = known
+            return HeadRegions(region)
+    places = head_places(np.asarray(capture.neutral)[faces].mean(1), capture.regions)
+    if places is None or not BUNDLED_HEAD.is_file():
+        return HeadRegions(np.full(len(faces), Region.OTHER, np.uint8))
+    rows = nearest_rows(_bundled_places(), places, 1)[:, 0]
+    return HeadRegions(arrays["bundled/region"][rows])
+
+
+def checksum(faces: np.ndarray) -> int:
+    """Of triangles (F, 3)."""
+    return crc32(np.ascontiguousarray(faces, "<i4").tobytes())
 
 
 def head_places(centers: np.ndarray, regions: Mapping[str, np.ndarray]) -> np.ndarray | None:
@@ -164,16 +177,17 @@ def head_places(centers: np.ndarray, regions: Mapping[str, np.ndarray]) -> np.nd
 
 
 @cache
-def _bundled_regions() -> tuple[np.ndarray, np.ndarray]:
-    """`region` and `place` of REGIONS_FILE."""
-    arrays = read_npz(REGIONS_FILE)
-    return arrays["region"], arrays["place"].astype(float)
+def _arrays() -> dict[str, np.ndarray]:
+    return read_npz(REGIONS_FILE)
 
 
 @cache
-def _bundled_faces() -> np.ndarray | None:
-    """(F, 3) of the bundled head; None in an edition without it."""
-    return flame_model(None).faces if BUNDLED_HEAD.is_file() else None
+def _bundled_places() -> np.ndarray:
+    """`head_places` (F, 3) of the bundled head."""
+    model = flame_model(None)
+    places = head_places(model.v_template[model.faces].mean(1), key_regions(model))
+    assert places is not None
+    return places
 
 
 def nearest_rows(known: np.ndarray, places: np.ndarray, count: int) -> np.ndarray:
