@@ -115,7 +115,8 @@ def bundled_head() -> Capture:
 def flame_head(path: Path) -> Capture:
     """FLAME without grafts as a capture without views."""
     arrays = read_npz(path)
-    neutral, faces = arrays["v_template"], arrays["faces"].astype(np.int32)
+    neutral = arrays["v_template"]
+    faces = arrays["faces"].astype(np.int32)
     return _head(neutral, faces, found_regions(neutral, faces))
 
 

@@ -112,7 +112,9 @@ def test_other_meshes_have_the_nearest_regions(seed, differs, head):
 def test_flames_mesh(is_known, flame):
     """Catches FLAME's mesh with regions of another, or laid on the bundled head another way: its
     face, skull, ears, lips' inner side and the end of its neck."""
-    neutral, faces, regions = flame.neutral, flame.faces, flame.regions
+    neutral = flame.neutral
+    faces = flame.faces
+    regions = flame.regions
     if not is_known:
         faces = faces[::-1].copy()
         regions = {name: own[::-1] for name, own in regions.items()}

@@ -4,9 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ...avatar.embedding import face_frames
-from .semantic_regions import EYES_TO_MIDDLE, HeadCoordinates, nearest_rows
-from .surface import Surface
+from .semantic_regions import EYES_TO_MIDDLE, HeadCoordinates
+from .surface import WIDTHS, Surface
 
 LOWEST_LEVEL = -1.6
 """Height over the eyes above which all that masks show beside the head is hair; shoulders are
@@ -17,10 +16,6 @@ LEVEL_STEP = 0.2
 """Distance between heights at which hair is measured."""
 BLENDED_LEVELS = 0.4
 """Height over which hair turns from growing to hanging."""
-WIDTHS = (0.5, 3.0)
-"""Distances from the middle plane between which hair may end."""
-WIDTH_STEP = 0.05
-"""Step between the distances that are tried."""
 EDGE_INSET = 0.4
 """Distance of hair's layer from the masks' edge: strands nearer to it would be trained, and fray
 it."""
@@ -46,7 +41,9 @@ class HangingHair:
         moved out to these, away from the vertical line between the ears."""
         across, up, ahead = self.at.axes
         away = (places - self.at.eyes) / self.at.unit
-        x, level, behind = away @ across, away @ up, -(away @ ahead) - EYES_TO_MIDDLE
+        x = away @ across
+        level = away @ up
+        behind = -(away @ ahead) - EYES_TO_MIDDLE
         right, left, depth = (
             np.interp(level, self.levels, each) for each in (*self.widths, self.depths)
         )
@@ -61,28 +58,10 @@ def hanging_hair(surface: Surface, at: HeadCoordinates, layer: np.ndarray) -> Ha
     """As wide as masks show it, and falling straight down from where its layer, points (N, 3) above
     the neutral head's scalp, reaches farthest back."""
     levels = np.arange(LOWEST_LEVEL, HIGHEST_LEVEL + LEVEL_STEP / 2, LEVEL_STEP)
-    widths = np.array([_widths(surface, at, levels, side) for side in (-1, 1)])
+    widths = np.maximum(surface.widths(levels) - EDGE_INSET, WIDTHS[0])
     _, up, ahead = at.axes
     away = (layer - at.eyes) / at.unit
-    level, behind = away @ up, -(away @ ahead) - EYES_TO_MIDDLE
+    level = away @ up
+    behind = -(away @ ahead) - EYES_TO_MIDDLE
     depths = [behind[level > low - LEVEL_STEP].max(initial=WIDTHS[0]) for low in levels]
-    return HangingHair(at, levels, np.maximum(widths - EDGE_INSET, WIDTHS[0]), np.array(depths))
-
-
-def _widths(surface: Surface, at: HeadCoordinates, levels: np.ndarray, side: int) -> np.ndarray:
-    """Distance (L,) from the middle plane at which masks end beside an ear; side: 1 on the left, −1
-    on the right."""
-    across, up, ahead = at.axes
-    tried = np.arange(*WIDTHS, WIDTH_STEP)
-    points = at.eyes + at.unit * (
-        side * tried[:, None] * across + levels[:, None, None] * up - EYES_TO_MIDDLE * ahead
-    )
-    points = points.reshape(-1, 3)
-    scalp = np.flatnonzero(surface.kinds["scalp"])
-    rows = scalp[nearest_rows(surface.centers[scalp], points, 1)[:, 0]]
-    neutral = surface.neutral
-    frames = face_frames(neutral, surface.capture.faces, neutral, "stga")
-    offsets = np.einsum("nji,nj->ni", frames.rotation[rows], points - frames.origin[rows])
-    beside = surface.beside_masks(rows, offsets[:, None]).reshape(len(levels), len(tried))
-    beside[:, -1] = True
-    return np.asarray(tried[beside.argmax(1)])
+    return HangingHair(at, levels, widths, np.array(depths))

@@ -162,7 +162,7 @@ def head_regions(capture: Capture) -> HeadRegions:
 
 
 def checksum(faces: np.ndarray) -> int:
-    """Of triangles (F, 3)."""
+    """CRC-32 of triangles (F, 3)."""
     return crc32(np.ascontiguousarray(faces, "<i4").tobytes())
 
 

@@ -26,6 +26,7 @@ from ...tracking.solve import lid_fractions
 from .initial_splats import FEW_CAMERAS, SAMPLED_HEIGHT_PIXELS, mirrored, voxel_size
 from .outlines import TOLERANCE_FRACTION, clear_of
 from .semantic_regions import (
+    EYES_TO_MIDDLE,
     JAW_LEVEL,
     TORSO_HEIGHT,
     HeadCoordinates,
@@ -81,16 +82,16 @@ CLOSED_FRACTION = 0.6
 """Weight of these expressions at which tracked eyes count as closed."""
 MIN_SQUARED_AREA = 1e-28
 """Squared area in m⁴ below which a triangle has none."""
-NECK_LEVEL = -1.1
-"""Height of the neck's middle, as `HeadCoordinates` have it."""
-NECK_HALF_HEIGHT = 0.4
-"""Half the height over which its sides are measured."""
-NECK_SIDE_DEG = 95.0
-"""Angle of the neck's sides from straight ahead."""
-NECK_HALF_WIDTH_DEG = 45.0
-"""Half the angle over which they are measured."""
-HANGING_HEIGHT = 0.4
-"""Least height of long hair beside the neck, in distances of the eyes from the mouth."""
+NECK_LEVELS = (-1.4, -1.2, -1.0, -0.8)
+"""Heights over the eyes, in their distance from the mouth, at which nothing but long hair is wide:
+shoulders are lower, ears higher."""
+LONG_HAIR_WIDTH = 1.2
+"""Least distance of long hair's edge from the middle plane, in distances of the eyes from the
+mouth: that of ears."""
+WIDTHS = (0.5, 3.0)
+"""Distances from the middle plane between which a mask's edge is looked for."""
+WIDTH_STEP = 0.05
+"""Step between the distances that are tried."""
 MAX_APART_DEG = 8.0
 """Largest angle between the directions in which one camera sees a triangle, and their mean."""
 MAX_BESIDE_FRACTION = 0.1
@@ -389,18 +390,31 @@ class Surface:
 
     @cached_property
     def has_long_hair(self) -> bool:
-        """Whether something stands out on both sides of the neck, just below the ears, where no
-        collar reaches."""
-        if self.at is None:
+        """Whether masks are as wide on both sides of the neck, where no collar reaches, as they are
+        at the ears; not where they are cut off."""
+        if self.at is None or not self.regions.within(Region.SCALP).any():
             return False
-        angle = np.degrees(self.at.azimuth)
-        measured = self._is_measured & (abs(self.at.level - NECK_LEVEL) < NECK_HALF_HEIGHT)
-        for sign in (-1, 1):
-            beside = measured & (abs(sign * angle - NECK_SIDE_DEG) < NECK_HALF_WIDTH_DEG)
-            height = self._measured_height[beside]
-            if not len(height) or np.median(height) < HANGING_HEIGHT * self.at.unit:
-                return False
-        return True
+        widths = self.widths(np.array(NECK_LEVELS))
+        return bool(widths.min() >= LONG_HAIR_WIDTH and widths.max() < WIDTHS[1] - WIDTH_STEP)
+
+    def widths(self, levels: np.ndarray) -> np.ndarray:
+        """Distance (2, L) from the middle plane at which masks end to the right and to the left of
+        the ears, at these heights over the eyes (L,); all in distances of the eyes from the mouth.
+        At most WIDTHS."""
+        at = self.at
+        assert at is not None
+        across, up, ahead = at.axes
+        tried = np.arange(*WIDTHS, WIDTH_STEP)
+        aside = np.multiply.outer([-1, 1], np.outer(tried, across))
+        points = aside[:, None] + levels[:, None, None] * up - EYES_TO_MIDDLE * ahead
+        points = at.eyes + at.unit * points.reshape(-1, 3)
+        scalp = np.flatnonzero(self.regions.within(Region.SCALP))
+        rows = scalp[nearest_rows(self.centers[scalp], points, 1)[:, 0]]
+        frames = face_frames(self.neutral, self.capture.faces, self.neutral, "stga")
+        offsets = np.einsum("nji,nj->ni", frames.rotation[rows], points - frames.origin[rows])
+        beside = self.beside_masks(rows, offsets[:, None]).reshape(2, len(levels), len(tried))
+        beside[..., -1] = True
+        return np.asarray(tried[beside.argmax(2)])
 
     @property
     def _scalp(self) -> np.ndarray:
