@@ -85,6 +85,8 @@ MIN_SQUARED_AREA = 1e-28
 NECK_LEVELS = (-1.4, -1.2, -1.0, -0.8)
 """Heights over the eyes, in their distance from the mouth, at which nothing but long hair is wide:
 shoulders are lower, ears higher."""
+BELOW_NECK_LEVELS = (-1.6, -1.8, -2.0, -2.2)
+"""Heights over the eyes, in their distance from the mouth, at which long hair may end."""
 LONG_HAIR_WIDTH = 1.2
 """Least distance of long hair's edge from the middle plane, in distances of the eyes from the
 mouth: that of ears."""
@@ -383,8 +385,10 @@ class Surface:
     def kinds(self) -> dict[str, np.ndarray]:
         """Kind -> (F,) bool of the outside: "scalp", which includes what long hair hides, and
         "body", neck and shoulders. Unseen parts of each kind look like visible ones of it."""
-        hidden = (Region.SIDE, Region.NAPE) if self.has_long_hair else ()
-        scalp = self.outside & self.regions.within(Region.SCALP, *hidden)
+        scalp = self.outside & self.regions.within(Region.SCALP)
+        if self.at is not None and self.has_long_hair:
+            under_hair = self.regions.within(Region.SIDE, Region.NAPE)
+            scalp |= self.outside & under_hair & (self.at.level > self._hair_end)
         body = self.outside & ~scalp & self.regions.within(Region.NAPE, Region.BODY)
         return {"scalp": scalp, "body": body}
 
@@ -396,6 +400,14 @@ class Surface:
             return False
         widths = self.widths(np.array(NECK_LEVELS))
         return bool(widths.min() >= LONG_HAIR_WIDTH and widths.max() < WIDTHS[1] - WIDTH_STEP)
+
+    @cached_property
+    def _hair_end(self) -> float:
+        """Height over the eyes, in their distance from the mouth, above which long hair hangs; −∞
+        where no gap separates it from the shoulders."""
+        levels = np.array(BELOW_NECK_LEVELS)
+        is_gap = self.widths(levels).mean(0) < LONG_HAIR_WIDTH
+        return float(levels[is_gap.argmax()]) if is_gap.any() else -np.inf
 
     def widths(self, levels: np.ndarray) -> np.ndarray:
         """Distance (2, L) from the middle plane at which masks end to the right and to the left of

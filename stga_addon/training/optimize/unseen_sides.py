@@ -185,7 +185,7 @@ def _hair(
     at = surface.at
     if at is None:
         return np.zeros(0, int)
-    scalp = surface.kinds["scalp"]
+    scalp = surface.outside & surface.regions.within(Region.SCALP)
     rows = np.flatnonzero(scalp & is_source)
     if not len(rows):
         rows = _fringe(at, surface.outside & has_pixels & (surface.facing > FRINGE_COSINE))
