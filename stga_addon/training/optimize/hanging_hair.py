@@ -16,7 +16,7 @@ LEVEL_STEP = 0.2
 """Distance between heights at which hair is measured."""
 BLENDED_LEVELS = 0.4
 """Height over which hair turns from growing to hanging."""
-EDGE_INSET = 0.4
+EDGE_INSET = 0.2
 """Distance of hair's layer from the masks' edge: strands nearer to it would be trained, and fray
 it."""
 
