@@ -198,6 +198,13 @@ def test_long_hair_hides_the_neck(sides, hangs, filmed, tmp_path):
     assert not surface.kinds["scalp"][center[:, 1] < -0.16].any()
 
 
+def test_no_hair_is_long_beyond_an_image(filmed, tmp_path):
+    """Catches a close-up whose image ends beside the head, and that is thought to be full of
+    hair."""
+    surface = Surface(from_the_front(filmed, tmp_path, lambda view, mask: mask.fill(255)))
+    assert not surface.has_long_hair
+
+
 def test_an_end_of_a_bust_is_no_eye(filmed, frames):
     """Catches eyelids and lips, whose edges are open too, that are taken for the mesh's end, large
     splats there and at the rim of a face alone, and a torso beside a mesh that ends at the neck, of

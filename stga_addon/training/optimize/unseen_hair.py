@@ -55,24 +55,27 @@ class UnseenHair:
         """Strands, which lie on the hair's surface in the direction of growth, and a splat under
         them on each triangle, and between them where hair hangs; without color."""
         frames = self._frames
-        neutral = frames.capture.neutral
-        scalp = self._one_each(neutral, self.has_strands, sh_degree, opacity_logit)
+        capture = frames.capture
+        scalp = lattice_splats(
+            capture.neutral, capture.faces, 0, sh_degree, opacity_logit, frames.convention
+        ).rows(self.has_strands)
         if not len(scalp):
             return scalp
         scalp.xyz[:, NORMAL_AXIS[frames.convention]] = self._scalp_height[scalp.face]
-        between = self._one_each(self._surface, self._hangs, sh_degree, opacity_logit)
-        return joined([scalp, between, self._strands(scalp)])
+        return joined([scalp, self._between_strands(scalp), self._strands(scalp)])
 
-    def _one_each(
-        self, mesh: np.ndarray, triangles: np.ndarray, sh_degree: int, opacity_logit: float
-    ) -> Splats:
-        """A splat on each of the triangles (F,) bool of the neutral head, moved to vertices (V,
-        3)."""
+    def _between_strands(self, like: Splats) -> Splats:
+        """A splat on each triangle whose strands hang too far from it for the scalp's to close gaps
+        between them."""
         frames = self._frames
         faces = frames.capture.faces
-        splats = lattice_splats(mesh, faces, 0, sh_degree, opacity_logit, frames.convention)
-        splats = splats.rows(triangles)
-        there = face_frames(mesh, faces, mesh, frames.convention)
+        surface = self._surface
+        moved = (surface != self._grown).any(1)
+        hangs = self.has_strands & moved[faces].any(1)
+        splats = lattice_splats(surface, faces, 0, like.sh_degree, 0.0, frames.convention)
+        splats.opacity[:] = like.opacity[0]
+        there = face_frames(surface, faces, surface, frames.convention)
+        splats = splats.rows(hangs)
         return to_local(to_world(splats, there), frames.neutral, splats.face)
 
     def _strands(self, like: Splats) -> Splats:
@@ -171,13 +174,6 @@ class UnseenHair:
             hanging = hanging_hair(self._frames.surface, self._at, surface[rows])
             surface[rows] = hanging.around(surface[rows])
         return surface
-
-    @cached_property
-    def _hangs(self) -> np.ndarray:
-        """(F,) bool: triangles with strands that hang, too far away for the scalp's splats to close
-        gaps between them."""
-        moved = (self._surface != self._grown).any(1)
-        return np.asarray(self.has_strands & moved[self._frames.capture.faces].any(1))
 
     @cached_property
     def _grown(self) -> np.ndarray:
