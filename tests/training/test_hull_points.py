@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 from stga_addon.avatar.embedding import face_frames, to_world
 from stga_addon.avatar.splats import SH_C0
 from stga_addon.capture.camera import look_at
+from stga_addon.capture.images import read_image
 from stga_addon.capture.model import Capture, View
 from stga_addon.flame.forward import neutral_frame
 from stga_addon.flame.model import torso_faces
@@ -124,12 +125,15 @@ def test_points_stand_on_the_balls_surface(beside, convention):
     assert gaps.max() < 2.5 * VOXEL_SIZE_M
 
 
-def test_points_are_unbound_gray_and_embedded_in_the_nearest_triangle(beside):
-    """Catches limits that pull hair onto the skin or a far face, and captures without masks."""
+def test_points_are_unbound_colored_and_embedded_in_the_nearest_triangle(beside):
+    """Catches limits that pull hair onto the skin or a far face, captures without masks, and points
+    that begin gray: previews would show wings around the head."""
     points = visual_hull_points(beside, beside.views["train"], "stga", 2)
     assert points.unbound.all()
     assert points.sh.shape == (len(points), 9, 3)
-    assert not points.sh.any()
+    color = points.sh[:, 0] * SH_C0 + 0.5
+    assert_allclose(np.median(color, axis=0), np.array([90, 250, 40]) / 255, atol=0.02)
+    assert not points.sh[:, 1:].any()
     assert not points.opacity.any()
     world = in_world(beside, points)
     assert_allclose(np.exp(world.log_scale), VOXEL_SIZE_M / 2, rtol=1e-5)
@@ -153,11 +157,12 @@ def test_blocks_leave_nothing_out(beside, tmp_path, monkeypatch, whole, shift):
     views = list(beside.views["train"])
     for number, view in enumerate(views[whole:], whole):
         assert view.mask
-        mask = Image.open(view.mask)
-        path = tmp_path / view.mask.name
-        width = mask.getbbox()[0] + shift
-        mask.crop((0, 0, width, SIZE)).save(path)
-        views[number] = replace(view, camera=replace(view.camera, width=width), mask=path)
+        width = Image.open(view.mask).getbbox()[0] + shift
+        paths = {}
+        for kind, file in (("image", view.image), ("mask", view.mask)):
+            paths[kind] = tmp_path / file.name
+            Image.open(file).crop((0, 0, width, SIZE)).save(paths[kind])
+        views[number] = replace(view, camera=replace(view.camera, width=width), **paths)
     capture = replace(beside, views={"train": tuple(views)})
     found = []
     for voxels in (1, 5):
@@ -280,6 +285,7 @@ def test_a_single_camera_gets_a_layer_as_deep_as_the_mesh(beside, convention):
     assert len(wanted) > 50
     assert norm(wanted[:, None] + 0.5 - pixels[None], axis=2).min(axis=1).max() < 1.5 * step
     assert world.unbound.all()
+    assert_allclose(world.sh[:, 0] * SH_C0 + 0.5, read_image(view)[rows, columns] / 255, atol=1e-5)
     assert_allclose(np.exp(world.log_scale), VOXEL_SIZE_M / 2, rtol=1e-5)
 
 

@@ -202,7 +202,8 @@ def mirror_images(
 def visual_hull_points(
     capture: Capture, views: Sequence[View], convention: str, sh_degree: int, torso: bool = False
 ) -> Splats:
-    """Unbound splats on the surface of the visual hull of one timestep, outside the mesh.
+    """Unbound splats on the surface of the visual hull of one timestep, outside the mesh, in the
+    colors of its views.
 
     views: all of one timestep. The hull is carved on a grid of VOXEL_SIZE_M (coarser on a larger
     mesh) from the masks or, without masks, from pixels that differ from white. Each splat is
@@ -216,6 +217,7 @@ def visual_hull_points(
     distance, face = _followed(capture, views[0].timestep, points, torso)
     outside = distance > MIN_MESH_DISTANCE_M
     world = _new_splats(points[outside], voxel, sh_degree)
+    world.sh[:, 0] = (_colors_beside(world.xyz, mesh, capture.faces, views) - 0.5) / SH_C0
     frames = face_frames(mesh, capture.faces, capture.neutral, convention)
     hull = to_local(world, frames, face[outside])
     seen = read_torso_points(capture.root) if torso and len(views) <= FEW_CAMERAS else None
@@ -284,10 +286,10 @@ def flat_points(
     _, face = _followed(capture, view.timestep, points, torso)
     frames = face_frames(mesh, capture.faces, capture.neutral, convention)
     splats = _new_splats(points, voxel, sh_degree)
+    splats.sh[:, 0] = (read_image(view)[pixel][beside] / 255 - 0.5) / SH_C0
     if neck is None:
         return to_local(splats, frames, face)
     cut = ~pixels_of(points, camera)[2]
-    splats.sh[cut, 0] = (read_image(view)[pixel][beside][cut] / 255 - 0.5) / SH_C0
     splats.log_scale[cut] = np.log(voxel)
     splats.opacity[cut] = CONTINUED_OPACITY
     below = below_neck(neck, view.timestep, points)
@@ -409,6 +411,22 @@ def _hull_surface(
     return np.asarray(
         points[surface & (exposed >= np.maximum(1, MIN_EXPOSED_FRACTION * len(views)))]
     )
+
+
+def _colors_beside(
+    points: np.ndarray, mesh: np.ndarray, faces: np.ndarray, views: Sequence[View]
+) -> np.ndarray:
+    """Mean color (N, 3) in 0…1 of points (N, 3) in the views that show them beside the mesh; gray
+    where none does."""
+    total = np.zeros((len(points), 3))
+    count = np.zeros(len(points))
+    for view in views:
+        x, y, inside = pixels_of(points, view.camera)
+        shown = np.flatnonzero(inside & ~_silhouette(mesh, faces, view.camera)[y, x])
+        total[shown] += read_image(view)[y[shown], x[shown]] / 255
+        count[shown] += 1
+    mean = total / np.maximum(count, 1)[:, None]
+    return np.where(count[:, None] > 0, mean, MIDDLE_GRAY)
 
 
 def _silhouette(mesh: np.ndarray, faces: np.ndarray, camera: Camera) -> np.ndarray:
