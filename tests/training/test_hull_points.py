@@ -239,13 +239,16 @@ def test_what_lies_below_the_neck_follows_the_torso(tmp_path, one):
 
 def test_few_cameras_take_the_torso_from_where_it_was_seen(tmp_path):
     """Catches a chest that bulges as the hull of few cameras does, one that loses its place when it
-    turns, and a hull of many cameras that is thrown away."""
+    turns or begins gray, and a hull of many cameras that is thrown away."""
     model = small_head(0)
     frames = {TIMESTEP: turned(model), TIMESTEP + 1: neutral_frame(model)}
     head = FlameSequence(model, np.zeros(model.n_identity), None, tuple(frames), frames.__getitem__)
     views = scene(tmp_path, np.array([0.0, -0.175, 0.115]), 0.015).views["train"]
     neutral = sequence_mesh(head, TIMESTEP + 1)
-    capture = capture_of(tmp_path, head, {"train": views}, neutral)
+    red = np.uint8([200, 30, 60])
+    Image.fromarray(np.tile(red, (SIZE, SIZE, 1))).save(tmp_path / "chest.png")
+    later = replace(views[0], timestep=TIMESTEP + 1, image=tmp_path / "chest.png", mask=None)
+    capture = capture_of(tmp_path, head, {"train": (*views, later)}, neutral)
     hull, many = (
         visual_hull_points(capture, own, "stga", 0, torso=True) for own in (views[:3], views)
     )
@@ -255,6 +258,7 @@ def test_few_cameras_take_the_torso_from_where_it_was_seen(tmp_path):
     seen = few.rows(slice(-SEEN_COPIES * len(at), None))
     assert len(few) - len(seen) < 0.2 * len(hull)  # above the neck
     assert torso_faces(model)[seen.face].all()
+    assert_allclose(seen.sh[:, 0] * SH_C0 + 0.5, np.tile(red / 255, (len(seen), 1)), atol=1e-6)
     neutral = face_frames(capture.mesh(TIMESTEP + 1), capture.faces, capture.neutral)
     assert norm(to_world(seen, neutral).xyz - at.mean(0), axis=1).max() < 0.03
     assert norm(in_world(capture, seen).xyz - at.mean(0), axis=1).min() > 0.01

@@ -19,6 +19,8 @@ BLENDED_LEVELS = 0.4
 EDGE_INSET = 0.2
 """Distance of hair's layer from the masks' edge: strands nearer to it would be trained, and fray
 it."""
+WIDEST = 1.7
+"""Largest distance of that layer from the middle plane; locks farther out are free splats."""
 
 
 @dataclass(frozen=True)
@@ -58,7 +60,7 @@ def hanging_hair(surface: Surface, at: HeadCoordinates, layer: np.ndarray) -> Ha
     """As wide as masks show it, and falling straight down from where its layer, points (N, 3) above
     the neutral head's scalp, reaches farthest back."""
     levels = np.arange(LOWEST_LEVEL, HIGHEST_LEVEL + LEVEL_STEP / 2, LEVEL_STEP)
-    widths = np.maximum(surface.widths(levels) - EDGE_INSET, WIDTHS[0])
+    widths = np.clip(surface.widths(levels) - EDGE_INSET, WIDTHS[0], WIDEST)
     _, up, ahead = at.axes
     away = (layer - at.eyes) / at.unit
     level = away @ up

@@ -80,7 +80,7 @@ def initial_splats(
     capture: Capture, settings: TrainingSettings, has_long_hair: bool = False
 ) -> Splats:
     """The lattice on the neutral mesh and, if the settings say so, visual-hull points of the first
-    training timestep (`flat_points` where a single camera shows it)."""
+    training timestep (`flat_points` where a single camera shows it, which may be of long hair)."""
     convention = settings.convention
     degree = settings.sh_degree
     views = capture.views["train"]
@@ -217,7 +217,8 @@ def visual_hull_points(
     distance, face = _followed(capture, views[0].timestep, points, torso)
     outside = distance > MIN_MESH_DISTANCE_M
     world = _new_splats(points[outside], voxel, sh_degree)
-    world.sh[:, 0] = (_colors_beside(world.xyz, mesh, capture.faces, views) - 0.5) / SH_C0
+    beside = [~_silhouette(mesh, capture.faces, view.camera) for view in views]
+    world.sh[:, 0] = (_colors_within(world.xyz, views, beside) - 0.5) / SH_C0
     frames = face_frames(mesh, capture.faces, capture.neutral, convention)
     hull = to_local(world, frames, face[outside])
     seen = read_torso_points(capture.root) if torso and len(views) <= FEW_CAMERAS else None
@@ -234,8 +235,11 @@ def visual_hull_points(
     points = (seen.at + spread).reshape(-1, 3)
     _, among = _nearest_triangle(points, mesh, capture.faces[triangles])
     frames = face_frames(mesh, capture.faces, capture.neutral, convention)
-    shown = to_local(_new_splats(points, voxel, sh_degree), frames, triangles[among])
-    return joined([rest, shown])
+    world = _new_splats(points, voxel, sh_degree)
+    views = [view for view in capture.views["train"] if view.timestep == seen.timestep]
+    within = [_foreground(view) for view in views]
+    world.sh[:, 0] = (_colors_within(world.xyz, views, within) - 0.5) / SH_C0
+    return joined([rest, to_local(world, frames, triangles[among])])
 
 
 def flat_points(
@@ -413,16 +417,16 @@ def _hull_surface(
     )
 
 
-def _colors_beside(
-    points: np.ndarray, mesh: np.ndarray, faces: np.ndarray, views: Sequence[View]
+def _colors_within(
+    points: np.ndarray, views: Sequence[View], masks: Sequence[np.ndarray]
 ) -> np.ndarray:
-    """Mean color (N, 3) in 0…1 of points (N, 3) in the views that show them beside the mesh; gray
-    where none does."""
+    """Mean color (N, 3) in 0…1 of points (N, 3) in the views in which they lie within the masks (H,
+    W) bool; gray where there is none."""
     total = np.zeros((len(points), 3))
     count = np.zeros(len(points))
-    for view in views:
+    for view, mask in zip(views, masks, strict=True):
         x, y, inside = pixels_of(points, view.camera)
-        shown = np.flatnonzero(inside & ~_silhouette(mesh, faces, view.camera)[y, x])
+        shown = np.flatnonzero(inside & mask[y, x])
         total[shown] += read_image(view)[y[shown], x[shown]] / 255
         count[shown] += 1
     mean = total / np.maximum(count, 1)[:, None]

@@ -106,7 +106,7 @@ class Region(IntEnum):
     """Regions of a head's triangles, by their numbers in REGIONS_FILE."""
 
     OTHER = 0
-    """Forehead and temples; all triangles where regions are not known."""
+    """Forehead, temples and the edge of the face; all triangles where regions are not known."""
     FACE = 1
     """What is between brows and neck, ahead of the ears, but for MOUTH."""
     MOUTH = 2
