@@ -15,7 +15,6 @@ from scipy.spatial.transform import Rotation
 from stga_addon.avatar.embedding import face_frames, to_world
 from stga_addon.avatar.splats import SH_C0
 from stga_addon.capture.camera import look_at
-from stga_addon.capture.images import read_image
 from stga_addon.capture.model import Capture, View
 from stga_addon.flame.forward import neutral_frame
 from stga_addon.flame.model import torso_faces
@@ -127,7 +126,7 @@ def test_points_stand_on_the_balls_surface(beside, convention):
 
 def test_points_are_unbound_colored_and_embedded_in_the_nearest_triangle(beside):
     """Catches limits that pull hair onto the skin or a far face, captures without masks, and points
-    that begin gray: previews would show wings around the head."""
+    of many cameras that begin gray."""
     points = visual_hull_points(beside, beside.views["train"], "stga", 2)
     assert points.unbound.all()
     assert points.sh.shape == (len(points), 9, 3)
@@ -289,7 +288,6 @@ def test_a_single_camera_gets_a_layer_as_deep_as_the_mesh(beside, convention):
     assert len(wanted) > 50
     assert norm(wanted[:, None] + 0.5 - pixels[None], axis=2).min(axis=1).max() < 1.5 * step
     assert world.unbound.all()
-    assert_allclose(world.sh[:, 0] * SH_C0 + 0.5, read_image(view)[rows, columns] / 255, atol=1e-5)
     assert_allclose(np.exp(world.log_scale), VOXEL_SIZE_M / 2, rtol=1e-5)
 
 

@@ -290,10 +290,10 @@ def flat_points(
     _, face = _followed(capture, view.timestep, points, torso)
     frames = face_frames(mesh, capture.faces, capture.neutral, convention)
     splats = _new_splats(points, voxel, sh_degree)
-    splats.sh[:, 0] = (read_image(view)[pixel][beside] / 255 - 0.5) / SH_C0
     if neck is None:
         return to_local(splats, frames, face)
     cut = ~pixels_of(points, camera)[2]
+    splats.sh[cut, 0] = (read_image(view)[pixel][beside][cut] / 255 - 0.5) / SH_C0
     splats.log_scale[cut] = np.log(voxel)
     splats.opacity[cut] = CONTINUED_OPACITY
     below = below_neck(neck, view.timestep, points)
