@@ -88,9 +88,9 @@ def regions_of(head: Capture) -> np.ndarray:
     away = np.linalg.norm(centers - centers[mouth].mean(0), axis=1) / at.unit
     lining = (away < LINING_REACH) & (at.level < LINING_LEVEL) & ~Surface(head).outside
     in_front = (angle < NECK_ANGLE_DEG) & (at.level > CHIN_LEVEL)
-    # a triangle belongs to the last of the regions that it lies in
     under_hair = hairy & (at.level > np.interp(angle, HAIRLINE_DEG, LONG_HAIRLINE))
     under_hair &= (side < LONG_HAIR_SIDE) | (at.level > JAW_LEVEL)
+    # a triangle belongs to the last of the regions that it lies in
     lies_in = {
         Region.FACE: in_front & (at.level < BROWS_LEVEL),
         Region.BODY: beside & (at.level < np.interp(angle, JAW_DEG, JAW)),

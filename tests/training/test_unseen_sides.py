@@ -344,13 +344,14 @@ def with_long_hair(capture, end=-0.15):
     return capture
 
 
-def test_long_hair_hangs_straight_down(bundled, tmp_path):
+@pytest.mark.parametrize("convention", ["stga", "gaussian_avatars"])
+def test_long_hair_hangs_straight_down(convention, bundled, tmp_path):
     """Catches long hair that follows the neck as a helmet's rim does, that ends inside of what the
     image shows or outside of it, and gaps in it."""
     capture = with_long_hair(filmed(bundled, painted(bundled), (0,), 0.0, tmp_path))
-    frames = FrameStore(capture, "stga")
+    frames = FrameStore(capture, convention)
     frames.surface.hair_height = np.where(frames.surface.kinds["scalp"], 0.02, 0)
-    layer = hidden_splats(frames, quick_settings(sh_degree=0))
+    layer = hidden_splats(frames, quick_settings(convention=convention, sh_degree=0))
     hair = layer.rows(frames.sides.is_hair[layer.face])
     x, y, z = to_world(hair, frames.neutral).xyz.T
     occiput = z[(y > 0) & (y < 0.06)].min()
@@ -380,7 +381,7 @@ def test_a_bob_ends_above_the_shoulders(bundled, tmp_path):
 
 
 def test_long_hair_beside_the_neck_is_as_deep_as_the_ears(bundled, tmp_path):
-    """Catches hair that, from aside, is torn: as deep as the jaw above, and as the shoulders
+    """Catches hair that is torn in off-axis views: as deep as the jaw above, and as the shoulders
     below."""
     capture = with_long_hair(filmed(bundled, painted(bundled), (0,), 0.0, tmp_path))
     (view,) = capture.views["train"]

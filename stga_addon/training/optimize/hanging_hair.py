@@ -57,8 +57,8 @@ class HangingHair:
 
 
 def hanging_hair(surface: Surface, at: HeadCoordinates, layer: np.ndarray) -> HangingHair:
-    """As wide as masks show it, and falling straight down from where its layer, points (N, 3) above
-    the neutral head's scalp, reaches farthest back."""
+    """The outline of a head's long hair: it is as wide as masks show it, and falls straight down
+    from where its layer, points (N, 3) above the neutral head's scalp, reaches farthest back."""
     levels = np.arange(LOWEST_LEVEL, HIGHEST_LEVEL + LEVEL_STEP / 2, LEVEL_STEP)
     widths = np.clip(surface.widths(levels) - EDGE_INSET, WIDTHS[0], WIDEST)
     _, up, ahead = at.axes

@@ -80,7 +80,8 @@ def initial_splats(
     capture: Capture, settings: TrainingSettings, has_long_hair: bool = False
 ) -> Splats:
     """The lattice on the neutral mesh and, if the settings say so, visual-hull points of the first
-    training timestep (`flat_points` where a single camera shows it, which may be of long hair)."""
+    training timestep (`flat_points` where a single camera shows it). has_long_hair: as `Surface`
+    finds it."""
     convention = settings.convention
     degree = settings.sh_degree
     views = capture.views["train"]

@@ -412,13 +412,13 @@ class Surface:
     def widths(self, levels: np.ndarray) -> np.ndarray:
         """Distance (2, L) from the middle plane at which masks end to the right and to the left of
         the ears, at these heights over the eyes (L,); all in distances of the eyes from the mouth.
-        At most WIDTHS."""
+        The upper end of WIDTHS where no mask ends."""
         at = self.at
         assert at is not None
         across, up, ahead = at.axes
         tried = np.arange(*WIDTHS, WIDTH_STEP)
-        aside = np.multiply.outer([-1, 1], np.outer(tried, across))
-        points = aside[:, None] + levels[:, None, None] * up - EYES_TO_MIDDLE * ahead
+        sideways = np.multiply.outer([-1, 1], np.outer(tried, across))
+        points = sideways[:, None] + levels[:, None, None] * up - EYES_TO_MIDDLE * ahead
         points = at.eyes + at.unit * points.reshape(-1, 3)
         scalp = np.flatnonzero(self.regions.within(Region.SCALP))
         rows = scalp[nearest_rows(self.centers[scalp], points, 1)[:, 0]]
