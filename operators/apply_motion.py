@@ -84,9 +84,9 @@ TAKEN_OVER = ("strength", "stay_trained", "smoothing", "mirror")
 """Options of driving live that its takes are applied with; their sides are exchanged already."""
 
 
-def own_range(head: Any, own: FlameSequence) -> TrainedRange:
-    """Measure and store the range of the recording that a head was trained on, its own motion."""
-    trained = open_motion.trained_range([own.frame(timestep) for timestep in own.timesteps])
+def own_range(head: Any, motion: FlameSequence) -> TrainedRange:
+    """Measure and store the range of the motion that a head was trained on."""
+    trained = open_motion.trained_range([motion.frame(timestep) for timestep in motion.timesteps])
     rig_motion.store_range(head, trained)
     return trained
 
@@ -269,9 +269,9 @@ class ApplyMotion(Edit, bpy.types.Operator, FileImport, MotionProperties):
         self._report_range(beyond)
         tracked = None
         if self.own_offsets:  # what the head was imported from, and where its timesteps come to lie
-            own = own_motion(head)
-            first = own.timesteps[0]
-            tracked = own, [self.start + (each - first) / step for each in own.timesteps]
+            recorded = own_motion(head)
+            first = recorded.timesteps[0]
+            tracked = recorded, [self.start + (each - first) / step for each in recorded.timesteps]
         placement = self._placement(name, parts)
         rig_motion.apply_motion(head, frames, placement, tracked, warn=self.warn)
         return name, len(frames)
@@ -292,15 +292,15 @@ class ApplyMotion(Edit, bpy.types.Operator, FileImport, MotionProperties):
             self.warn(f"{path.name}: {performance.lost} rows are missing and were interpolated")
         rig = common.rig_or_shapes(head)
         if rig is not None and not (self.sliders and has_shapes(head)):
-            own = own_motion(head)
+            recorded = own_motion(head)
             trained = self._trained(head)
-            motion = open_motion.performed(performance, own, head.name, options, trained, rate)
+            motion = open_motion.performed(performance, recorded, head.name, options, trained, rate)
             frames = [motion.sequence.frame(timestep) for timestep in motion.sequence.timesteps]
             self._report_range(motion.outside)
             placement = self._placement(name, parts)
             rig_motion.apply_motion(head, frames, placement, warn=self.warn)
             return name, len(frames)
-        kept = {part: float(own in parts) for part, own in PART_OF_SHAPES.items()}
+        kept = {part: float(shape_part in parts) for part, shape_part in PART_OF_SHAPES.items()}
         performance = open_motion.prepared_performance(amplified(performance, kept), options, rate)
         weights = np.clip(performance.weights, *rig_motion.WEIGHT_RANGE)
         if rig is None:

@@ -348,12 +348,12 @@ class DriveLive(Action, bpy.types.Operator):
         pose = LivePose(head, common.rig_or_shapes(head))
         found = trained = None
         if pose.takes_frames:
-            own = own_motion(head)
+            motion = own_motion(head)
             show_progress(0.1)
-            found = head_map(own, head.name)
+            found = head_map(motion, head.name)
             check_sliders(head, found.expressions)
             show_progress(0.9)
-            trained = stored_range(head) or own_range(head, own)
+            trained = stored_range(head) or own_range(head, motion)
         receiver = sources.Receiver(source, settings.address, settings.port, settings.phone)
         stop_session()
         _session = LiveSession(Identity(context.scene), pose, found, trained, receiver)

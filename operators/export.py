@@ -294,11 +294,13 @@ class ExportSplats(SplatExport, bpy.types.Operator):
         playback = Playback(fps=frames_per_second(context.scene))
         format = SPLAT_FORMATS[self.format]
         count = len(scene_frames(context.scene))
-        for shown in context.scene.objects:
-            is_own = tags.is_splats(shown) and not shown.hide_render
-            if is_own and display_mode(shown) != NATIVE and later_modifiers(shown):
-                names = ", ".join(each.name for each in later_modifiers(shown))
-                self.warn(f"{shown.name}: exported without {names}; {NATIVE} are exported with it")
+        for scene_object in context.scene.objects:
+            is_own = tags.is_splats(scene_object) and not scene_object.hide_render
+            if is_own and display_mode(scene_object) != NATIVE and later_modifiers(scene_object):
+                names = ", ".join(each.name for each in later_modifiers(scene_object))
+                self.warn(
+                    f"{scene_object.name}: exported without {names}; {NATIVE} are exported with it"
+                )
 
         def read() -> Splats:
             depsgraph = bpy.context.evaluated_depsgraph_get()

@@ -380,13 +380,15 @@ class OpenDemo(HeadImport, bpy.types.Operator):
 
     def run(self, context: Any) -> None:
         # in Blender's folder for user files, where an update of the add-on leaves it in place
-        own = Path(bpy.utils.extension_path_user(package(), path="demo", create=True)) / "capture"
+        folder = (
+            Path(bpy.utils.extension_path_user(package(), path="demo", create=True)) / "capture"
+        )
         try:
-            shutil.copytree(DEMO, own, dirs_exist_ok=True)
+            shutil.copytree(DEMO, folder, dirs_exist_ok=True)
         except (OSError, shutil.Error) as error:
             problem = getattr(error, "strerror", None) or error
-            raise StgaError(f"{own}: cannot be written ({problem})") from error
-        self.bring_in(context, own, set_up_scene=None)
+            raise StgaError(f"{folder}: cannot be written ({problem})") from error
+        self.bring_in(context, folder, set_up_scene=None)
         runs = Path.home() / "STGA Demo"
         names = ("run", *(f"run {number}" for number in range(2, 1000)))
         free = next(runs / name for name in names if not has_run(runs / name))
@@ -395,7 +397,7 @@ class OpenDemo(HeadImport, bpy.types.Operator):
         settings.minutes = DEMO_MINUTES
         settings.shot_run = ""
         if self.shot:
-            write_performance(own.with_name(SPEECH_FILE), demo_speech())
+            write_performance(folder.with_name(SPEECH_FILE), demo_speech())
             settings.shot_run = str(free.resolve())
             settings.show_result = True
             call(bpy.ops.stga.train, directory=str(free), iterations=SHOT_ITERATIONS)

@@ -247,9 +247,9 @@ def handle(scene: Any, kind: Kind, event: states.Event) -> RequestState:
 def _carry_out(scene: Any, state: RequestState, effect: states.Effect) -> states.Event | None:
     match effect:
         case states.Store(subject, result_shown):
-            path, shown = PLACES[state.kind]
+            path, flag = PLACES[state.kind]
             setattr(scene.stga, path, str(subject or ""))
-            setattr(scene.stga, shown, result_shown)
+            setattr(scene.stga, flag, result_shown)
             if subject is None:
                 record_head(scene, state.kind, None)
             store_head(scene, state.kind)

@@ -113,8 +113,8 @@ def _after_append(imported: Any) -> None:
         if thing is None or tags.KIND not in thing:
             continue
         if isinstance(thing, bpy.types.Collection):  # of bones or cameras
-            for shown in layers_with(thing, layer):
-                shown.hide_viewport = True
+            for layer_collection in layers_with(thing, layer):
+                layer_collection.hide_viewport = True
         elif tags.WORLD in thing:
             hide_in_layers(thing, scene)
         elif tags.CONVENTION in thing:
@@ -155,12 +155,12 @@ def _choose_head() -> None:
     for scene in own_scenes():
         settings = scene.stga
         heads = tags.heads_of(scene)
-        shown = list(filter(tags.is_splats, scene.objects))
+        splats = list(filter(tags.is_splats, scene.objects))
         if settings.head is None and len(heads) == 1:
             settings.head = heads[0]
             show_panel()
-            if settings.splats is None and len(shown) == 1:
-                settings.splats = shown[0]
+            if settings.splats is None and len(splats) == 1:
+                settings.splats = splats[0]
         for head in heads:
             avatar = stored_path(head, tags.AVATAR)
             folder = os.path.dirname(avatar)

@@ -47,8 +47,8 @@ def path(
 
 def file_filter(*suffixes: str) -> Any:
     """The files that a file browser shows."""
-    shown = ";".join(f"*{suffix}" for suffix in suffixes)
-    return bpy.props.StringProperty(default=shown, options={"HIDDEN"})
+    patterns = ";".join(f"*{suffix}" for suffix in suffixes)
+    return bpy.props.StringProperty(default=patterns, options={"HIDDEN"})
 
 
 def flame() -> Any:

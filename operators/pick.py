@@ -47,11 +47,13 @@ def avatar_at(context: Any, at: np.ndarray) -> Any:
     """What moves the nearest avatar that is shown at a point of the region, pixels; None where
     there is none, or a mesh in front of it."""
     layer = context.view_layer
-    shown = [each for each in layer.objects if each.get(tags.KIND) in PARTS and each.visible_get()]
+    visible = [
+        each for each in layer.objects if each.get(tags.KIND) in PARTS and each.visible_get()
+    ]
     origin = region_2d_to_origin_3d(context.region, context.region_data, at)
     ray = region_2d_to_vector_3d(context.region, context.region_data, at)
     found: list[tuple[float, Any]] = []
-    for part in shown:
+    for part in visible:
         distance = _distance(context, part, at, origin)
         if distance is not None:
             found.append((distance, mover_of(part)))

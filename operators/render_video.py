@@ -186,13 +186,15 @@ class RenderVideo(Stepwise, bpy.types.Operator, FileExport):
                 images = _images(view, frames, cameras)
                 for number in range(len(frames)):
                     yield from _while_rendering(status, number / len(frames), output)
-                    layers, seen, is_new = next(images)
+                    layers, camera_view, is_new = next(images)
                     if drawn is not None:
-                        drawn.add(layers, seen)
+                        drawn.add(layers, camera_view)
                     else:
                         if is_new or any(layer.relit for layer in layers):
-                            posed = [layer.posed(seen.camera.position) for layer in layers]
-                        recorder.add([in_range(each, seen) for each in posed], seen.camera)
+                            posed = [layer.posed(camera_view.camera.position) for layer in layers]
+                        recorder.add(
+                            [in_range(each, camera_view) for each in posed], camera_view.camera
+                        )
                     fraction = (number + 1) / len(frames)
                     if status.report(Progress(fraction, "Recording", figures=lambda: left)):
                         raise Cancelled(f"{output}: cancelled")
@@ -235,9 +237,9 @@ def _images(
                 layers = all_layers(bpy.context.evaluated_depsgraph_get(), cache)
             depsgraph = bpy.context.evaluated_depsgraph_get()
             camera = cameras[number] if cameras else scene_camera(depsgraph)
-            seen = engine.camera_view(camera, scene.camera.evaluated_get(depsgraph))
+            camera_view = engine.camera_view(camera, scene.camera.evaluated_get(depsgraph))
         before = frame
-        yield layers, seen, is_new
+        yield layers, camera_view, is_new
 
 
 def _dismiss(scene: Identity) -> None:

@@ -67,9 +67,9 @@ def start(
     last = monitor.inspect_status(folder)
     if last.state.failed:
         print(failure_report(folder, last), file=sys.stderr)
-    shown = monitor.finish(scene, kind)
-    if last.state.failed or shown.error:
-        raise StgaError(shown.error or last.status.error)
+    finished = monitor.finish(scene, kind)
+    if last.state.failed or finished.error:
+        raise StgaError(finished.error or last.status.error)
     if (
         last.state == WorkerState.CANCELLED and kind not in table.TRAINS
     ):  # which keep the avatar so far

@@ -158,11 +158,11 @@ def shown_splats(scene: Any, head: Any) -> Any:
     return scene.stga.splats if scene.stga.splats in found else next(iter(found), None)
 
 
-def check_replaceable(scene: Any, head: Any, shown: Any) -> None:
+def check_replaceable(scene: Any, head: Any, splats: Any) -> None:
     """Raise StgaError where an avatar cannot take the place of what `shown_splats` found, None:
     nothing that can be changed."""
-    if shown is not None:
-        splat_object.check_own_data(shown)
+    if splats is not None:
+        splat_object.check_own_data(splats)
     elif splat_object.splats_of(head, scene, linked=True):
         raise StgaError(f"{head.name}: shows an avatar already, and {LINKED}")
 
@@ -172,10 +172,10 @@ def follow_head(settings: Any) -> None:
     the scene's, or a new one beside that of another head."""
     scene = settings.id_data
     head = settings.head
-    shown = shown_splats(scene, head)
+    splats = shown_splats(scene, head)
     others = [thing for thing in tags.heads_of(scene) if thing != head]
-    if shown is not None or (head is not None and others):
-        settings.splats = shown
+    if splats is not None or (head is not None and others):
+        settings.splats = splats
     if owner_of(scene, head) == head and tags.RUN not in head:
         _begin_record(scene, head, others)
     look_for_run(settings)
@@ -198,10 +198,10 @@ DEFAULT_RUN = "//stga_run"
 def panel_path(settings: Any, tag: str) -> str:
     """A path of the panel's head (`record`), or of the scene without one, as the panel shows it."""
     head = settings.head
-    own = stored_path(owner_of(settings.id_data, head), tag)
-    if not own and is_head(head):  # a linked one
-        own = stored_path(head, tag)
-    return displayed_path(own or (DEFAULT_RUN if tag == tags.RUN else ""))
+    path = stored_path(owner_of(settings.id_data, head), tag)
+    if not path and is_head(head):  # a linked one
+        path = stored_path(head, tag)
+    return displayed_path(path or (DEFAULT_RUN if tag == tags.RUN else ""))
 
 
 def store_panel_path(settings: Any, tag: str, value: str) -> None:
@@ -255,38 +255,38 @@ def _show_avatar(scene: Any, state: RequestState) -> Answer:
     if head is None:
         gone = "the head that it was trained for is no longer in the scene"
         raise StgaError(f"{run}: {gone}; choose a head, then Show Avatar")
-    shown = shown_splats(scene, head)
+    splats = shown_splats(scene, head)
     worn = Path(_absolute(owner_of(scene, head), tags.AVATAR))
-    is_other = shown is not None and worn.is_file() and worn.parent != run
+    is_other = splats is not None and worn.is_file() and worn.parent != run
     if is_other and _is_immature(state):
         if not is_result:
             return Shown()
         count = f"{state.snapshot.status.figures.get('iteration', 0):.0f} iterations"
         shows = f"{head.name} keeps the avatar that it has; Show Avatar shows the new one"
         raise StgaError(f"{run}: was cancelled after {count}, so {shows}")
-    check_replaceable(scene, head, shown)
+    check_replaceable(scene, head, splats)
     avatar, attributes = loading.result()
     splat_object.check_head(avatar, head)
-    is_update = shown is not None and splat_object.can_update(shown, avatar)
+    is_update = splats is not None and splat_object.can_update(splats, avatar)
     if not is_update and splat_object.build_next_node_group(avatar):
         return SliceBuilt()
     del _loading[scene.session_uid]
     if is_update:
-        splat_object.update_splats(shown, attributes)
+        splat_object.update_splats(splats, attributes)
     else:
-        is_new = shown is None
+        is_new = splats is None
         name = f"{head.name} {run.name}"
-        shown = splat_object.show_avatar(avatar, head, name, attributes, shown, scene)
+        splats = splat_object.show_avatar(avatar, head, name, attributes, splats, scene)
         if is_new:
             splat_object.hide_object(head, scene)
     if is_result:
         store_path(owner_of(scene, head), tags.AVATAR, str(state.loading_path))
         is_first = head.get(tags.TRACKED) and not head.get(tags.SHOWN_UNSEEN)
-        if is_first and splat_object.is_partly_filmed(shown):
+        if is_first and splat_object.is_partly_filmed(splats):
             head[tags.SHOWN_UNSEEN] = True
-            splat_object.set_input(shown, splat_nodes.SHOW_UNSEEN, True)
+            splat_object.set_input(splats, splat_nodes.SHOW_UNSEEN, True)
     if scene.stga.head == head:
-        scene.stga.splats = shown
+        scene.stga.splats = splats
     show_world(run / AVATAR, head, scene)
     return Shown(undoable=not is_update)
 
@@ -340,9 +340,9 @@ def _in_panel(scene: Any, head: Any) -> Iterator[None]:
 
 def _store_added(scene: Any, state: RequestState) -> Answer:
     """Give the scene's splats what is now in the avatar of the run."""
-    shown = shown_splats(scene, request_head(scene, state))
+    splats = shown_splats(scene, request_head(scene, state))
     path = state.subject_path / AVATAR
-    if shown is None or not ADDS[state.kind](shown, read_avatar(path)):
+    if splats is None or not ADDS[state.kind](splats, read_avatar(path)):
         problem = "its avatar is not the one that the scene shows; show it again"
         raise StgaError(f"{state.subject}: {problem}")
     return Shown(undoable=True)

@@ -132,8 +132,8 @@ class HeatMap(Edit, bpy.types.Operator):
         elif self.of == "RESIDUAL":
             folder = file_path(self.directory, "run folder")
             residual = np.nan_to_num(read_residuals(folder, len(head.data.polygons)))
-            seen = residual[residual > 0]
-            largest = float(np.quantile(seen, LARGEST_RESIDUAL_QUANTILE)) if seen.size else 1.0
+            errors = residual[residual > 0]
+            largest = float(np.quantile(errors, LARGEST_RESIDUAL_QUANTILE)) if errors.size else 1.0
             groups.show_heat_map(head, residual, groups.RESIDUAL, largest)
             self.inform(f"Red: a mean error of {100 * largest:.1f} % of full brightness or more")
         else:
@@ -160,11 +160,11 @@ def possible_regions(head: Any) -> list[str]:
     names = [name for name in head.data.attributes.keys() if name.startswith(tags.REGION_PREFIX)]  # noqa: SIM118
     rigs = [each.object for each in head.modifiers if each.type == "ARMATURE" and each.object]
     bones = {bone.name for rig in rigs for bone in rig.data.bones}
-    own = [name.removeprefix(tags.REGION_PREFIX) for name in names]
+    found = [name.removeprefix(tags.REGION_PREFIX) for name in names]
     for group in head.vertex_groups:
         if tags.group_timestep(group.name) is None and group.name not in bones:
-            own.append(group.name)
-    return list(dict.fromkeys(own))
+            found.append(group.name)
+    return list(dict.fromkeys(found))
 
 
 def key_regions(head: Any) -> list[str]:

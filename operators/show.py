@@ -60,11 +60,11 @@ class ShowAvatar(Edit, bpy.types.Operator, FileImport):
         before = shown_splats(context.scene, head)
         check_replaceable(context.scene, head, before)
         name = f"{head.name} {path.stem}"
-        shown = splat_object.show_avatar(avatar, head, name, replaced=before)
-        shown.hide_viewport = False
-        if before is not None and context.view_layer.objects.get(shown.name) is shown:
-            shown.hide_set(False)
-        settings.splats = shown
+        splats = splat_object.show_avatar(avatar, head, name, replaced=before)
+        splats.hide_viewport = False
+        if before is not None and context.view_layer.objects.get(splats.name) is splats:
+            splats.hide_set(False)
+        settings.splats = splats
         if self.hide_head:
             splat_object.hide_object(head, context.scene)
         show_world(path, head, context.scene)
@@ -95,8 +95,8 @@ class ImportPly(Edit, bpy.types.Operator, FileImport):
     def run(self, context: Any) -> None:
         path = file_path(self.filepath, "splat")
         splats = read_splats(path, self.warn)
-        shown = context.scene.stga.splats = splat_object.show_world_splats(splats, path.stem)
-        shown.rotation_euler = (radians(UP_ROTATION_DEG[self.up]), 0.0, 0.0)
+        world_splats = context.scene.stga.splats = splat_object.show_world_splats(splats, path.stem)
+        world_splats.rotation_euler = (radians(UP_ROTATION_DEG[self.up]), 0.0, 0.0)
         self.inform(f"{len(splats)} splats")
 
 
@@ -136,8 +136,8 @@ def leaves_out_set(scene: Any) -> bool:
 
 def _own_as_trained(context: Any) -> list[Any]:
     """The splat objects displayed as trained, whose display can be changed: no linked ones."""
-    own = [thing for thing in context.view_layer.objects if thing.library is None]
-    return [thing for thing in own if is_shown_as_trained(thing)]
+    local = [thing for thing in context.view_layer.objects if thing.library is None]
+    return [thing for thing in local if is_shown_as_trained(thing)]
 
 
 PREVIEW_SAMPLES = 4

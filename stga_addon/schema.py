@@ -98,8 +98,8 @@ def _with_path(hint: Any, value: Any) -> Any:
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         hints = type_hints(type(value))
         found = {spec.name: getattr(value, spec.name) for spec in dataclasses.fields(value)}
-        paths = {name: _with_path(hints[name], own) for name, own in found.items()}
-        changed = {name: own for name, own in paths.items() if own is not found[name]}
+        paths = {name: _with_path(hints[name], entry) for name, entry in found.items()}
+        changed = {name: entry for name, entry in paths.items() if entry is not found[name]}
         return dataclasses.replace(value, **changed) if changed else value
     if tuple[Path, ...] in kinds and isinstance(value, (tuple, list)):
         return tuple(_with_path(Path, item) for item in value)

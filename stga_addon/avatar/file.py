@@ -168,9 +168,9 @@ class Avatar:
         """Those of a file, by name, but for regions and light."""
         optional = {name: getattr(self, name) for name in _OPTIONAL_ARRAYS}
         given = {name: array for name, array in optional.items() if array is not None}
-        own = {name: getattr(self.splats, name) for name in ARRAYS}
+        splats = {name: getattr(self.splats, name) for name in ARRAYS}
         mesh = {"neutral": self.neutral, "faces": self.faces}
-        return {**own, **mesh, **given, **self.driven_offsets}
+        return {**splats, **mesh, **given, **self.driven_offsets}
 
     @property
     def follows_strain(self) -> bool:

@@ -217,18 +217,21 @@ def seen_range(basis: StrainBasis, meshes: Iterable[np.ndarray]) -> np.ndarray:
     It includes the neutral mesh, and stays within that of the basis. What is fitted to a few
     expressions is not extrapolated to stronger ones.
     """
-    seen = range_with_margin(at_rest(basis.range), (deformation(basis, mesh) for mesh in meshes))
-    return np.clip(seen, basis.range[:, :1], basis.range[:, 1:]).astype(np.float32)
+    limits = range_with_margin(at_rest(basis.range), (deformation(basis, mesh) for mesh in meshes))
+    return np.clip(limits, basis.range[:, :1], basis.range[:, 1:]).astype(np.float32)
 
 
 def range_with_margin(rest: np.ndarray, values: Iterable[np.ndarray]) -> np.ndarray:
     """Lowest and highest (F, 2, D) of rest (F, D) and of values (F, D) that are RANGE_MARGIN times
     as far from it."""
-    seen = np.stack([rest, rest], axis=1)
+    limits = np.stack([rest, rest], axis=1)
     for value in values:
         wider = rest + np.float32(RANGE_MARGIN) * (value - rest)
-        seen[:, 0], seen[:, 1] = np.minimum(seen[:, 0], wider), np.maximum(seen[:, 1], wider)
-    return np.asarray(seen)
+        limits[:, 0], limits[:, 1] = (
+            np.minimum(limits[:, 0], wider),
+            np.maximum(limits[:, 1], wider),
+        )
+    return np.asarray(limits)
 
 
 def deformation(basis: StrainBasis, vertices: np.ndarray) -> np.ndarray:

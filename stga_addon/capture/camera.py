@@ -210,13 +210,13 @@ def covered_angles(
     arms = np.array([camera.position for camera in (start, *cameras)]) - center
     first = arms[0] - arms[0] @ axis * axis
     azimuths = np.arctan2(arms[1:] @ np.cross(axis, first), arms[1:] @ first)
-    seen = np.sort(np.append(azimuths, 0.0))
-    gaps = np.diff(np.append(seen, seen[0] + 2 * np.pi))
+    angles = np.sort(np.append(azimuths, 0.0))
+    gaps = np.diff(np.append(angles, angles[0] + 2 * np.pi))
     if gaps.max() < MAX_GAP_RAD:
         return -np.pi, np.pi
     widest = int(gaps.argmax())
-    low = seen[(widest + 1) % len(seen)]
-    high = seen[widest]
+    low = angles[(widest + 1) % len(angles)]
+    high = angles[widest]
     return (low - 2 * np.pi if low > 0 else low), (high + 2 * np.pi if high < 0 else high)
 
 

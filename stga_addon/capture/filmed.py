@@ -72,9 +72,9 @@ class Filmed:
     @property
     def next_take(self) -> str:
         """What to film next, in a sentence; "" where nothing is missing."""
-        seen = {cell % SECTORS for cell in self.cells}
+        sectors = {cell % SECTORS for cell in self.cells}
         wanted = range(-SIDE_DEG // SECTOR_DEG, SIDE_DEG // SECTOR_DEG + 1)
-        missing = [sector * SECTOR_DEG for sector in wanted if sector % SECTORS not in seen]
+        missing = [sector * SECTOR_DEG for sector in wanted if sector % SECTORS not in sectors]
         if len(self.directions) and missing:
             ends = {"right": min(missing) < 0, "left": max(missing) > 0}
             where = " and ".join(side for side, is_missing in ends.items() if is_missing)

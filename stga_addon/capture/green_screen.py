@@ -30,7 +30,7 @@ def without_spill(image: np.ndarray, mask: np.ndarray) -> np.ndarray:
     distance = cv2.distanceTransform(whole, cv2.DIST_L2, 3)
     fraction = np.clip(2 - 2 / (SPILL_REACH_FRACTION * len(image)) * distance, 0, 1)
     channels = list(cv2.split(image))
-    others = [own for number, own in enumerate(channels) if number != key]
+    others = [channel for number, channel in enumerate(channels) if number != key]
     excess = cv2.bitwise_and(cv2.subtract(channels[key], cv2.max(*others)), whole)
     channels[key] = cv2.subtract(channels[key], (fraction * excess).astype(np.uint8))
     return np.asarray(cv2.merge(channels))

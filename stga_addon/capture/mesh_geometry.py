@@ -52,8 +52,8 @@ def pixels_of(points: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarra
     where they are not."""
     pixels, depth = camera.project(points)
     x, y = np.floor(pixels).T
-    seen = (depth > MIN_DEPTH_M) & (x >= 0) & (x < camera.width) & (y >= 0) & (y < camera.height)
-    return np.where(seen, x, 0).astype(int), np.where(seen, y, 0).astype(int), seen
+    inside = (depth > MIN_DEPTH_M) & (x >= 0) & (x < camera.width) & (y >= 0) & (y < camera.height)
+    return np.where(inside, x, 0).astype(int), np.where(inside, y, 0).astype(int), inside
 
 
 def connected_parts(vertices: int, faces: np.ndarray) -> np.ndarray:
@@ -203,12 +203,12 @@ def rasterize(vertices: np.ndarray, faces: np.ndarray, camera: Camera) -> ArrayP
         # of several triangles at one depth, the last
         wins = (closeness > 0) & (closeness == nearest[pixel])
         owner[pixel[wins]] = face[wins]
-    shown = np.flatnonzero(owner >= 0)
+    covered = np.flatnonzero(owner >= 0)
     triangle = np.full(len(nearest), -1, np.int32)
     weights = np.zeros((len(nearest), 3))
-    triangle[shown] = rows[owner[shown]]
-    y, x = np.divmod(shown, camera.width)
-    weights[shown] = np.maximum(_at(slopes[owner[shown]], x[:, None], y[:, None]), 0)
+    triangle[covered] = rows[owner[covered]]
+    y, x = np.divmod(covered, camera.width)
+    weights[covered] = np.maximum(_at(slopes[owner[covered]], x[:, None], y[:, None]), 0)
     shape = camera.height, camera.width
     return triangle.reshape(shape), weights.reshape(*shape, 3)
 

@@ -53,7 +53,7 @@ def read_mesh(path: Path) -> Mesh:
 def checked_mesh(path: Path, vertices: np.ndarray, faces: np.ndarray) -> Mesh:
     """A mesh of the arrays, as float64 and int32. Raises StgaError as `read_mesh` does, if they are
     not a valid triangle mesh."""
-    triples = all(own.ndim == 2 and own.shape[1] == 3 for own in (vertices, faces))
+    triples = all(array.ndim == 2 and array.shape[1] == 3 for array in (vertices, faces))
     if not triples or not len(faces):
         raise StgaError(
             f"{path}: holds no triangles; expected vertices with three coordinates, and triangles"
@@ -220,7 +220,7 @@ def _parse_ply(path: Path, data: bytes) -> Mesh:
     if vertices is None or not {"x", "y", "z"} <= set(names):
         raise StgaError(f"{path}: has no vertices with x, y and z")
     lists = {} if faces is None else faces.lists
-    corners = next((own for name, own in lists.items() if name in PLY_CORNERS), None)
+    corners = next((indices for name, indices in lists.items() if name in PLY_CORNERS), None)
     if corners is None:
         kind = "triangle strips" if "tristrips" in rows else "no polygons"
         raise StgaError(f"{path}: holds {kind}; expected faces with vertex_indices")

@@ -131,7 +131,7 @@ def cameras_at_once(views: Iterable[View]) -> int:
     """Most cameras that show one timestep. A phone is one also where it took several takes, from
     other places: they do not show together how far away anything is."""
     together = views_by_timestep(views).values()
-    return max((len(views_by_camera(shown)) for shown in together), default=0)
+    return max((len(views_by_camera(simultaneous)) for simultaneous in together), default=0)
 
 
 def parts_of(timesteps: Sequence[int], limit: int) -> list[list[int]]:
@@ -158,7 +158,9 @@ def summarize_capture(capture: Capture) -> list[tuple[str, str]]:
         ("splits", "; ".join(splits)),
     ]
     bare = [("cameras", "none: can be imported and animated, not trained on")]
-    regions = [f"{name} {int(np.count_nonzero(own))}" for name, own in capture.regions.items()]
+    regions = [
+        f"{name} {int(np.count_nonzero(region))}" for name, region in capture.regions.items()
+    ]
     lines = [("folder", str(capture.root)), ("layout", capture.layout)]
     lines += [*(recorded if views else bare), ("timesteps", format_ranges(capture.timesteps))]
     if capture.fps is not None:
@@ -174,9 +176,9 @@ def summarize_capture(capture: Capture) -> list[tuple[str, str]]:
     if capture.flame is not None:
         first = capture.flame.frame(capture.flame.timesteps[0])
         offsets = (("static", capture.flame.static_offset), ("dynamic", first.dynamic_offset))
-        for name, own in offsets:
-            size = 0.0 if own is None else 1000 * float(np.linalg.norm(own, axis=1).max())
-            lines.append((f"{name} offset", "none" if own is None else f"up to {size:.1f} mm"))
+        for name, offset in offsets:
+            size = 0.0 if offset is None else 1000 * float(np.linalg.norm(offset, axis=1).max())
+            lines.append((f"{name} offset", "none" if offset is None else f"up to {size:.1f} mm"))
     return lines + [("warning", warning) for warning in capture.warnings]
 
 
@@ -298,9 +300,9 @@ def _renumbered(take: Capture, start: int, first: Capture, taken: set[int]) -> V
     if start == 0:
         return take.views
     poses = {view.camera_index: view.camera.world_to_camera for view in first.all_views}
-    own = views_by_camera(take.all_views)
+    cameras = views_by_camera(take.all_views)
     free = 1 + start + max(poses, default=-1)
-    if any(free + index in taken for index in own):
+    if any(free + index in taken for index in cameras):
         free = 1 + max(taken)
 
     def moved(view: View) -> View:

@@ -131,7 +131,7 @@ def open_capture(
     transforms, resized = in_image_size(transforms)
     distorted = distortion(transforms.frames)
     if distorted:
-        splits = {name: undistorted(own) for name, own in transforms.splits.items()}
+        splits = {name: undistorted(frames) for name, frames in transforms.splits.items()}
         transforms = replace(transforms, splits=splits)
     capture = _open_layout(root, transforms, flame)
     warnings = [*capture.warnings, *([resized] if resized else ())]
@@ -181,7 +181,7 @@ def is_capture(path: Path) -> bool:
     is_listed = is_folder(path / PARAMETERS) or bool(matching(path / "meshes", "mesh_*.json"))
     if tracked or is_listed or is_file(path / CANONICAL_NAME):
         return True
-    bare = any(own.suffix.lower() in meshes.MESH_SUFFIXES for own in matching(path, "[!.]*"))
+    bare = any(file.suffix.lower() in meshes.MESH_SUFFIXES for file in matching(path, "[!.]*"))
     return bare and not files and not is_gaussian_output(path)
 
 
@@ -218,7 +218,7 @@ def repair_capture(
 
 def _require_files(frames: Sequence[Frame]) -> None:
     """A missing file is reported now rather than an hour into the training."""
-    seen = set[Path | None]()
+    checked = set[Path | None]()
     for frame in frames:
         for key, file in (
             ("file_path", frame.view.image),
@@ -226,9 +226,9 @@ def _require_files(frames: Sequence[Frame]) -> None:
             ("mesh_path", frame.mesh),
             ("flame_param_path", frame.flame),
         ):
-            if file is not None and file not in seen and not is_file(file):
+            if file is not None and file not in checked and not is_file(file):
                 raise StgaError(f"{file}: does not exist, but {frame.where} names it as its {key}")
-            seen.add(file)
+            checked.add(file)
 
 
 def _open_layout(root: Path, transforms: Transforms, flame: Path | None) -> Capture:
@@ -263,8 +263,8 @@ def _principal_point_warning(
     apart = []
     outside = []
     for frame in frames:
-        own = frame.view.camera
-        cameras = [with_principal_point(own, frame.principal, name) for name in PRINCIPAL_POINTS]
+        given = frame.view.camera
+        cameras = [with_principal_point(given, frame.principal, name) for name in PRINCIPAL_POINTS]
         if (np.ptp([(camera.cx, camera.cy) for camera in cameras], axis=0) > 0.5).any():
             apart.append((frame.view, cameras))
     if not apart or find_spec("PIL") is None:
@@ -276,8 +276,8 @@ def _principal_point_warning(
             points = mesh(view.timestep)
             fractions = []
             for camera in cameras:
-                column, row, seen = pixels_of(points, camera)
-                fractions.append(1 - float((seen & (mask[row, column] > 127)).mean()))
+                column, row, inside = pixels_of(points, camera)
+                fractions.append(1 - float((inside & (mask[row, column] > 127)).mean()))
             outside.append(fractions)
     if not outside:
         return None

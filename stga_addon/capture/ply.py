@@ -94,20 +94,20 @@ def ply_header(path: Path, data: bytes) -> tuple[list[Element], str, int]:
     elements = dict[str, Element]()
     try:
         for line in start[: end.start()].decode("latin-1").splitlines():
-            own = elements[next(reversed(elements))] if elements else None
+            element = elements[next(reversed(elements))] if elements else None
             match line.split():
                 case ["format", name, _]:
                     order = _BYTE_ORDERS[name]
                 case ["element", name, count] if name not in elements and int(count) >= 0:
                     elements[name] = Element(name, int(count))
-                case ["property", kind, name] if own is not None and name not in own.order:
-                    own.scalars[name] = order + _TYPES[kind]
-                    own.order.append(name)
+                case ["property", kind, name] if element is not None and name not in element.order:
+                    element.scalars[name] = order + _TYPES[kind]
+                    element.order.append(name)
                 case ["property", "list", length, kind, name] if (
-                    own and name not in own.order and _TYPES[length][0] in "iu"
+                    element and name not in element.order and _TYPES[length][0] in "iu"
                 ):
-                    own.lists[name] = order + _TYPES[length], order + _TYPES[kind]
-                    own.order.append(name)
+                    element.lists[name] = order + _TYPES[length], order + _TYPES[kind]
+                    element.order.append(name)
                 case ["ply"] | ["comment" | "obj_info", *_] | []:
                     pass
                 case _:
@@ -222,8 +222,8 @@ def _gathered_rows(
         for name in element.order:
             if name in element.scalars:
                 kind = np.dtype(element.scalars[name])
-                own = raw[place[:, None] + np.arange(kind.itemsize)]
-                table[name][rows] = own.view(kind)[:, 0]
+                column = raw[place[:, None] + np.arange(kind.itemsize)]
+                table[name][rows] = column.view(kind)[:, 0]
                 place += kind.itemsize
                 continue
             place += np.dtype(element.lists[name][0]).itemsize
@@ -325,6 +325,6 @@ def _as_rows(
         if name in element.scalars:
             table[name] = converted(numbers, element.scalars[name])
         else:
-            own = converted(numbers, element.lists[name][1])
-            lists[name] = Lists(np.array(sizes, np.int64), own)
+            entries = converted(numbers, element.lists[name][1])
+            lists[name] = Lists(np.array(sizes, np.int64), entries)
     return Rows(table, lists)

@@ -187,15 +187,15 @@ def in_image_size(transforms: Transforms) -> tuple[Transforms, str | None]:
         principal = cx * found.width / camera.width, cy * found.height / camera.height
         return replace(frame, view=replace(frame.view, camera=found), principal=principal)
 
-    splits = {name: tuple(map(fitted, own)) for name, own in transforms.splits.items()}
+    splits = {name: tuple(map(fitted, members)) for name, members in transforms.splits.items()}
     return replace(transforms, splits=splits), next(iter(sentences), None)
 
 
 def _in_images(capture: Capture) -> float:
     """Fraction of the mesh that lies within the images of a few views."""
     views = evenly_spread(capture.all_views, MAX_MEASURED_VIEWS)
-    seen = [pixels_of(capture.mesh(view.timestep), view.camera)[2].mean() for view in views]
-    return float(np.mean(seen)) if seen else 0.0
+    fractions = [pixels_of(capture.mesh(view.timestep), view.camera)[2].mean() for view in views]
+    return float(np.mean(fractions)) if fractions else 0.0
 
 
 def find_repair(capture: Capture) -> tuple[str | None, str | None]:
@@ -205,17 +205,17 @@ def find_repair(capture: Capture) -> tuple[str | None, str | None]:
     if not views or find_spec("PIL") is None or find_spec("cv2") is None:
         return None, None
     try:
-        shown = [_Measured(capture, view) for view in views]
+        measured = [_Measured(capture, view) for view in views]
     except StgaError:  # what needs the file says so
         return None, None
-    has_masks = all(each.mask is not None for each in shown)
-    now, problem = _fit(shown, None, has_masks)
+    has_masks = all(each.mask is not None for each in measured)
+    now, problem = _fit(measured, None, has_masks)
     if problem is None:
         return None, None
     fits = {}
     for name, repair in REPAIRS.items():
         if has_masks or not repair.inverted:
-            fits[name] = _fit(shown, _resolved(capture, repair), has_masks)[0]
+            fits[name] = _fit(measured, _resolved(capture, repair), has_masks)[0]
     best = max(fits, key=lambda name: fits[name])
     least = max(MIN_FIT, MIN_BETTER * now) if has_masks else MIN_IN_IMAGES
     if fits[best] >= least:
@@ -243,13 +243,13 @@ class _Measured:
 
 
 def _fit(
-    shown: Sequence[_Measured], repair: Repair | None, has_masks: bool
+    measured: Sequence[_Measured], repair: Repair | None, has_masks: bool
 ) -> tuple[float, str | None]:
     """How well the mesh fits, 0 to 1, and what is wrong, None where nothing is."""
     scores = []
     beside = []
     within = []
-    for each in shown:
+    for each in measured:
         camera = (
             each.camera if repair is None or repair.camera is None else repair.camera(each.camera)
         )
@@ -305,7 +305,7 @@ def _changed(views: Views, repair: Repair, cameras: Callable[[Camera], Camera] |
         inverted = view.is_mask_inverted != repair.inverted
         return replace(view, camera=change(view.camera), is_mask_inverted=inverted)
 
-    return {split: tuple(map(changed, own)) for split, own in views.items()}
+    return {split: tuple(map(changed, members)) for split, members in views.items()}
 
 
 def _with_vertices(capture: Capture, matrix: np.ndarray) -> Capture:

@@ -156,7 +156,9 @@ class Transforms:
 
     @property
     def views(self) -> Views:
-        return {split: tuple(frame.view for frame in own) for split, own in self.splits.items()}
+        return {
+            split: tuple(frame.view for frame in frames) for split, frames in self.splits.items()
+        }
 
 
 def transforms_files(folder: Path) -> list[Path]:

@@ -84,8 +84,8 @@ def with_usable_views(capture: Capture) -> tuple[Capture, tuple[str, ...]]:
     if not failed:
         return capture, ()
     usable = {
-        split: tuple(view for view in own if view.image not in failed)
-        for split, own in capture.views.items()
+        split: tuple(view for view in members if view.image not in failed)
+        for split, members in capture.views.items()
     }
     warnings = []
     named = set[Path]()
@@ -93,10 +93,10 @@ def with_usable_views(capture: Capture) -> tuple[Capture, tuple[str, ...]]:
         files = found - named
         named |= found
         if files:
-            shown = [view for view in views if view.image in files]
-            count = f"{len(shown)} of {len(views)} images {why}"
+            unusable = [view for view in views if view.image in files]
+            count = f"{len(unusable)} of {len(views)} images {why}"
             left_out = "they are left out of training, tracking and scores"
-            warnings.append(f"{capture.root}: {count} ({_timesteps(shown)}); {left_out}")
+            warnings.append(f"{capture.root}: {count} ({_timesteps(unusable)}); {left_out}")
     return replace(capture, views=usable), tuple(warnings)
 
 
@@ -121,8 +121,8 @@ def _unusable(views: Sequence[View]) -> list[set[Path]]:
     """Images of views with each of PROBLEMS."""
     if len(views) > MAX_VIEWS_READ:
         certain = {view.image for view in evenly_spread(views, SAMPLED_VIEWS)}
-        for own in views_by_camera(views).values():
-            certain |= _suspects(own)
+        for camera_views in views_by_camera(views).values():
+            certain |= _suspects(camera_views)
         found = _found([view for view in views if view.image in certain])
         if not any(found):
             return found
@@ -134,8 +134,8 @@ def _found(views: Sequence[View]) -> list[set[Path]]:
         contents = dict(zip((view.image for view in views), pool.map(_content, views), strict=True))
     empty = set[Path]()
     full = set[Path]()
-    for own in views_by_camera(views).values():
-        known = {view.image: contents[view.image].coverage for view in own}
+    for camera_views in views_by_camera(views).values():
+        known = {view.image: contents[view.image].coverage for view in camera_views}
         covered = {path: fraction for path, fraction in known.items() if fraction is not None}
         median = statistics.median([fraction for fraction in covered.values() if fraction] or [0.0])
         least = max(MIN_COVERAGE, MIN_COVERAGE_FRACTION * median)

@@ -106,8 +106,8 @@ class ProgressBar(ExitStack[None]):
         self._bar.set_description(progress.stage, refresh=progress.stage != self._stage)
         self._stage = progress.stage
         figures = self._clock.reported(progress)
-        shown = [describe_left(figures), *describe_figures(figures), printable(progress.detail)]
-        self._bar.set_postfix_str("; ".join(filter(None, shown)), refresh=False)
+        parts = [describe_left(figures), *describe_figures(figures), printable(progress.detail)]
+        self._bar.set_postfix_str("; ".join(filter(None, parts)), refresh=False)
         self._bar.update(progress.fraction - self._bar.n)
         return False
 
@@ -410,7 +410,9 @@ def _info(options: Namespace, head: OpenHead | None) -> None:
         rows = [("path", str(path)), ("what", other.what), ("next", f"it {other.plan}")]
         if other.is_rendered:
             rows.insert(2, ("splats", str(len(read_splats(path)))))
-        rows += [("command" if n == 0 else "or", own) for n, own in enumerate(other.commands[:2])]
+        rows += [
+            ("command" if n == 0 else "or", command) for n, command in enumerate(other.commands[:2])
+        ]
         print(*format_table(rows), sep="\n")
         return
     request = Analyze(**given_options(options, Analyze))

@@ -226,9 +226,9 @@ def _thinned(
     faces = []
     count = 0
     for part, wanted in KEPT_TRIANGLES.items():
-        own = triangles[_within(part, triangles).all(axis=1)]
-        own = collapsed(vertices, own, detail, wanted)
-        used, within = np.unique(own, return_inverse=True)
+        part_triangles = triangles[_within(part, triangles).all(axis=1)]
+        part_triangles = collapsed(vertices, part_triangles, detail, wanted)
+        used, within = np.unique(part_triangles, return_inverse=True)
         kept.append(used)
         faces.append(within.reshape(-1, 3) + count)
         count += len(used)

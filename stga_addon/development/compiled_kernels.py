@@ -91,11 +91,11 @@ def _digest(wheels: Path) -> str:
 def _is_target(target: Target, wheels: Path) -> bool:
     """Whether this Python and its Numba are the target's."""
     try:
-        own = version("numba")
+        installed = version("numba")
     except PackageNotFoundError:
         return False
     return target.python == "{}.{}".format(*sys.version_info[:2]) and any(
-        wheels.glob(f"numba-{own}-*")
+        wheels.glob(f"numba-{installed}-*")
     )
 
 

@@ -96,9 +96,9 @@ def _camera(center: np.ndarray, azimuth_deg: float, elevation_deg: float) -> Cam
 def _filled(found: np.ndarray) -> np.ndarray:
     """Means (A, E, N, 2) over the people; a direction without a face in anyone's pictures has that
     of the next ones towards the front."""
-    seen = ~np.isnan(found)
-    mean = np.where(seen, found, 0).sum(0) / np.maximum(seen.sum(0), 1)
-    known = seen.any(axis=(0, 3, 4))
+    measured = ~np.isnan(found)
+    mean = np.where(measured, found, 0).sum(0) / np.maximum(measured.sum(0), 1)
+    known = measured.any(axis=(0, 3, 4))
     middle = len(AZIMUTHS_DEG) // 2, len(ELEVATIONS_DEG) // 2
     cells = [(row, column) for row in range(known.shape[0]) for column in range(known.shape[1])]
     for row, column in sorted(

@@ -109,13 +109,13 @@ class Target:
     def tags(self) -> frozenset[Tag]:
         """Tags of the wheels that run on the target."""
         version = tuple(int(part) for part in self.python.split("."))
-        own = cpython_tags(version, platforms=PLATFORM_TAGS[self.platform])
+        compiled = cpython_tags(version, platforms=PLATFORM_TAGS[self.platform])
         pure = (
             Tag(f"py{name}", "none", where)
             for name in ("3", self.python.replace(".", ""))
             for where in ("any", *PLATFORM_TAGS[self.platform])
         )
-        return frozenset((*own, *pure))
+        return frozenset((*compiled, *pure))
 
 
 TARGETS = tuple(
@@ -172,8 +172,8 @@ def check_wheels(wheels: Sequence[Path], target: Target) -> None:
     tags = target.tags()
     versions = {}
     for wheel in wheels:
-        name, version, _, own = parse_wheel_filename(wheel.name)
-        if not own & tags:
+        name, version, _, wheel_tags = parse_wheel_filename(wheel.name)
+        if not wheel_tags & tags:
             raise StgaError(
                 f"{wheel.name}: does not run on {target.platform} with Python {target.python}"
             )
@@ -258,9 +258,9 @@ def _locked(requirement: Requirement, target: Target) -> list[str]:
     tags = target.tags()
     found = []
     for wheel in locked_wheels():
-        name, version, _, own = parse_wheel_filename(wheel)
+        name, version, _, wheel_tags = parse_wheel_filename(wheel)
         fits = requirement.specifier.contains(version, prereleases=True)
-        if name == canonicalize_name(requirement.name) and fits and own & tags:
+        if name == canonicalize_name(requirement.name) and fits and wheel_tags & tags:
             found.append((version.local is None, wheel))
     if not found:
         raise StgaError(f"{target.name}: {LOCK.name} has no wheel of {requirement}")

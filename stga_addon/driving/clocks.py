@@ -441,7 +441,7 @@ def at_even_times(times: np.ndarray) -> tuple[np.ndarray, float]:
     typical = steps[steps <= LONG_STEP * np.median(steps)]
     mean = 1 / float(typical.mean())
     near = [rate for rate in RATES if abs(rate / mean - 1) < MAX_RATE_DIFFERENCE]
-    for rate in (*sorted(near, key=lambda own: abs(own - mean)), mean):
+    for rate in (*sorted(near, key=lambda standard: abs(standard - mean)), mean):
         rows = np.round(times * rate)
         if (np.diff(rows) > 0).all() and np.abs(times * rate - rows).max() < GRID_TOLERANCE:
             return rows / rate, rate

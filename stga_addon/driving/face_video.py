@@ -66,5 +66,5 @@ def head_rotation(points: np.ndarray, size: tuple[int, int]) -> np.ndarray:
     focal = height / 2 / np.tan(np.radians(CAMERA_FIELD_OF_VIEW_DEG) / 2)
     distance = focal + points[:, 2] - points[:, 2].mean()
     offset = (points[:, :2] - [width / 2, height / 2]) * (distance / focal)[:, None]
-    seen = np.column_stack([offset * [1, -1], -distance])[shapes.reliable]
-    return similarity(shapes.points[shapes.reliable], seen).rotation
+    observed = np.column_stack([offset * [1, -1], -distance])[shapes.reliable]
+    return similarity(shapes.points[shapes.reliable], observed).rotation

@@ -82,8 +82,8 @@ def find_head(
     units = {unit_of[axis] for axis in used}
     units = units - {""} or units
     for axis in used:
-        own = numbers(where, axes[axis], columns[axes[axis]])
-        values[:, AXES[axis]] = np.radians(own) if units > {unit_of[axis]} == {"deg"} else own
+        angles = numbers(where, axes[axis], columns[axes[axis]])
+        values[:, AXES[axis]] = np.radians(angles) if units > {unit_of[axis]} == {"deg"} else angles
     if len(units) > 1:
         notes.append(f"{', '.join(axes[axis] for axis in used)}: are in different units")
         units = {"rad"}

@@ -119,7 +119,7 @@ def quiet_weights(performance: Performance) -> np.ndarray:
 def exchanged_neutral(
     frames: Sequence[FlameFrame],
     theirs: Mapping[str, np.ndarray | float] | None,
-    own: Mapping[str, np.ndarray | float] | None = None,
+    neutral: Mapping[str, np.ndarray | float] | None = None,
 ) -> list[FlameFrame]:
     """The frames with this head's neutral in place of the other person's, part by part; None: a
     neutral of zeros.
@@ -127,10 +127,12 @@ def exchanged_neutral(
     Parameters of the parts are subtracted and added, rotations as axis-angle: jaw and eyes turn by
     small angles.
     """
-    own = own or dict.fromkeys(PART_FIELDS, 0.0)
+    neutral = neutral or dict.fromkeys(PART_FIELDS, 0.0)
     theirs = theirs or dict.fromkeys(PART_FIELDS, 0.0)
     parts = _by_part(frames).items()
-    return _with_parts(frames, {part: each + (own[part] - theirs[part]) for part, each in parts})
+    return _with_parts(
+        frames, {part: each + (neutral[part] - theirs[part]) for part, each in parts}
+    )
 
 
 def outside(frames: Sequence[FlameFrame], trained: TrainedRange) -> Parts:
@@ -331,8 +333,8 @@ def open_motion(
     recorded = capture.flame_motion()
     check_faces(path, recorded.model.faces, faces)
     sequence = transferred_motion(recorded, neutral)
-    own = sequence.frames()
-    frames, beyond = adapted(own, options, trained)
+    transferred = sequence.frames()
+    frames, beyond = adapted(transferred, options, trained)
     moved = _with_frames(sequence, sequence.timesteps, frames)
     return Motion(moved, playback_fps(capture), 0, beyond, recorded.warnings)
 

@@ -88,11 +88,13 @@ def read_performance(
     """
     if is_folder(path):
         files = _tables(path)
-        own = [path for path in files if not path.stem.lower().endswith(TAKE_EXTRAS)] or files
-        if len(own) != 1:
-            names = ", ".join(path.name for path in own[:4]) or "none"
+        candidates = [
+            path for path in files if not path.stem.lower().endswith(TAKE_EXTRAS)
+        ] or files
+        if len(candidates) != 1:
+            names = ", ".join(path.name for path in candidates[:4]) or "none"
             raise StgaError(f"{path}: a take's folder holds one CSV file, found {names}")
-        path = own[0]
+        path = candidates[0]
     performer = performer_of(path)
     if performer is None:
         raise StgaError(

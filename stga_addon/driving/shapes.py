@@ -181,9 +181,9 @@ def _aligned(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Points and normals (478, 3) after the affine map and the identities."""
     source = face_shapes()
-    own = source.points[list(PUPILS)]
-    linear = np.eye(3) * np.ptp(pupils[:, 0]) / np.ptp(own[:, 0])
-    points = source.points @ linear + pupils.mean(axis=0) - own.mean(axis=0) @ linear
+    source_pupils = source.points[list(PUPILS)]
+    linear = np.eye(3) * np.ptp(pupils[:, 0]) / np.ptp(source_pupils[:, 0])
+    points = source.points @ linear + pupils.mean(axis=0) - source_pupils.mean(axis=0) @ linear
     normals = source.normals
     count = len(source.identity)
     affine = np.einsum("ac,nb->nacb", np.eye(3), _homogeneous(source.points)).reshape(-1, 3, 12)

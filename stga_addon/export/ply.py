@@ -140,7 +140,7 @@ def splats_of(path: Path, vertices: np.ndarray, log: Log) -> Splats:
 def _base_color(path: Path, vertices: np.ndarray) -> np.ndarray:
     """(N, 3) coefficients of degree 0: f_dc_0…2, or those of red, green and blue."""
     names = vertices.dtype.names or ()
-    colors = next((own for own in COLOR_NAMES if set(own) <= set(names)), None)
+    colors = next((triple for triple in COLOR_NAMES if set(triple) <= set(names)), None)
     if "f_dc_0" in names or colors is None:
         return _columns(path, vertices, [f"f_dc_{i}" for i in range(3)])
     dtype = vertices.dtype[colors[0]]

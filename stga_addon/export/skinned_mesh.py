@@ -93,11 +93,11 @@ def _skin_attributes(weights: np.ndarray, accessors: Accessors, exact: bool) -> 
     attributes = {}
     for number in range(sets):
         four = np.s_[:, 4 * number : 4 * number + 4]
-        own = np.ascontiguousarray(joints[four].astype(kind))
-        attributes[f"JOINTS_{number}"] = accessors.add(own, VERTICES)
+        values = np.ascontiguousarray(joints[four].astype(kind))
+        attributes[f"JOINTS_{number}"] = accessors.add(values, VERTICES)
         normalized = {} if exact else {"normalized": True}
-        own = np.ascontiguousarray(fractions[four])
-        attributes[f"WEIGHTS_{number}"] = accessors.add(own, VERTICES, **normalized)
+        values = np.ascontiguousarray(fractions[four])
+        attributes[f"WEIGHTS_{number}"] = accessors.add(values, VERTICES, **normalized)
     return attributes
 
 
@@ -111,21 +111,21 @@ def _targets(
     moved = [np.flatnonzero((np.abs(shape) > least).any(axis=1)) for shape in shapes]
     wide = shapes.shape[1] > MAX_USHORT
     places = [each.astype(np.uint32 if wide else np.uint16) for each in moved]
-    displacements = [shape[own] for shape, own in zip(values, moved, strict=True)]
+    displacements = [shape[rows] for shape, rows in zip(values, moved, strict=True)]
     index_view = accessors.add_view(b"".join(map(little_endian, places)))
     value_view = accessors.add_view(b"".join(map(little_endian, displacements)))
     index_offsets = itertools.accumulate((each.nbytes for each in places), initial=0)
     value_offsets = itertools.accumulate((each.nbytes for each in displacements), initial=0)
     targets = []
-    for shape, own, index_at, value_at in zip(
+    for shape, rows, index_at, value_at in zip(
         values, places, index_offsets, value_offsets, strict=False
     ):
         accessor = accessor_of(shape) | range_of(shape)
         accessor |= {} if exact else {"normalized": True}
-        if len(own):
-            kind = COMPONENTS[own.dtype.name]
+        if len(rows):
+            kind = COMPONENTS[rows.dtype.name]
             accessor["sparse"] = {
-                "count": len(own),
+                "count": len(rows),
                 "indices": {
                     "bufferView": index_view,
                     "byteOffset": index_at,

@@ -119,10 +119,10 @@ def _flame_joints(path: Path, rig: Rig) -> list[int]:
 def _model(path: Path, rig: Rig, faces: np.ndarray) -> Arrays:
     """Arrays of a FLAME model. A joint that the rig lacks moves nothing; a rig without expressions
     gets one that moves nothing. Raises StgaError as `_flame_joints`."""
-    own = rig.basis[: rig.expressions]
+    expressions = rig.basis[: rig.expressions]
     joints = _flame_joints(path, rig)
     # the weights of vertices, of least norm, that give a joint's place and how shapes move it
-    shaped = np.concatenate([rig.base[None], own])
+    shaped = np.concatenate([rig.base[None], expressions])
     places = np.concatenate([rig.joint_rest[None], rig.joint_basis[: rig.expressions]])
     system = np.moveaxis(shaped, 2, 1).reshape(-1, len(rig.base))
     regressor = np.linalg.lstsq(
@@ -137,7 +137,9 @@ def _model(path: Path, rig: Rig, faces: np.ndarray) -> Arrays:
     weights[:, joints] = rig.weights
     arrays = {
         "v_template": rig.base,
-        "shapedirs": np.moveaxis(own if len(own) else np.zeros((1, *rig.base.shape)), 0, 2),
+        "shapedirs": np.moveaxis(
+            expressions if len(expressions) else np.zeros((1, *rig.base.shape)), 0, 2
+        ),
         "n_identity": np.array(0),
         "J_regressor": joint_regressor,
         "kintree_table": np.array([parents, range(len(JOINTS))], np.int64),
@@ -173,8 +175,8 @@ def _motion(path: Path, rig: Rig) -> Arrays:
             problem = f"moves {len(rig.base)} vertices without sliders in {frames} frames"
             raise StgaError(f"{path}: {problem}; expected up to {MAX_MOVED_NUMBERS} coordinates")
         moved = np.empty((frames, *rig.base.shape), np.float32)
-        for frame, own in enumerate(others):
-            moved[frame] = np.einsum("r,rvc->vc", own, rig.basis[rig.expressions :])
+        for frame, coefficients in enumerate(others):
+            moved[frame] = np.einsum("r,rvc->vc", coefficients, rig.basis[rig.expressions :])
         motion["dynamic_offset"] = moved
     return motion
 
@@ -223,10 +225,10 @@ def _arrays(entries: Json, packed: bytes) -> Arrays:
         raise ValueError("its arrays are not whole")
     for name in [name for name in arrays if name.endswith(AXES)]:
         axes = arrays.pop(name)
-        own = name.removesuffix(AXES)
-        if axes.shape != 2 * arrays[own].shape[-1:]:
+        stem = name.removesuffix(AXES)
+        if axes.shape != 2 * arrays[stem].shape[-1:]:
             raise ValueError(f"{name} of shape {axes.shape}, not one row a column")
-        arrays[own] = arrays[own] @ axes.T
+        arrays[stem] = arrays[stem] @ axes.T
     return arrays
 
 
@@ -246,8 +248,8 @@ def _array(entry: Json, shape: list[int], planes: int, raw: bytes) -> np.ndarray
     if entry["type"] == "float32":
         return block.view("<f4").reshape(shape).astype(np.float64)
     integers = np.zeros(math.prod(shape), np.int64)
-    for plane, own in enumerate(block.reshape(planes, -1)):
-        integers |= own.astype(np.int64) << 8 * plane
+    for plane, plane_bytes in enumerate(block.reshape(planes, -1)):
+        integers |= plane_bytes.astype(np.int64) << 8 * plane
     if (integers < 0).any():
         raise ValueError("an array holds numbers of more than 63 bits")
     integers += _whole(entry["low"], -(2**62))
@@ -298,9 +300,9 @@ def _mesh(
     weights = np.zeros((count, joints))
     for number in range(sum(name.startswith("JOINTS") for name in attributes)):
         fractions = values(attributes[f"WEIGHTS_{number}"], count, 4)
-        own = values(attributes[f"JOINTS_{number}"], count, 4).astype(int)
+        indices = values(attributes[f"JOINTS_{number}"], count, 4).astype(int)
         for column in range(4):
-            np.add.at(weights, (np.arange(count), own[:, column]), fractions[:, column])
+            np.add.at(weights, (np.arange(count), indices[:, column]), fractions[:, column])
     for name, array in (("POSITION", base), ("targets", basis), ("WEIGHTS", weights)):
         if not np.isfinite(array).all():
             raise ValueError(f"{name} holds values that are not finite")
@@ -418,14 +420,14 @@ def _avatar(header: Json, arrays: Arrays, rig: Rig, faces: np.ndarray) -> Avatar
 def _light(header: Json, arrays: Arrays) -> AvatarLight | None:
     if "light" not in header:
         return None
-    own = header["light"]
+    light = header["light"]
     return AvatarLight(
-        radiance=np.reshape(own["radiance"], (9, 3)).astype(np.float32),
+        radiance=np.reshape(light["radiance"], (9, 3)).astype(np.float32),
         transfer=arrays["light_transfer"].astype(np.float32),
         occlusion=arrays["light_occlusion"].astype(np.float32),
         irradiance=arrays["light_irradiance"].astype(np.float32),
         roughness=arrays["light_roughness"].astype(np.float32),
-        residual=_number(own, "residual"),
-        damping=_number(own, "damping"),
-        source=str(own["source"]),
+        residual=_number(light, "residual"),
+        damping=_number(light, "damping"),
+        source=str(light["source"]),
     )

@@ -119,7 +119,7 @@ def change_between(start: np.ndarray, end: np.ndarray) -> np.ndarray:
     """
     change = np.subtract(end, start)
     turns = np.s_[..., -RIGID_SIZE:-TRANSLATION_SIZE]
-    before, after = (from_axis_angle(_joints(own[turns])) for own in (start, end))
+    before, after = (from_axis_angle(_joints(parameters[turns])) for parameters in (start, end))
     turn = to_axis_angle(multiply(after, before * [1, -1, -1, -1]))
     turn = np.where((before == after).all(-1, keepdims=True), 0.0, turn)  # without rounding
     change[turns] = turn.reshape(change[turns].shape)
@@ -132,7 +132,9 @@ def changed_by(start: np.ndarray, change: np.ndarray) -> np.ndarray:
     changes."""
     changed = np.add(start, change)
     turns = np.s_[..., -RIGID_SIZE:-TRANSLATION_SIZE]
-    before, turn = (_joints(np.broadcast_to(own, changed.shape)[turns]) for own in (start, change))
+    before, turn = (
+        _joints(np.broadcast_to(each, changed.shape)[turns]) for each in (start, change)
+    )
     found = to_axis_angle(multiply(from_axis_angle(turn), from_axis_angle(before)))
     found = np.where(turn.any(-1, keepdims=True), nearest_axis_angle(found, before), before)
     changed[turns] = found.reshape(changed[turns].shape)
@@ -195,8 +197,8 @@ def by_change(parameters: np.ndarray) -> np.ndarray:
     derivative = np.eye(len(parameters))
     first = len(parameters) - RIGID_SIZE
     for joint, turn in enumerate(left_jacobians(frame_of(parameters).pose)):
-        own = slice(first + 3 * joint, first + 3 * joint + 3)
-        derivative[own, own] = np.linalg.inv(turn)
+        columns = slice(first + 3 * joint, first + 3 * joint + 3)
+        derivative[columns, columns] = np.linalg.inv(turn)
     return derivative
 
 
@@ -261,7 +263,7 @@ def parameters_gradient(
     twist = by_local @ posed.local.swapaxes(1, 2)
     torque = np.stack([twist[:, k - 1, k - 2] - twist[:, k - 2, k - 1] for k in range(3)], 1)
     jacobians = left_jacobians(frame.pose)
-    by_pose = [own.T @ turn for own, turn in zip(jacobians, torque, strict=True)]
+    by_pose = [jacobian.T @ turn for jacobian, turn in zip(jacobians, torque, strict=True)]
     by_shaped = by_corrected + model.j_regressor.T @ by_joint
     by_expression = np.tensordot(by_shaped, expressions, 2)
     return np.concatenate([by_expression, *by_pose, vertex_gradient.sum(0)])

@@ -133,10 +133,10 @@ def model_of(path: Path, arrays: Arrays) -> FlameModel:
 def _model_arrays(path: Path) -> tuple[Arrays, str]:
     """Those of MODEL_KEYS, what else the file has of a model, and the file's digest."""
     if path.suffix.lower() == ".npz":
-        own = (*MODEL_KEYS, "n_identity", "shape_steps", EXPRESSION_NAMES)
+        keys = (*MODEL_KEYS, "n_identity", "shape_steps", EXPRESSION_NAMES)
         with open_npz(path) as file:
             digest = file.digest()
-            arrays = model_arrays(file, own)
+            arrays = model_arrays(file, keys)
         if "shape_steps" in arrays and "v_template" in arrays:
             steps = finite(path, arrays, "shape_steps", (None, len(arrays["v_template"]), 3))
             arrays["shapedirs"] = np.moveaxis(SHAPE_STEP_M * steps, 0, -1)
@@ -250,8 +250,8 @@ def _integers(path: Path, key: str, array: np.ndarray) -> np.ndarray:
 
 
 def _masks(path: Path, arrays: Arrays, vertices: int) -> dict[str, np.ndarray]:
-    own = {key: value for key, value in arrays.items() if key.startswith(MASK_PREFIX)}
-    found = {key.removeprefix(MASK_PREFIX): value for key, value in own.items()}
+    named = {key: value for key, value in arrays.items() if key.startswith(MASK_PREFIX)}
+    found = {key.removeprefix(MASK_PREFIX): value for key, value in named.items()}
     source = path
     beside = path.with_name(MASK_FILE)
     if not found and beside.is_file():

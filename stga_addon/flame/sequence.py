@@ -229,7 +229,9 @@ def read_motion(path: Path, model: FlameModel) -> FlameSequence:
 
 def motion_of(path: Path, arrays: Arrays, model: FlameModel) -> FlameSequence:
     """The motion in the arrays of a file, as `read_motion` reads it; errors name `path`."""
-    spelled = {FIELD_ALIASES[name]: own for name, own in arrays.items() if name in FIELD_ALIASES}
+    spelled = {
+        FIELD_ALIASES[name]: values for name, values in arrays.items() if name in FIELD_ALIASES
+    }
     warnings = _guesses(path, arrays)
     arrays = spelled | dict(arrays)
     body = arrays.get("poses")
@@ -287,7 +289,7 @@ def motion_of(path: Path, arrays: Arrays, model: FlameModel) -> FlameSequence:
 
 def _guesses(path: Path, arrays: Arrays) -> tuple[str, ...]:
     """Sentences about fields of a motion that other programs may mean otherwise, or lack here."""
-    sizes = {name: own[0].size for name, own in arrays.items() if own.ndim > 1 and len(own)}
+    sizes = {name: array[0].size for name, array in arrays.items() if array.ndim > 1 and len(array)}
     joints = {name: JOINT_COUNTS.get(FIELD_ALIASES.get(name, name), 0) for name in sizes}
     six = [name for name, count in joints.items() if count and sizes[name] == count * ROWS_OF_SIX]
     sentences = []
@@ -313,7 +315,7 @@ def motion_arrays(sequence: FlameSequence, dtype: DTypeLike = np.float64) -> dic
     offsets = [none if frame.dynamic_offset is None else frame.dynamic_offset for frame in frames]
     moving = {name: [getattr(frame, name) for frame in frames] for name in FRAME_FIELDS}
     return {
-        **{name: np.stack(own, dtype=dtype) for name, own in moving.items()},
+        **{name: np.stack(rows, dtype=dtype) for name, rows in moving.items()},
         "shape": sequence.shape.astype(dtype),
         "static_offset": (none if static is None else static).astype(dtype),
         "dynamic_offset": np.stack(offsets, dtype=dtype),
@@ -323,7 +325,9 @@ def motion_arrays(sequence: FlameSequence, dtype: DTypeLike = np.float64) -> dic
 def _frame(path: Path, arrays: Arrays, model: FlameModel) -> FlameFrame:
     sizes = dict.fromkeys(FRAME_FIELDS, 3) | {"expr": model.n_expression, "eyes_pose": 6}
     turns = {name: arrays[name] for name in JOINT_COUNTS if name in arrays}
-    plain = dict(arrays) | {name: _axis_angles(path, name, own) for name, own in turns.items()}
+    plain = dict(arrays) | {
+        name: _axis_angles(path, name, rotation) for name, rotation in turns.items()
+    }
     values = {name: _vector(path, plain, name, size) for name, size in sizes.items()}
     offset = _offset(path, arrays, "dynamic_offset", len(model.v_template))
     return FlameFrame(**values, dynamic_offset=offset)
@@ -431,7 +435,7 @@ def strengthened(frames: Sequence[FlameFrame], strength: float) -> list[FlameFra
     start[[*range(-RIGID_SIZE, 3 - RIGID_SIZE), -3, -2, -1]] = *first.rotation, *first.translation
     scaled = changed_by(start, strength * change_between(start, values))
     rows = zip(scaled, frames, strict=True)
-    return [frame_of(own, frame.dynamic_offset) for own, frame in rows]
+    return [frame_of(parameters, frame.dynamic_offset) for parameters, frame in rows]
 
 
 def transferred_motion(motion: FlameSequence, neutral: np.ndarray) -> FlameSequence:

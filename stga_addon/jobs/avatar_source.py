@@ -164,9 +164,9 @@ def open_avatar_motion(request: Posed, avatar: Avatar, log: Log) -> Motion:
     flame = request.flame or (run.flame if run is not None else None)
     if run is not None and (options.neutral != "none" or options.stay_trained is not None):
         try:
-            own = open_run(source, flame=request.flame).capture.flame
-            if own is not None:
-                trained = trained_range(own.frames())
+            recorded = open_run(source, flame=request.flame).capture.flame
+            if recorded is not None:
+                trained = trained_range(recorded.frames())
         except StgaError as error:
             if options.stay_trained is not None:
                 raise
@@ -183,10 +183,10 @@ def open_avatar_motion(request: Posed, avatar: Avatar, log: Log) -> Motion:
     return motion
 
 
-def motion_capture(request: Posed, avatar: Avatar, own: Capture | None, log: Log) -> Capture:
+def motion_capture(request: Posed, avatar: Avatar, recorded: Capture | None, log: Log) -> Capture:
     """The motion as a capture, seen by the cameras of the run's own one."""
     motion = open_avatar_motion(request, avatar, log)
-    views = {} if own is None else own.views
+    views = {} if recorded is None else recorded.views
     capture = sequence_capture(request.motion, motion.sequence, request.flame, views)
     return replace(capture, fps=motion.fps)
 

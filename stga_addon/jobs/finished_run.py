@@ -153,8 +153,8 @@ def measure_run(
         return quality, None
     before = tracked.flame.frame
     after = fitted.flame.frame
-    shown = {view.timestep for view in capture.views[split]}
-    if all(np.array_equal(after(t).parameters, before(t).parameters) for t in shown):
+    timesteps = {view.timestep for view in capture.views[split]}
+    if all(np.array_equal(after(t).parameters, before(t).parameters) for t in timesteps):
         return quality, None
     return quality, evaluate_avatar(avatar, fitted, split, True, matched)
 
@@ -182,8 +182,8 @@ def evaluate(request: Evaluate, report: Report, log: Log) -> Written:
     quality, fitted = measure_run(folder, avatar, capture, split)
     if (folder / WORLD_FILE).is_file():
         world = read_splats(folder / WORLD_FILE)
-        shown = run_folder.with_refined_tracking(capture, folder, fitted=False)
-        recorded = psnr_recorded(avatar, world, shown, split)
+        tracked = run_folder.with_refined_tracking(capture, folder, fitted=False)
+        recorded = psnr_recorded(avatar, world, tracked, split)
         quality = replace(quality, psnr_recorded=recorded)
     path = folder / f"quality_{split}.json"
     figures = with_fitted_heads(quality.as_json(), {} if fitted is None else fitted.as_json())

@@ -328,8 +328,8 @@ def _status_read(state: RequestState, event: StatusRead) -> Outcome:
     drawn = [(each.folder, each.files.metrics, each.files.picture) for each in (before, state)]
     if drawn[0] != drawn[1] and state.kind in (*TRAINS, Kind.TRACKING):
         effects.append(ReadCurve(state.run))
-    seen = [(each.folder, each.files, each.snapshot) for each in (before, state)]
-    if seen[0] != seen[1]:
+    snapshots = [(each.folder, each.files, each.snapshot) for each in (before, state)]
+    if snapshots[0] != snapshots[1]:
         effects.append(Redraw())
     is_alive = state.snapshot.state.is_alive
     files = state.files

@@ -198,7 +198,9 @@ def camera_views(request: Render, path: Path, log: Log) -> list[View]:
     """The views of a file of cameras: transforms, or 3D Gaussian Splatting's. Raises StgaError."""
     if is_file(path) and is_gaussian_cameras(path):
         shots = read_gaussian_cameras(path)
-        return [View(0, n, own.camera, own.label, Path(own.label)) for n, own in enumerate(shots)]
+        return [
+            View(0, n, shot.camera, shot.label, Path(shot.label)) for n, shot in enumerate(shots)
+        ]
     principal_point = request.principal_point
     if principal_point is None:
         if is_splats(request.source):

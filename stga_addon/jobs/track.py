@@ -475,9 +475,9 @@ def make_avatar(request: MakeAvatar, report: Report, log: Log) -> Written:
     tracking = tracked - begin
     training = perf_counter() - tracked
     lines = [""]
-    for own in captures:
-        lines += _tracking_lines(own)
-    files = [own / name for own in captures for name in (SHEET_FILE, REPORT_FILE)]
+    for folder in captures:
+        lines += _tracking_lines(folder)
+    files = [folder / name for folder in captures for name in (SHEET_FILE, REPORT_FILE)]
     lines += [
         f"report: {', '.join(str(path) for path in (*files, run / CURVE) if path.exists())}",
         *trained.lines,
@@ -513,15 +513,15 @@ def _track_takes(request: MakeAvatar, report: Report, log: Log) -> list[Path]:
         write_json(out / INPUTS, _inputs(request.track, request.takes))
     try:
         tracks = _planned(request, report, log)
-        for number, (own, known) in enumerate(tracks):
+        for number, (take, known) in enumerate(tracks):
 
             def report_take(progress: Progress, before: int = number) -> bool:
                 fraction = (before + progress.fraction) / len(tracks)
                 return report(replace(progress, fraction=fraction))
 
-            if not is_written(own.out):
-                with hold_folder(own.out, LOCK_FILE, WRITER):
-                    for line in _track_head(own, report_take, known).lines:
+            if not is_written(take.out):
+                with hold_folder(take.out, LOCK_FILE, WRITER):
+                    for line in _track_head(take, report_take, known).lines:
                         log(line)
     except (StgaError, OSError):
         # nothing was tracked yet, so that the inputs may be mended
@@ -530,7 +530,7 @@ def _track_takes(request: MakeAvatar, report: Report, log: Log) -> list[Path]:
             if is_new:
                 out.rmdir()
         raise
-    return sorted((own.out for own, _ in tracks), key=lambda path: path != request.track.out)
+    return sorted((take.out for take, _ in tracks), key=lambda path: path != request.track.out)
 
 
 def _planned(
@@ -545,10 +545,10 @@ def _planned(
     footage = [track.footage, *request.takes]
     found = _kinds(request, report, log)
     kinds = [kind for kind, _ in found]
-    shown = kinds.index("talk") if "talk" in kinds else 0
+    played = kinds.index("talk") if "talk" in kinds else 0
     person = kinds.index("around") if "around" in kinds else 0
     folders = [f"{CAPTURE_FOLDER}_{number + 1}" for number in range(1, len(footage))]
-    folders.insert(shown, CAPTURE_FOLDER)
+    folders.insert(played, CAPTURE_FOLDER)
     outs = [request.out / name for name in folders]
     order = [person, *(number for number in range(len(footage)) if number != person)]
     tracks = [
@@ -561,7 +561,7 @@ def _planned(
         )
         for number in order
     ]
-    return [(own, found[number]) for own, number in zip(tracks, order, strict=True)]
+    return [(take, found[number]) for take, number in zip(tracks, order, strict=True)]
 
 
 def _kinds(request: MakeAvatar, report: Report, log: Log) -> list[tuple[str, str]]:
@@ -585,8 +585,8 @@ def _kinds(request: MakeAvatar, report: Report, log: Log) -> list[tuple[str, str
         kinds = []
         steps = _Steps(report)
         with Helpers() as helpers:
-            for own, path in zip(opened, footage, strict=True):
-                kind, why = take_of(own, Workers(helpers, steps.report, steps.show))
+            for take, path in zip(opened, footage, strict=True):
+                kind, why = take_of(take, Workers(helpers, steps.report, steps.show))
                 kinds.append((kind, why))
                 what = "around a still head" if kind == "around" else "a head that moves"
                 log(f"take: {path.name}: {what} ({why})")

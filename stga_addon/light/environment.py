@@ -201,9 +201,9 @@ def read_lighting(path: Path) -> Lighting:
     found: LightFile = from_json(LightFile, _completed(LightFile, values), path)
     lights = []
     for entry in found.lights:
-        own = {**vars(entry), "color": entry.strength * np.array(entry.color)}
-        del own["strength"]
-        lights.append(Light(**own))
+        light = {**vars(entry), "color": entry.strength * np.array(entry.color)}
+        del light["strength"]
+        lights.append(Light(**light))
     return Lighting(**{**vars(found), "world": uniform(found.world), "lights": tuple(lights)})
 
 

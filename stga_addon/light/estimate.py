@@ -45,13 +45,15 @@ def observe(
     for n, (time, views) in enumerate(times.items()):
         report(Progress(n / (len(times) + ITERATIONS), "Estimating the light"))
         mesh = np.asarray(capture.mesh(time), np.float64)
-        seen = np.stack([_view_colors(capture, mesh, view, exposure(view)) for view in views])
-        ordered = np.sort(seen, axis=0)  # NaN comes last
-        count = np.isfinite(seen[..., :1]).sum(0)
-        taken = np.arange(len(seen))[:, None, None] < (count + 1) // 2
+        view_colors = np.stack(
+            [_view_colors(capture, mesh, view, exposure(view)) for view in views]
+        )
+        ordered = np.sort(view_colors, axis=0)  # NaN comes last
+        count = np.isfinite(view_colors[..., :1]).sum(0)
+        taken = np.arange(len(view_colors))[:, None, None] < (count + 1) // 2
         total = np.where(taken, np.nan_to_num(ordered), 0).sum(0)
         colors.append(np.where(count > 0, total / np.maximum((count + 1) // 2, 1), np.nan))
-        cameras.append(np.isfinite(seen[..., 0]).sum(0))
+        cameras.append(np.isfinite(view_colors[..., 0]).sum(0))
     return np.stack(colors), np.stack(cameras)
 
 
@@ -72,15 +74,15 @@ def _view_colors(
             usable &= inside[y : y + height, x : x + width]
     corners = mesh[capture.faces]
     middle = corners.mean(1)
-    seen = facing(view.camera, middle, unit(triangle_normals(corners), 1e-20)) > MIN_FACING
+    visible = facing(view.camera, middle, unit(triangle_normals(corners), 1e-20)) > MIN_FACING
     depths = ShadowMap(mesh, capture.faces, Light("point", np.ones(3), view.camera.position))
-    seen &= depths.lit(middle, HIDDEN_M, step=0) > 0.5
-    total = np.zeros((len(seen), 3))
-    count = np.zeros((len(seen), 1))
+    visible &= depths.lit(middle, HIDDEN_M, step=0) > 0.5
+    total = np.zeros((len(visible), 3))
+    count = np.zeros((len(visible), 1))
     for weights in POINTS:
         points = np.einsum("k,fkc->fc", weights, corners)
         column, row, inside = pixels_of(points, view.camera)
-        inside &= seen & usable[row, column]
+        inside &= visible & usable[row, column]
         color = np.clip((image[row, column] - offset) / gain, 0, 255)
         total += np.where(inside[:, None], srgb_to_linear(color / 255), 0)
         count += inside[:, None]
@@ -199,8 +201,8 @@ def recorded_irradiance(
     cameras (T, F) see the vertex: teeth in an open mouth."""
     total = np.zeros(direct.shape[1:])
     count = np.zeros((direct.shape[1], 1))
-    for arriving, seen in zip(direct, cameras, strict=True):
-        views = np.bincount(faces.ravel(), np.repeat(seen, 3), len(arriving))
+    for arriving, observed in zip(direct, cameras, strict=True):
+        views = np.bincount(faces.ravel(), np.repeat(observed, 3), len(arriving))
         weight = views[:, None] + UNSEEN_WEIGHT
         total += weight * (arriving + bounce.light(arriving))
         count += weight
@@ -225,22 +227,22 @@ def fit_light(
     radiance = np.array(uniform(np.ones(3) / np.pi) if given is None else given)
     typical = np.empty(3)
     error = np.empty_like(color)
-    for k, shown in enumerate(color.T):
-        weight = np.ones_like(shown)
+    for k, observed in enumerate(color.T):
+        weight = np.ones_like(observed)
         for _ in range(ITERATIONS):
             arriving = received @ radiance[:, k]
             arriving = np.maximum(arriving, max(MIN_ARRIVING * arriving.mean(), DARK))
-            typical[k] = max(np.median(shown / arriving), DARK)
+            typical[k] = max(np.median(observed / arriving), DARK)
             prior = PRIOR * times * (arriving**2).mean()
-            upper = np.bincount(face, weight * shown * arriving, faces) + prior * typical[k]
+            upper = np.bincount(face, weight * observed * arriving, faces) + prior * typical[k]
             albedo = (upper / (np.bincount(face, weight * arriving**2, faces) + prior))[face]
-            error[:, k] = np.abs(shown - albedo * arriving)
+            error[:, k] = np.abs(observed - albedo * arriving)
             scale = LOSS_SCALE * np.median(error[:, k]) + 1e-9
             weight = 1 / (1 + (error[:, k] / scale) ** 2)
             if given is None:
                 root = np.sqrt(weight)
                 rows = received * (albedo * root)[:, None]
-                radiance[:, k] = least_squares(rows, shown * root, RIDGE)
+                radiance[:, k] = least_squares(rows, observed * root, RIDGE)
     residual = float(1.4826 * np.median(error / np.maximum(color, 1e-3)))
     if given is None:
         mean = (received @ radiance).mean(0)
@@ -253,9 +255,9 @@ def dark_triangles(
 ) -> np.ndarray:
     """(F,) bool: triangles darker than HAIR_BRIGHTNESS, by linear colors (T, F, 3), NaN where they
     are not seen, and the light that they received (F, 3); none where no nose (F,) bool is."""
-    seen = np.isfinite(color[..., :1])
-    mean = np.where(seen, color, 0).sum(0) / np.maximum(seen.sum(0), 1)
-    albedo = np.where(seen.any(0), mean / np.maximum(irradiance, DARK), np.nan).mean(1)
+    observed = np.isfinite(color[..., :1])
+    mean = np.where(observed, color, 0).sum(0) / np.maximum(observed.sum(0), 1)
+    albedo = np.where(observed.any(0), mean / np.maximum(irradiance, DARK), np.nan).mean(1)
     if nose is None or not np.isfinite(albedo[nose]).any():
         return np.zeros(len(albedo), bool)
     return np.asarray(albedo < HAIR_BRIGHTNESS * np.nanmedian(albedo[nose]))

@@ -222,14 +222,14 @@ class Relighter:
             view = _unit(eye.astype(np.float32) - points)
             cosine = np.maximum(row_dot(normals, view), np.float32(0.02))
             glossy = (GLOSSY[:, None] * lighting.world).astype(np.float32)
-            seen = np.maximum(basis(2 * cosine[:, None] * normals - view) @ glossy, 0)
+            reflection = np.maximum(basis(2 * cosine[:, None] * normals - view) @ glossy, 0)
             x = 1 - roughness
             y = 0.0425 - 0.0275 * roughness
             z = 1.04 - 0.572 * roughness
             w = 0.022 * roughness - 0.04
             part = np.minimum(x * x, np.exp2(np.float32(-9.28) * cosine)) * x + y
             reflected = REFLECTANCE * (z - 1.04 * part) + 1.04 * part + w
-            highlight += np.asarray(seen * (reflected * self.occlusion)[:, None], np.float32)
+            highlight += np.asarray(reflection * (reflected * self.occlusion)[:, None], np.float32)
         color = _with_driven(self.diffuse_color, self.avatar.without_light, mesh)
         albedo = self.albedo if color is self.diffuse_color else self._albedo(color)
         lit = albedo * arriving * np.float32(1 / np.pi)

@@ -31,5 +31,5 @@ def prefers_numba() -> bool:
     if find_spec("numba") is None:
         return False
     name = f"{__package__}.{LAST_COMPILED.parent.name}"
-    own = os.environ.get("NUMBA_CACHE_DIR") or cache_folder() / KERNELS / name
-    return any(has_kernels(folder) for folder in (Path(own), cache_folder() / BUNDLED / name))
+    compiled = os.environ.get("NUMBA_CACHE_DIR") or cache_folder() / KERNELS / name
+    return any(has_kernels(folder) for folder in (Path(compiled), cache_folder() / BUNDLED / name))

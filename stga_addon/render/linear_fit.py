@@ -57,19 +57,21 @@ def fit_linear(avatar: Avatar, capture: Capture, report: Report = ignore) -> np.
         raise StgaError(f"{capture.root}: has no training views, by which colors could be fitted")
     rng = np.random.default_rng(0)
     chosen = evenly_spread(views, MAX_VIEWS)
-    seen = []
+    posed_views = []
     for place, index in enumerate(rng.permutation(len(chosen))):
         view = chosen[index]
         camera = view.camera
         camera = camera.scaled(min(1.0, MAX_SIDE_PX / max(camera.width, camera.height)))
-        seen.append(_seen(avatar, capture.mesh(view.timestep), camera, BEHIND[place % 2]))
+        posed_views.append(_seen(avatar, capture.mesh(view.timestep), camera, BEHIND[place % 2]))
     change = np.zeros((len(avatar.splats), 4), np.float32)
     mean = np.zeros_like(change)
     square = np.zeros_like(change)
     buffers = BufferPool()
-    order = [n for _ in range(0, STEPS, len(seen)) for n in rng.permutation(len(seen))]
+    order = [
+        n for _ in range(0, STEPS, len(posed_views)) for n in rng.permutation(len(posed_views))
+    ]
     for step in counted(range(STEPS), STEPS, report, "Fitting colors for linear light", "Step"):
-        gradient = _gradient(avatar, change, seen[order[step]], buffers)
+        gradient = _gradient(avatar, change, posed_views[order[step]], buffers)
         mean += (1 - BETAS[0]) * (gradient - mean)
         square += (1 - BETAS[1]) * (gradient**2 - square)
         unbiased = mean / (1 - BETAS[0] ** (step + 1))
@@ -89,32 +91,32 @@ def _seen(avatar: Avatar, mesh: np.ndarray, camera: Camera, behind: float) -> _S
     return _Seen(fine, sh_color(world.sh, direction), behind, picture)
 
 
-def _gradient(avatar: Avatar, change: np.ndarray, seen: _Seen, buffers: BufferPool) -> np.ndarray:
+def _gradient(avatar: Avatar, change: np.ndarray, view: _Seen, buffers: BufferPool) -> np.ndarray:
     """(N, 4) of half the mean squared difference of a view blended in linear light from its
     picture, in display values, by the change of colors and logits."""
     splats = avatar.splats
-    srgb = np.clip(seen.color + change[:, :3], 0, MAX_SRGB)
+    srgb = np.clip(view.color + change[:, :3], 0, MAX_SRGB)
     values = {name: np.ascontiguousarray(getattr(splats, name)) for name in Parameters._fields}
     values["sh"] = ((srgb_to_linear(srgb) - 0.5) / SH_C0).astype(np.float32)[:, None]
     values["opacity"] = splats.opacity + change[:, 3]
     parameters = Parameters(**values)
-    behind = np.full(3, seen.behind, np.float32)
+    behind = np.full(3, view.behind, np.float32)
     output = render_forward(
         parameters,
         splats.face,
-        seen.frames,
+        view.frames,
         0,
         behind,
         antialiased=avatar.antialiased,
         buffers=buffers,
     )
-    channels, height, width = seen.picture.shape
+    channels, height, width = view.picture.shape
     fine = output.image.reshape(channels, height, FINENESS, width, FINENESS)
-    difference = fine.mean((2, 4)) - srgb_to_linear(seen.picture)
-    difference /= _slope(seen.picture) ** 2 * difference.size * FINENESS**2
+    difference = fine.mean((2, 4)) - srgb_to_linear(view.picture)
+    difference /= _slope(view.picture) ** 2 * difference.size * FINENESS**2
     by_image = difference.repeat(FINENESS, 1).repeat(FINENESS, 2).astype(np.float32)
     by = Parameters(*(np.zeros_like(each) for each in parameters))
-    render_backward(output, parameters, splats.face, seen.frames, by_image, by, buffers=buffers)
+    render_backward(output, parameters, splats.face, view.frames, by_image, by, buffers=buffers)
     by_color = by.sh[:, 0] / SH_C0 * _slope(srgb)
     return np.asarray(np.column_stack([by_color, by.opacity]), np.float32)
 

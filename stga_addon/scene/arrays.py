@@ -47,26 +47,28 @@ def has_triangles(mesh: Any, faces: np.ndarray) -> bool:
 def evaluated_vertices(obj: Any) -> np.ndarray:
     """(V, 3) float32 vertices of a mesh object at the current frame, in object space."""
     with kept_evaluated([obj]):
-        shown = evaluated(obj, bpy.context.evaluated_depsgraph_get())
-        mesh = shown.to_mesh()
+        evaluated_object = evaluated(obj, bpy.context.evaluated_depsgraph_get())
+        mesh = evaluated_object.to_mesh()
         try:
             return mesh_vertices(mesh)
         finally:
-            shown.to_mesh_clear()
+            evaluated_object.to_mesh_clear()
 
 
 def own_vertices(head: Any) -> np.ndarray:
     """(V, 3) float32 of a head's own vertices as `evaluated_vertices`, also where modifiers divide
     its triangles or add others. Raises StgaError where they replace them."""
-    own = head.data
+    neutral = head.data
     found = evaluated_vertices(head)
-    if len(found) == len(own.vertices):
+    if len(found) == len(neutral.vertices):
         return found
-    if len(found) > len(own.vertices):
-        own.calc_loop_triangles()
-        triangles = read_values(own.loop_triangles, "vertices", 3, np.int32)
-        posed = found[: len(own.vertices)]
-        stretch = _edges(posed[triangles]) / np.maximum(_edges(mesh_vertices(own)[triangles]), 1e-9)
+    if len(found) > len(neutral.vertices):
+        neutral.calc_loop_triangles()
+        triangles = read_values(neutral.loop_triangles, "vertices", 3, np.int32)
+        posed = found[: len(neutral.vertices)]
+        stretch = _edges(posed[triangles]) / np.maximum(
+            _edges(mesh_vertices(neutral)[triangles]), 1e-9
+        )
         low, high = np.quantile(stretch, (0.25, 0.75))
         if high <= MAX_SPREAD * low:
             return posed

@@ -143,7 +143,7 @@ def set_up_head(capture: Capture) -> Any:
 def show_on_head(avatar: Avatar, head: Any, link: str, fps: float) -> Any:
     """Show the avatar in place of the mesh, with every viewport on it and a white world; bones and
     cameras are hidden. Returns the splats. link: the avatar's file, relative to the .blend file."""
-    shown = show_avatar(avatar, head)
+    splats = show_avatar(avatar, head)
     scene = bpy.context.scene
     head[tags.AVATAR] = link
     hide_object(head, scene)
@@ -154,7 +154,7 @@ def show_on_head(avatar: Avatar, head: Any, link: str, fps: float) -> Any:
     for kind in COLLECTIONS:
         show_kind(head.parent, kind, scene.view_layers[0], False)
     frame_head(head, scene.camera, bpy.data.screens)
-    return shown
+    return splats
 
 
 def show_world(avatar_file: Path, head: Any, scene: Any = None) -> Any:

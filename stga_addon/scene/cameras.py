@@ -287,16 +287,16 @@ def look_through(scene: Any, camera: Any) -> None:
 
 def look_away(scene: Any) -> None:
     """Give the scene its own resolution again, unless it has been changed meanwhile."""
-    own = scene.get(tags.OWN_RESOLUTION)
-    if own is not None and _has_camera_size(scene):
-        scene.render.resolution_x, scene.render.resolution_y = own
+    resolution = scene.get(tags.OWN_RESOLUTION)
+    if resolution is not None and _has_camera_size(scene):
+        scene.render.resolution_x, scene.render.resolution_y = resolution
     scene.pop(tags.OWN_RESOLUTION, None)
 
 
 def _has_camera_size(scene: Any) -> bool:
     size = scene.camera.get(tags.IMAGE_SIZE) if scene.camera else None
-    shown = scene.render.resolution_x, scene.render.resolution_y
-    return size is not None and tuple(size) == shown
+    resolution = scene.render.resolution_x, scene.render.resolution_y
+    return size is not None and tuple(size) == resolution
 
 
 def central(cameras: list[Any]) -> Any:

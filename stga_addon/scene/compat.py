@@ -248,16 +248,16 @@ def new_compositor_tree(scene: Any) -> Any:
 
 def compositor_math(nodes: Any, operation: str, *values: Any) -> Any:
     """Output of a Math node of the compositor, whose own kind went with 5.0."""
-    own = "CompositorNodeMath"
-    kind = own if hasattr(bpy.types, own) else "ShaderNodeMath"
+    legacy = "CompositorNodeMath"
+    kind = legacy if hasattr(bpy.types, legacy) else "ShaderNodeMath"
     return nodes.out(kind, {"Value": list(values)}, operation=operation)
 
 
 def compositor_mix(nodes: Any, factor: Any, first: Any, second: Any) -> Any:
     """Output of a Mix node of the compositor: second where factor is 1."""
-    own = "CompositorNodeMixRGB"
-    if hasattr(bpy.types, own):
-        return nodes.out(own, {"Fac": factor, "Image": [first, second]})
+    legacy = "CompositorNodeMixRGB"
+    if hasattr(bpy.types, legacy):
+        return nodes.out(legacy, {"Fac": factor, "Image": [first, second]})
     inputs = {"Factor": factor, "A": first, "B": second}
     return nodes.out("ShaderNodeMix", inputs, data_type="RGBA")
 

@@ -117,8 +117,8 @@ def _collect(family: list[Any], copies: list[Any]) -> None:
             made[collection].objects.link(copy)
     for kind in COLLECTIONS:
         pairs = zip(layers_of(root, kind, layer), layers_of(new_root, kind, layer), strict=False)
-        for shown, new in pairs:
-            new.hide_viewport = shown.hide_viewport
+        for layer_collection, new in pairs:
+            new.hide_viewport = layer_collection.hide_viewport
 
 
 def _parent_of(collection: Any) -> Any:

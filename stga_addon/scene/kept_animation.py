@@ -251,10 +251,10 @@ def give_animation(owner: Any, kept: KeptAnimation) -> None:
         for field, value in track_fields.items():
             setattr(track, field, value)
     if kept.action is not None:
-        own = animation.action
+        replaced = animation.action
         assign_action(animation, kept.action, kept.slot)
-        if own is not None:
-            _keep_once(own)
+        if replaced is not None:
+            _keep_once(replaced)
 
 
 def _keep_once(action: Any) -> None:

@@ -124,21 +124,21 @@ def light_of(light: Any, matrix: Any) -> Light | None:
     to_world = np.array(matrix, np.float64)
     scale = np.linalg.norm(to_world[:3, :3], axis=0)
     axes = to_world[:3, :3] / np.maximum(scale, 1e-12)
-    own: dict[str, Any] = {}
+    fields: dict[str, Any] = {}
     if light.type == "SUN":
-        own["angle"] = light.angle
+        fields["angle"] = light.angle
         area = np.pi * np.tan(light.angle / 2) ** 2
     elif light.type == "AREA":
         height = light.size_y if light.shape in ("RECTANGLE", "ELLIPSE") else light.size
         is_round = light.shape in ("DISK", "ELLIPSE")
-        own["size"] = width, height = float(light.size * scale[0]), float(height * scale[1])
-        own |= {"tangent": axes[:, 0], "shape": "ellipse" if is_round else "rectangle"}
+        fields["size"] = width, height = float(light.size * scale[0]), float(height * scale[1])
+        fields |= {"tangent": axes[:, 0], "shape": "ellipse" if is_round else "rectangle"}
         area = width * height * (np.pi / 4 if is_round else 1.0)
     else:
-        own["radius"] = light.shadow_soft_size
+        fields["radius"] = light.shadow_soft_size
         area = np.pi * light.shadow_soft_size**2
         if light.type == "SPOT":
-            own |= {"cone": light.spot_size, "blend": light.spot_blend}
+            fields |= {"cone": light.spot_size, "blend": light.spot_blend}
     color = light_strength(light, area)
     shader = _surface_node(shader_nodes(light))
     if shader is not None and shader.type == "EMISSION":
@@ -154,7 +154,7 @@ def light_of(light: Any, matrix: Any) -> Light | None:
         casts_shadow=bool(light.use_shadow),
         diffuse=light.diffuse_factor,
         specular=light.specular_factor,
-        **own,
+        **fields,
     )
 
 

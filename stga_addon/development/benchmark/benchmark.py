@@ -162,13 +162,13 @@ def report_text(
 
 def table_lines(table: Mapping[str, Mapping[str, Spread]]) -> list[str]:
     """Lines of an aligned Markdown table."""
-    shown = [name for name in COLUMNS if any(name in row for row in table.values())]
+    columns = [name for name in COLUMNS if any(name in row for row in table.values())]
     reference = table.get(STANDARD, {}).get("val_psnr")
-    rows = [["variant", *(COLUMNS[name][0] for name in shown)]]
+    rows = [["variant", *(COLUMNS[name][0] for name in columns)]]
     if reference is not None:
         rows[0].append("Δ val")
     for variant, row in table.items():
-        cells = [variant, *(_cell(row.get(name), COLUMNS[name][1]) for name in shown)]
+        cells = [variant, *(_cell(row.get(name), COLUMNS[name][1]) for name in columns)]
         if reference is not None:
             cells.append(
                 f"{row['val_psnr'].mean - reference.mean:+.2f}" if "val_psnr" in row else ""
@@ -247,7 +247,7 @@ def benchmark_chart(curves: Mapping[str, MeanCurve], title: str) -> "Figure":
         axes.fill_between(curve.seconds, curve.low, curve.high, color=color, alpha=0.2, linewidth=0)
         for best, start, end in front:
             if best == name:
-                shown = (curve.seconds >= start) & (curve.seconds <= end)
-                axes.plot(curve.seconds[shown], curve.mean[shown], color=color, linewidth=4)
+                within = (curve.seconds >= start) & (curve.seconds <= end)
+                axes.plot(curve.seconds[within], curve.mean[within], color=color, linewidth=4)
     finish_axes(axes)
     return figure

@@ -133,7 +133,7 @@ def leaks(driver: Head, driven: Head, poses: int) -> None:
         driver.rest - driver.rest.mean(axis=0)
     )
     displaced = [driven.rest + scale * (driver.points(row) - rest) for row in copied]
-    own = _values(driven.map.frames(take))
+    mapped = _values(driven.map.frames(take))
     true = [driven.true_points(row) for row in weights[QUIET_FRAMES:]]
     through = driven.map.parameters(back)[:, : driven.count + 3]
     ways = {
@@ -144,8 +144,8 @@ def leaks(driver: Head, driven: Head, poses: int) -> None:
         "ARKit weights, what they do fitted": _fitted(
             driven, [driven.true_points(row) for row in back], through
         ),
-        "this head's own coefficients": own,
-        "best of this model": _fitted(driven, true, own),
+        "this head's own coefficients": mapped,
+        "best of this model": _fitted(driven, true, mapped),
     }
     print("\n## Another person's motion\n")
     print("| way | from ICT-FaceKit mm | less % | from own coefficients mm | less % |")
@@ -157,7 +157,10 @@ def leaks(driver: Head, driven: Head, poses: int) -> None:
             [
                 np.mean([mean_distance(p, t) for p, t in zip(points, true, strict=True)]),
                 np.mean(
-                    [mean_distance(p, driven.points(v)) for p, v in zip(points, own, strict=True)]
+                    [
+                        mean_distance(p, driven.points(v))
+                        for p, v in zip(points, mapped, strict=True)
+                    ]
                 ),
             ]
         )

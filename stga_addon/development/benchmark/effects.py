@@ -74,10 +74,10 @@ def trained(
         run = Run(capture.root, flame, "vhap", settings, plan)
         avatar = read_avatar(train_run(capture, Path(folder), run).path)
         seconds = read_metrics(Path(folder))[-1]["seconds"]
-        shown = with_refined_tracking(capture, Path(folder), fitted=False)
-    splits = [split for split in ("val", "test") if shown.views.get(split)]
-    quality = {split: evaluate_avatar(avatar, shown, split, True, True) for split in splits}
-    return Trained(shown, avatar, quality, 1000 * seconds / iterations)
+        refined = with_refined_tracking(capture, Path(folder), fitted=False)
+    splits = [split for split in ("val", "test") if refined.views.get(split)]
+    quality = {split: evaluate_avatar(avatar, refined, split, True, True) for split in splits}
+    return Trained(refined, avatar, quality, 1000 * seconds / iterations)
 
 
 def on_and_off(

@@ -132,8 +132,8 @@ class _Viewport:
         depsgraph = bpy.context.evaluated_depsgraph_get()
         layers = all_layers(depsgraph, self._cache)
         camera = self._scene.camera.evaluated_get(depsgraph)
-        seen = render_camera(camera, depsgraph, *SIZE_PX, (0, 0, *SIZE_PX))
-        view = engine.camera_view(seen, camera)
+        image_camera = render_camera(camera, depsgraph, *SIZE_PX, (0, 0, *SIZE_PX))
+        view = engine.camera_view(image_camera, camera)
         if self._static is None or self._static.key != packing.static_key(layers):
             self._static = packing.StaticSplats(layers)
         blocks = [packing.frame_block(layer.frames) for layer in layers]

@@ -86,7 +86,7 @@ def measure(options: argparse.Namespace, folder: Path) -> None:
     """Track, and print a row in Markdown for each timestep."""
     footage = open_footage(options.capture, frames=FrameRange(stop=options.timesteps))
     if options.cameras is not None:
-        at = np.array([own.camera.position for own in footage.cameras])
+        at = np.array([each.camera.position for each in footage.cameras])
         order = np.argsort(np.linalg.norm(at - at.mean(0), axis=1), kind="stable")
         chosen = order[: 2 * options.cameras : 2].tolist()
         footage = replace(footage, cameras=tuple(footage.cameras[row] for row in chosen))
@@ -123,21 +123,21 @@ def measure(options: argparse.Namespace, folder: Path) -> None:
         middle = places.on(local, found.faces)[used].mean(0)
         centers = mesh[true.faces].mean(1)
         normals = vertex_normals(mesh, true.faces)[true.faces].mean(1)
-        seen = np.zeros(len(centers), bool)
-        for view in (own.camera for own in footage.cameras if timestep in own.timesteps):
-            seen |= (facing(view, centers, normals) > MIN_COSINE) & in_sight(
+        visible = np.zeros(len(centers), bool)
+        for view in (each.camera for each in footage.cameras if timestep in each.timesteps):
+            visible |= (facing(view, centers, normals) > MIN_COSINE) & in_sight(
                 view, mesh, true.faces, centers
             )
-        seen &= np.linalg.norm(centers - middle, axis=1) < FACE_RADIUS_M / result.scale
-        distance = 1000 * nearest_points(local, found.faces, centers[seen])[1]
+        visible &= np.linalg.norm(centers - middle, axis=1) < FACE_RADIUS_M / result.scale
+        distance = 1000 * nearest_points(local, found.faces, centers[visible])[1]
         same = len(found.faces) == len(true.faces) or len(mesh) - len(local) == TEETH_VERTICES
         shift = 1000 * np.linalg.norm(local[face] - mesh[face], axis=1).mean() if same else np.nan
         median = np.median(distance)
         most = np.percentile(distance, 90)
         print(f"| {timestep} | {median:.2f} | {most:.2f} | {shift:.2f} |")
     if options.model is None and len(meshes) > 2:
-        heads, own = (np.stack(every) for every in zip(*meshes, strict=True))
-        report_motion(heads, own, found.faces, result.scale)
+        heads, tracked = (np.stack(every) for every in zip(*meshes, strict=True))
+        report_motion(heads, tracked, found.faces, result.scale)
     print(f"\n{len(list(footage.views()))} images, {seconds:.1f} s")
     print(f"reprojection {result.median_px:.2f} px, scale {result.scale:.4f}")
 
@@ -167,7 +167,7 @@ def report_motion(true: np.ndarray, tracked: np.ndarray, faces: np.ndarray, scal
         motion.append(np.stack(laid) - np.mean(laid, axis=0))
     print("\n| part | followed | correlation | median error, mm |\n| --- | --- | --- | --- |")
     for part, where in parts.items():
-        one, other = (own[:, where] for own in motion)
+        one, other = (meshes[:, where] for meshes in motion)
         both = (one * other).sum()
         size = np.square(one).sum()
         error = 1000 * scale * np.median(np.linalg.norm(one - other, axis=2))

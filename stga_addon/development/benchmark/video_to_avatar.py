@@ -55,9 +55,9 @@ def measure(request: MakeAvatar) -> None:
     perform(request, report)
     report(Progress())
     print("\n| step | s |\n| --- | --- |")
-    for name, own in seconds.items():
-        print(f"| {name} | {own:.1f} |")
-    tracking = sum(own for name, own in seconds.items() if name.startswith("Tracking"))
+    for name, duration in seconds.items():
+        print(f"| {name} | {duration:.1f} |")
+    tracking = sum(duration for name, duration in seconds.items() if name.startswith("Tracking"))
     print(f"| **all**, of which tracking {tracking:.0f} | **{last - begin:.0f}** |")
     print(f"\n{sum(os.times()[:4]):.0f} s of processor time")
 

@@ -247,8 +247,8 @@ def _write_transforms(out: Path, cameras: Sequence[Camera], trained: int) -> Non
     train, val, test = splits.values()
     for timestep in range(trained + len(TEST_ACTS)):
         for number, camera in enumerate(cameras):
-            seen = val if number == HELD_OUT else train
-            (seen if timestep < trained else test).append(
+            split = val if number == HELD_OUT else train
+            (split if timestep < trained else test).append(
                 {
                     "timestep_index": timestep,
                     "camera_index": number,

@@ -394,13 +394,13 @@ def _grow(
     root = np.einsum("nk,nka->na", inside, neutral[corners])
     root_cm = np.einsum("nk,nka->na", inside, paint.at[corners])
     step = growth.length(root_cm) * rng.uniform(0.75, 1.1, len(root)) / (POINTS_PER_HAIR - 1)
-    own = rng.normal(0, growth.disorder, (len(root), 3))
+    disorder = rng.normal(0, growth.disorder, (len(root), 3))
     points = [root]
     for number in range(1, POINTS_PER_HAIR):
         at = points[-1]
         near = skin[tree.query(at)[1]]
         normal = normals[near]
-        along = growth.heading(root_cm, normal) + own
+        along = growth.heading(root_cm, normal) + disorder
         along -= (along * normal).sum(1, keepdims=True) * normal
         along /= np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-9)
         fraction = (number - 1) / (POINTS_PER_HAIR - 2)

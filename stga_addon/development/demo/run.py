@@ -132,8 +132,8 @@ def _moving_picture(run: Path, path: Path) -> None:
     assert capture.flame is not None
     views = capture.views["train"]
     ((most, _),) = Counter(view.camera_index for view in views).most_common(1)
-    own = [view for view in views if view.camera_index == most]
-    talk = sorted(own, key=lambda view: view.timestep)
+    camera_views = [view for view in views if view.camera_index == most]
+    talk = sorted(camera_views, key=lambda view: view.timestep)
     avatar = read_avatar(run / AVATAR)
     fps = float(MOVING_PICTURE_FPS)
     driven = performed(demo_speech(), capture.flame, SPEECH_FILE, MotionOptions(), fps=fps)

@@ -175,8 +175,8 @@ def _soft_box(scene: Any, azimuth: float, elevation: float, watts: float, size: 
 
 
 def _body(person: Person) -> Any:
-    shown = person.surface >= 0
-    mesh = triangle_mesh("body", person.neutral, person.model.faces[shown])
+    visible = person.surface >= 0
+    mesh = triangle_mesh("body", person.neutral, person.model.faces[visible])
     attributes = {
         "rest": ("FLOAT_VECTOR", "vector", flat_floats(person.rest)),
         "tint": ("FLOAT_VECTOR", "vector", flat_floats(person.tint)),
@@ -188,7 +188,7 @@ def _body(person: Person) -> Any:
     shaders = {"skin": _skin, "mouth": _wet, "gums": _wet, "teeth": _wet, "eyes": _eye}
     for name in SURFACES:
         mesh.materials.append(new_material(name, shaders[name]))
-    mesh.polygons.foreach_set("material_index", person.surface[shown].astype(np.int32))
+    mesh.polygons.foreach_set("material_index", person.surface[visible].astype(np.int32))
     return mesh
 
 

@@ -342,10 +342,10 @@ class Recording:
             last = self._packets[-1]
             step = now - self._arrived
             if packet.time is not None:
-                own = -1.0 if last.time is None else packet.time - last.time
-                leads = before + own > now + MAX_LEAD_S
-                has_jumped = own <= 0 or leads or packet.subject != last.subject
-                step = max(step, MIN_STEP_S) if has_jumped else own
+                elapsed = -1.0 if last.time is None else packet.time - last.time
+                leads = before + elapsed > now + MAX_LEAD_S
+                has_jumped = elapsed <= 0 or leads or packet.subject != last.subject
+                step = max(step, MIN_STEP_S) if has_jumped else elapsed
             time = before + step
             if step < MIN_STEP_S or len(self._times) >= MAX_ROWS:
                 return

@@ -192,11 +192,11 @@ def plan_of_captures(
 ) -> Plan:
     """A training of each capture; fields: of `Train`, settings: of `make_settings`."""
     folders = [path.resolve() for path in captures]
-    own = [_slug(path.name) for path in folders]
+    slugs = [_slug(path.name) for path in folders]
     jobs: dict[str, Any] = {}
-    for name, path in zip(own, folders, strict=True):
+    for name, path in zip(slugs, folders, strict=True):
         # where several share it, with that of the folder above, or numbered
-        job = name if own.count(name) == 1 else _slug("-".join(path.parts[-2:]))
+        job = name if slugs.count(name) == 1 else _slug("-".join(path.parts[-2:]))
         numbers = (f"train-{job}" if n == 1 else f"train-{job}_{n}" for n in count(1))
         unused = next(each for each in numbers if each not in jobs)
         jobs[unused] = {"request": "train", "settings": dict(settings), **fields}

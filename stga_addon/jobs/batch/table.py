@@ -53,10 +53,10 @@ def table_lines(batch: Batch) -> list[str]:
     """A line on the whole batch, and one for each job that runs or has failed."""
     entries = [entry for entry in batch.entries.values() if entry.state == JobState.RUNNING]
     entries += batch.failures
-    shown = entries[:MAX_LIVE_ROWS]
-    width = max((len(entry.job.name) for entry in shown), default=0)
-    lines = [summary_line(batch), *(_row(entry, width) for entry in shown)]
-    more = len(entries) - len(shown)
+    listed = entries[:MAX_LIVE_ROWS]
+    width = max((len(entry.job.name) for entry in listed), default=0)
+    lines = [summary_line(batch), *(_row(entry, width) for entry in listed)]
+    more = len(entries) - len(listed)
     return [*lines, f"… and {more} more"] if more else lines
 
 

@@ -426,8 +426,8 @@ def _unblend(count, listed, before, batch, s):
         order = np.float32(before + np.int64(q) + 1)
         for k in range(np.uint64(BLOCK_PIXELS)):
             p = first + k
-            own = at + k
-            raw = s[ALPHA + own]
+            place = at + k
+            raw = s[ALPHA + place]
             a = min(MAX_ALPHA, raw)
             a = a if (a >= MIN_ALPHA) & (order <= s[LAST + p]) else np.float32(0.0)
             ra = np.float32(1.0) / (np.float32(1.0) - a)
@@ -440,12 +440,12 @@ def _unblend(count, listed, before, batch, s):
             v_a = t * along - ra * s[BEHIND + p]
             s[p] = t
             s[BEHIND + p] += weight * along
-            s[PART_RED + own] = weight * v_red
-            s[PART_GREEN + own] = weight * v_green
-            s[PART_BLUE + own] = weight * v_blue
+            s[PART_RED + place] = weight * v_red
+            s[PART_GREEN + place] = weight * v_green
+            s[PART_BLUE + place] = weight * v_blue
             # d alpha / d power through the clamp is zero; `a` zeroes pixels that this splat does
             # not reach.
-            s[V_POWER + own] = a * v_a if raw < MAX_ALPHA else np.float32(0.0)
+            s[V_POWER + place] = a * v_a if raw < MAX_ALPHA else np.float32(0.0)
 
 
 @inline_jit

@@ -31,21 +31,21 @@ NEEDED_FEATURES = ("avx2", "bmi", "bmi2", "f16c", "fma", "lzcnt", "movbe")
 FASTER_FEATURE = "avx512f"
 
 
-def kernel_folder(own: Path, beside: Path) -> tuple[Path, bool]:
+def kernel_folder(native: Path, beside: Path) -> tuple[Path, bool]:
     """The folder of compiled kernels, and whether they are the bundled ones.
 
-    own: that of this processor's kernels; beside: of bundled ones where the processor is faster
+    native: that of this processor's kernels; beside: of bundled ones where the processor is faster
     with its own. Has to be called before Numba compiles or loads anything: the name of the
     processor is a part of a kernel's key.
     """
     features = get_host_cpu_features()
     runs = platform.machine() in MACHINES and all(features.get(name) for name in NEEDED_FEATURES)
     if not BUNDLE.is_dir() or not runs or not __name__.startswith(f"{PACKAGE}."):
-        return own, False
+        return native, False
     faster = features.get(FASTER_FEATURE)
-    if faster and (OWN_KERNELS in os.environ or has_kernels(own)):
-        return own, False
-    folder = beside if faster else own
+    if faster and (OWN_KERNELS in os.environ or has_kernels(native)):
+        return native, False
+    folder = beside if faster else native
     with suppress(OSError):  # they are compiled then
         _copy_bundle(folder)
     vars(config).update(CPU_NAME=PROCESSOR, CPU_FEATURES="")

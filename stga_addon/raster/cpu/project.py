@@ -102,8 +102,8 @@ def move_frames(work, coefficients, signal, target, rotation, unit, moved):
 
 
 @parallel(lambda rows, *_: len(rows), piece=4096)
-def count_marked(work, rows, xyz, face, frames, mask, shown, marked):
-    """Add 1 to shown (N,) int32 of the listed splats (M,) int32 whose centers xyz (N, 3) lie in a
+def count_marked(work, rows, xyz, face, frames, mask, inside, marked):
+    """Add 1 to inside (N,) int32 of the listed splats (M,) int32 whose centers xyz (N, 3) lie in a
     camera's image, and to marked (N,) int32 where the mask (H, W) bool holds there; frames: a
     CameraFrames of the mask's size."""
     height, width = mask.shape
@@ -121,7 +121,7 @@ def count_marked(work, rows, xyz, face, frames, mask, shown, marked):
                 column = fl_x * x / z + cx
                 row = fl_y * y / z + cy
                 if 0 <= column < width and 0 <= row < height:
-                    shown[i] += 1
+                    inside[i] += 1
                     if mask[int(row), int(column)]:
                         marked[i] += 1
 
@@ -225,9 +225,9 @@ def _bound(b, column, q):
 
 
 @part_jit
-def _list_seen(rows, covered, rect, b, seen):
-    """List the places of the block's visible splats in `seen`, their bounds shrunk to the rendered
-    tiles, and write `rect` of all as of splats that are not. Returns how many are visible.
+def _list_seen(rows, covered, rect, b, visible):
+    """List the places of the block's visible splats in `visible`, their bounds shrunk to the
+    rendered tiles, and write `rect` of all as of splats that are not. Returns how many are visible.
 
     Without a branch that depends on which tiles are rendered, but at these tiles' border.
     """
@@ -241,7 +241,7 @@ def _list_seen(rows, covered, rect, b, seen):
         y1 = _bound(b, block.Y1, q)
         found = _count_rendered(covered, x0, y0, x1, y1)
         rect[i, 0] = rect[i, 1] = rect[i, 2] = rect[i, 3] = outside
-        seen[count] = q
+        visible[count] = q
         count += np.uint64(found > 0)
         if found > 0 and found < (x1 - x0) * (y1 - y0):
             x0, y0, x1, y1 = _shrink_bounds(covered, x0, y0, x1, y1)
@@ -319,7 +319,7 @@ def project_forward(
     limits = _tan_limits(frames.intrinsics, frames.size)
     coefficients = np.uint64((degree + 1) * (degree + 1))
     b = np.zeros(block.FORWARD_SIZE, np.float32)
-    seen = np.empty(BLOCK_SPLATS, np.uint64)
+    visible = np.empty(BLOCK_SPLATS, np.uint64)
     rows = np.empty(SPLATS_PER_PIECE, np.int64)
     for begin, end in pieces(work):
         found = _list_wanted(begin, end, wanted, rows)
@@ -330,12 +330,12 @@ def project_forward(
             if antialiased:
                 block.compensate_low_pass(b)
             block.project_bounds(b, np.float32(tiles_x), np.float32(tiles_y))
-            count = _list_seen(some, covered, projection.rect, b, seen)
+            count = _list_seen(some, covered, projection.rect, b, visible)
             if count == 0:
                 continue
             block.compute_harmonics(b, frames.to_world)
             for n in range(count):
-                q = seen[n]
+                q = visible[n]
                 i = np.uint64(some[q])
                 red, green, blue = _color(b, q, i, coefficients, splats.sh)
                 if frames.color.shape[1] > 0:

@@ -186,8 +186,8 @@ def render_forward(
     background = np.asarray(background, np.float32)
     blended = new_image(width, height, lists, buffers)
     blend_forward(tiles, tiles_x, tile_blocks, lists, projection, background, blended)
-    shown = (blended, projection, lists, tiles, tile_blocks, focus, touched)
-    return RenderOutput(*shown, background, degree, depth_as_color, antialiased)
+    results = (blended, projection, lists, tiles, tile_blocks, focus, touched)
+    return RenderOutput(*results, background, degree, depth_as_color, antialiased)
 
 
 def render_backward(

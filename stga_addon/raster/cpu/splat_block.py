@@ -281,8 +281,8 @@ def project_bounds(b, tiles_x, tiles_y):
         b[Y1 + q] = min(tiles_y, max(ZERO, np.ceil((mean_y + ey) / size)))
         finite = (opacity >= ZERO) & (det < infinite)
         finite = finite & (abs(mean_x) < infinite) & (abs(mean_y) < infinite)
-        seen = (ONE if reach > ZERO else ZERO) if finite else -ONE
-        b[SEEN + q] = ZERO if b[CAMERA_Z + q] < NEAR_M else seen
+        visible = (ONE if reach > ZERO else ZERO) if finite else -ONE
+        b[SEEN + q] = ZERO if b[CAMERA_Z + q] < NEAR_M else visible
 
 
 @inline_jit

@@ -134,16 +134,16 @@ def _list_visible(k, projection, lists, sorting):
     for i in range(begin, np.uint64(min(len(rect), (k + 1) * SPLATS_PER_SORT))):
         width = rect[i, 2] - rect[i, 0]
         key = depth_bits[i]
-        seen = width > 0
+        visible = width > 0
         found[begin + count] = i
         keys[begin + count] = key
         pairs[i] = width * (rect[i, 3] - rect[i, 1])
         first_pair[i] = before
-        count = count + np.uint64(seen)
+        count = count + np.uint64(visible)
         before = np.int32(before + pairs[i])
-        row[_digit(key, np.uint32(0), np.uint32(0))] += seen
-        least = min(least, key if seen else least)
-        greatest = max(greatest, key if seen else greatest)
+        row[_digit(key, np.uint32(0), np.uint32(0))] += visible
+        least = min(least, key if visible else least)
+        greatest = max(greatest, key if visible else greatest)
     parts[k, SPLATS] = count
     parts[k, PAIRS] = before
     parts[k, LEAST] = least

@@ -83,10 +83,10 @@ def _shadow_shader(nodes: Nodes) -> Any:
     return _by_shadow(nodes, None, nodes.out("ShaderNodeBsdfDiffuse"))
 
 
-def _by_shadow(nodes: Nodes, seen: Any, shadow: Any) -> Any:
+def _by_shadow(nodes: Nodes, visible: Any, shadow: Any) -> Any:
     """One shader for rays to lights and one for all others; None: these pass."""
     is_shadow = nodes.add("ShaderNodeLightPath").outputs["Is Shadow Ray"]
-    shaders = [each or nodes.out("ShaderNodeBsdfTransparent") for each in (seen, shadow)]
+    shaders = [each or nodes.out("ShaderNodeBsdfTransparent") for each in (visible, shadow)]
     return nodes.out("ShaderNodeMixShader", {"Fac": is_shadow, "Shader": shaders})
 
 

@@ -281,9 +281,9 @@ def _radiance(nodes: Nodes, added: Any, flat: Any) -> Socket:
     fitted, is_fitted = nodes.attribute_if_any(stored.LINEAR_SH, "FLOAT_VECTOR")
     base = nodes.switch("VECTOR", is_fitted, nodes.attribute(stored.SH.format(0)), fitted)
     base = nodes.vector("MULTIPLY_ADD", added, (1 / SH_C0,) * 3, base)
-    shown = nodes.group(LINEAR_TO_SRGB, nodes.attribute(stored.DISPLAY_COLOR, "FLOAT_COLOR"))
-    shown = nodes.scale(nodes.vector("SUBTRACT", shown, (0.5, 0.5, 0.5)), 1 / SH_C0)
-    base = nodes.switch("VECTOR", flat, base, shown)
+    color = nodes.group(LINEAR_TO_SRGB, nodes.attribute(stored.DISPLAY_COLOR, "FLOAT_COLOR"))
+    color = nodes.scale(nodes.vector("SUBTRACT", color, (0.5, 0.5, 0.5)), 1 / SH_C0)
+    base = nodes.switch("VECTOR", flat, base, color)
     clamped = nodes.vector("MINIMUM", nodes.vector("MAXIMUM", base, MIN_BASE), MAX_BASE)
     red, green, blue = nodes.components(clamped)
     trained = nodes.attribute(stored.OPACITY, "FLOAT")
@@ -484,8 +484,8 @@ def _build(nodes: Nodes, options: TreeOptions) -> None:
         native = nodes.group(NATIVE_GROUPS[options.degree], given or splats, visible, *fields)
         if lit is not None:
             native = nodes.switch("GEOMETRY", lit, native, nodes.group(LIT, native, head))
-    shown = displayed(nodes, inputs[DISPLAY], splats, visible, inputs[SIZE], native)
-    nodes.finish("NodeGroupOutput", {"Geometry": shown})
+    geometry = displayed(nodes, inputs[DISPLAY], splats, visible, inputs[SIZE], native)
+    nodes.finish("NodeGroupOutput", {"Geometry": geometry})
     for item in nodes.tree.interface.items_tree:  # a menu has items only once it is linked
         if item.name in MENUS:
             item.default_value = MENUS[item.name]
@@ -505,11 +505,11 @@ def _color(nodes: Nodes, inputs: Any, added: Any, degree: int) -> Any:
     camera = nodes.object_info(nodes.out("GeometryNodeInputActiveCamera")).outputs["Location"]
     position = nodes.out("GeometryNodeInputPosition")
     direction = nodes.vector("NORMALIZE", nodes.vector("SUBTRACT", position, camera))
-    seen = nodes.sum(srgb, *(nodes.group(band, direction) for band in SH_BANDS[:degree]))
+    view_dependent = nodes.sum(srgb, *(nodes.group(band, direction) for band in SH_BANDS[:degree]))
     # Without a camera object the location is zero, which is inside the head: no camera is there.
     has_camera = nodes.compare("GREATER_THAN", nodes.vector("LENGTH", camera), 0.0)
     is_chosen = nodes.logic("AND", inputs[VIEW_DEPENDENT], has_camera)
-    return nodes.switch("RGBA", is_chosen, color, nodes.group(SRGB_TO_LINEAR, seen))
+    return nodes.switch("RGBA", is_chosen, color, nodes.group(SRGB_TO_LINEAR, view_dependent))
 
 
 def _frozen_splats(nodes: Nodes, mesh: Any) -> Socket:

@@ -118,9 +118,9 @@ def _exchange_tree(splat_object: Any, tree: Any) -> None:
 
 def splats_of(head: Any, scene: Any, linked: bool = False) -> list[Any]:
     """The splat objects of the scene that follow the head and can be changed, or are linked."""
-    shown = [each for each in scene.objects if tags.CONVENTION in each]
-    own = [each for each in shown if (each.library is not None) == linked]
-    return [each for each in own if followed_head(each) == head]
+    splats = [each for each in scene.objects if tags.CONVENTION in each]
+    wanted = [each for each in splats if (each.library is not None) == linked]
+    return [each for each in wanted if followed_head(each) == head]
 
 
 def check_own_data(splat_object: Any) -> None:
@@ -165,11 +165,11 @@ def _own_neutral(splat_object: Any) -> Any:
     neutral = get_input(splat_object, splat_nodes.NEUTRAL)
     others = [each for each in bpy.data.objects if tags.CONVENTION in each]
     sharing = [each for each in others if _stored_neutral(each) == neutral.data]
-    own = [each for each in sharing if each.data == splat_object.data and each.library is None]
-    if len(own) < len(sharing):
+    local = [each for each in sharing if each.data == splat_object.data and each.library is None]
+    if len(local) < len(sharing):
         neutral = neutral.copy()
         neutral.data = neutral.data.copy()
-        for each in own:
+        for each in local:
             set_input(each, splat_nodes.NEUTRAL, neutral)
     return neutral.data
 
@@ -200,9 +200,9 @@ def store_light(splat_object: Any, avatar: Avatar) -> bool:
 def store_linear_base(splat_object: Any, avatar: Avatar) -> bool:
     """Give the object the colors for linear light of the same avatar; False where it shows
     another one."""
-    shown = stored_avatar(splat_object).splats
+    splats = stored_avatar(splat_object).splats
     known = avatar.splats
-    if len(shown) != len(known) or not np.array_equal(shown.sh[:, 0], known.sh[:, 0]):
+    if len(splats) != len(known) or not np.array_equal(splats.sh[:, 0], known.sh[:, 0]):
         return False
     stored.write_attributes(splat_object.data, stored.linear_attributes(avatar), "POINT")
     splat_object.data.update()
@@ -282,8 +282,10 @@ def triangles_hint(splat_object: Any, depsgraph: Any) -> str | None:
     neutral = get_input(splat_object, splat_nodes.NEUTRAL)
     if head is None or neutral is None:
         return None
-    shown = head.evaluated_get(depsgraph)
-    if shown.type == "MESH" and len(shown.data.vertices) >= len(neutral.data.vertices):
+    evaluated_head = head.evaluated_get(depsgraph)
+    if evaluated_head.type == "MESH" and len(evaluated_head.data.vertices) >= len(
+        neutral.data.vertices
+    ):
         return None
     follower = splat_object.name
     return (
@@ -423,6 +425,6 @@ def _splat_object(name: str, collection: Any, options: splat_nodes.TreeOptions) 
 
 
 def _tree_options(avatar: Avatar) -> splat_nodes.TreeOptions:
-    shown = [name for name, offset in OFFSETS.items() if offset.signal in SIGNALS]
-    offsets = tuple(name for name in shown if name in avatar.driven_offsets)
+    names = [name for name, offset in OFFSETS.items() if offset.signal in SIGNALS]
+    offsets = tuple(name for name in names if name in avatar.driven_offsets)
     return splat_nodes.TreeOptions(avatar.convention, avatar.splats.sh_degree, offsets)

@@ -165,9 +165,9 @@ class SplatsEngine(bpy.types.RenderEngine):  # type: ignore[misc]
                 hidden = np.zeros_like(image.alpha) if image.hidden is None else image.hidden
                 color = color + combined(image.rgb, image.alpha, background, inverse, hidden)
                 if asks_depth:
-                    seen = image.alpha - hidden
-                    fraction = fraction + seen
-                    distance = distance + np.where(seen > 0, seen * image.depth, 0)
+                    visible = image.alpha - hidden
+                    fraction = fraction + visible
+                    distance = distance + np.where(visible > 0, visible * image.depth, 0)
                 self.update_stats("", f"{sum(len(layer.splats) for layer in layers)} splats")
                 self.update_progress((taken + 1) / len(samples))
                 if self.test_break():
@@ -208,8 +208,8 @@ class SplatsEngine(bpy.types.RenderEngine):  # type: ignore[misc]
         before, after, now = places
         found = []
         for other in (before, after):
-            shown, scale = motion_vectors.painted(layers, motion_vectors.moved(now, other))
-            image = self._image(shown, view, renderers)
+            painted, scale = motion_vectors.painted(layers, motion_vectors.moved(now, other))
+            image = self._image(painted, view, renderers)
             found.append(motion_vectors.read_motion(image, scale, MIN_ALPHA))
         return np.concatenate([found[0], -found[1]], axis=2)
 

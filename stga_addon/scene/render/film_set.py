@@ -35,10 +35,10 @@ def show_set(scene: Any) -> None:
     leave_out_set(scene)  # what is left of one
     scene.render.use_compositing = True
     tree = compat.compositor_tree(scene) or compat.new_compositor_tree(scene)
-    own = next((node for node in tree.nodes if _renders(node, scene)), None)
-    if own is None:
-        own = tree.nodes.new("CompositorNodeRLayers")
-        own.scene = scene
+    splat_layers = next((node for node in tree.nodes if _renders(node, scene)), None)
+    if splat_layers is None:
+        splat_layers = tree.nodes.new("CompositorNodeRLayers")
+        splat_layers.scene = scene
     title = f"{scene.name} Set"
     scene[tags.SET] = bpy.data.scenes.new(title)
     if not scene.view_layers[0].use_pass_z:
@@ -50,15 +50,15 @@ def show_set(scene: Any) -> None:
     layers = tree.nodes.new("CompositorNodeRLayers")
     layers.name = layers.label = LAYERS
     layers.scene = scene[tags.SET]
-    layers.location = own.location.x, own.location.y - 400.0
+    layers.location = splat_layers.location.x, splat_layers.location.y - 400.0
     both = tree.nodes.new("CompositorNodeGroup")
     both.name = both.label = NODE
     both.node_tree = _depth_combine()
-    both.location = own.location.x + 350.0, own.location.y
+    both.location = splat_layers.location.x + 350.0, splat_layers.location.y
     for name in PASSES:
-        for link in list(own.outputs[name].links):
+        for link in list(splat_layers.outputs[name].links):
             tree.links.new(both.outputs[name], link.to_socket)
-        tree.links.new(own.outputs[name], both.inputs[f"Splats {name}"])
+        tree.links.new(splat_layers.outputs[name], both.inputs[f"Splats {name}"])
         tree.links.new(layers.outputs[name], both.inputs[f"Set {name}"])
     for splats in filter(tags.is_splats, scene.objects):
         head = followed_head(splats)
@@ -98,8 +98,8 @@ def update_set(scene: Any) -> None:
     other = scene.get(tags.SET)
     if other is None or not other.collection.children:
         return
-    shown = objects_of_images(scene.view_layers[0].layer_collection)
-    wanted = {each for each in shown if not tags.is_splats(each)}
+    objects = objects_of_images(scene.view_layers[0].layer_collection)
+    wanted = {each for each in objects if not tags.is_splats(each)}
     followers = other.collection.children[0].objects
     present = set(followers)
     for each in present - wanted:
@@ -151,8 +151,8 @@ def _depth_combine() -> Any:
     behind = compat.alpha_over(nodes, splats, others)
     nearest = compat.compositor_math(nodes, "MINIMUM", splat_depth, other_depth)
     alpha = nodes.add("CompositorNodeSeparateColor", {"Image": splats}).outputs["Alpha"]
-    seen = compat.compositor_math(nodes, "SUBTRACT", 1.0, hidden)
-    mask = compat.compositor_math(nodes, "MULTIPLY", alpha, seen)
+    visible = compat.compositor_math(nodes, "SUBTRACT", 1.0, hidden)
+    mask = compat.compositor_math(nodes, "MULTIPLY", alpha, visible)
     image = compat.compositor_mix(nodes, hidden, before, behind)
     nodes.finish("NodeGroupOutput", {"Image": image, "Depth": nearest, "Mask": mask})
     return tree

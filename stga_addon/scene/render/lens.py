@@ -69,13 +69,13 @@ def seen_from(view: View, camera: Any, point: np.ndarray) -> View:
     data = camera.data
     radius = 1e-3 * data.lens / (2 * data.dof.aperture_fstop)
     right, down = radius * point
-    own = view.camera
-    moved = own.world_to_camera.copy()
+    pinhole = view.camera
+    moved = pinhole.world_to_camera.copy()
     moved[:2, 3] -= right, down
     distance = max(_focus_distance(camera), 1e-6)
-    cx = own.cx + own.fl_x * right / distance
-    cy = own.cy + own.fl_y * down / distance
-    return replace(view, camera=replace(own, cx=cx, cy=cy, world_to_camera=moved))
+    cx = pinhole.cx + pinhole.fl_x * right / distance
+    cy = pinhole.cy + pinhole.fl_y * down / distance
+    return replace(view, camera=replace(pinhole, cx=cx, cy=cy, world_to_camera=moved))
 
 
 def _focus_distance(camera: Any) -> float:

@@ -22,8 +22,8 @@ def pixel_centers(layers: Sequence[SceneLayer], view: View) -> list[np.ndarray]:
     for layer in layers:
         splats = layer.splats
         placed = points_to_world(splats.xyz, layer.frames, splats.face)
-        seen = camera.world_to_camera @ layer.to_world
-        x, y, depth = seen[:3, :3] @ placed.T + seen[:3, 3:]
+        to_camera = camera.world_to_camera @ layer.to_world
+        x, y, depth = to_camera[:3, :3] @ placed.T + to_camera[:3, 3:]
         depth = np.where(depth > MIN_DEPTH_M, depth, np.nan)
         found.append(np.stack([camera.fl_x * x / depth, -camera.fl_y * y / depth], axis=1))
         found[-1] += camera.cx, -camera.cy
@@ -44,15 +44,15 @@ def painted(
     """The layers in colors that are their motion (N, 2): 0.5 plus a multiple; and its divisor."""
     largest = max((float(np.abs(each).max(initial=0)) for each in motion), default=0.0)
     scale = 2 * max(largest, 1e-6)
-    shown = []
+    colored = []
     for layer, moved in zip(layers, motion, strict=True):
         sh = np.zeros((len(moved), 1, 3), np.float32)
         sh[:, 0, :2] = moved / (scale * SH_C0)
         frames = replace(layer.frames, color=NO_COLUMNS)
         settings = replace(layer.settings, show_selection=False, show_unseen=False)
         splats = replace(layer.splats, sh=sh)
-        shown.append(replace(layer, splats=splats, frames=frames, settings=settings, relit=None))
-    return shown, scale
+        colored.append(replace(layer, splats=splats, frames=frames, settings=settings, relit=None))
+    return colored, scale
 
 
 def read_motion(image: ComposedImage, scale: float, least_alpha: float) -> np.ndarray:

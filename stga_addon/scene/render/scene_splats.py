@@ -102,11 +102,15 @@ class SplatCache:
             self._stored[key] = read
         return self._stored[key]
 
-    def native(self, shown: Any) -> Splats | None:
+    def native(self, pointcloud: Any) -> Splats | None:
         """`read_native_splats` of an evaluated object, by that and where its data are."""
-        key = shown.original.session_uid, shown.data.as_pointer(), len(shown.data.points)
+        key = (
+            pointcloud.original.session_uid,
+            pointcloud.data.as_pointer(),
+            len(pointcloud.data.points),
+        )
         if key not in self._native:
-            self._native[key] = read_native_splats(shown.data)
+            self._native[key] = read_native_splats(pointcloud.data)
         return self._native[key]
 
     def frames(
@@ -203,29 +207,31 @@ def native_layers(
     those that it has, too."""
     layers = []
     for instance in depsgraph.object_instances if compat.NATIVE_SPLATS else ():
-        shown = instance.object
-        owner = instance.parent if instance.is_instance else shown
+        evaluated_object = instance.object
+        owner = instance.parent if instance.is_instance else evaluated_object
         # the data are there until the next instance only
-        original = shown.original
-        if shown.type != "POINTCLOUD":
+        original = evaluated_object.original
+        if evaluated_object.type != "POINTCLOUD":
             continue
         if _is_own(owner.original, original) and not is_wanted(original):
             continue
-        is_hidden = owner.hide_render or not (owner.visible_camera and shown.visible_camera)
+        is_hidden = owner.hide_render or not (
+            owner.visible_camera and evaluated_object.visible_camera
+        )
         if view is None and is_hidden:
             continue
-        splats = cache.native(shown)
+        splats = cache.native(evaluated_object)
         if splats is not None:
             to_world = np.array(instance.matrix_world, np.float64)
-            holdout = view is None and (owner.is_holdout or shown.is_holdout)
+            holdout = view is None and (owner.is_holdout or evaluated_object.is_holdout)
             layers.append(SceneLayer(splats, WORLD, to_world, holdout=holdout))
     return layers
 
 
-def _is_own(owner: Any, shown: Any) -> bool:
+def _is_own(owner: Any, pointcloud: Any) -> bool:
     """Whether `visible_layers` has these splats."""
-    is_known = owner == shown or owner.instance_type == "COLLECTION"
-    return is_known and tags.is_splats(shown)
+    is_known = owner == pointcloud or owner.instance_type == "COLLECTION"
+    return is_known and tags.is_splats(pointcloud)
 
 
 def all_layers(depsgraph: Any, cache: SplatCache, view: Any = None) -> list[SceneLayer]:
@@ -239,10 +245,14 @@ def evaluated_splats(depsgraph: Any, cache: SplatCache, to_file: np.ndarray) -> 
     highest degree among them, by a matrix (4, 4) from Blender's axes; native ones as modifiers
     after ours leave them. Raises StgaError as `visible_layers`, and where there are none."""
 
-    def is_changed(shown: Any) -> bool:
-        return bool(later_modifiers(shown)) and display_mode(shown) == splat_nodes.NATIVE
+    def is_changed(splat_object: Any) -> bool:
+        return (
+            bool(later_modifiers(splat_object)) and display_mode(splat_object) == splat_nodes.NATIVE
+        )
 
-    layers = visible_layers(depsgraph, cache, is_wanted=lambda shown: not is_changed(shown))
+    layers = visible_layers(
+        depsgraph, cache, is_wanted=lambda splat_object: not is_changed(splat_object)
+    )
     layers += native_layers(depsgraph, cache, is_wanted=is_changed)
     camera = depsgraph.scene.camera
     eye = None if camera is None else np.array(camera.evaluated_get(depsgraph).matrix_world)[:3, 3]
@@ -263,9 +273,11 @@ def evaluated_splats(depsgraph: Any, cache: SplatCache, to_file: np.ndarray) -> 
 def with_heads(scene: Any) -> list[Any]:
     """The splat objects of the scene and its background, and the heads that they follow, for
     `kept_evaluated`."""
-    objects = [each for own in (scene, *_background_scenes(scene)) for each in own.objects]
-    shown = list(filter(tags.is_splats, objects))
-    return [*shown, *map(followed_head, shown)]
+    objects = [
+        each for each_scene in (scene, *_background_scenes(scene)) for each in each_scene.objects
+    ]
+    splats = list(filter(tags.is_splats, objects))
+    return [*splats, *map(followed_head, splats)]
 
 
 def _posed_vertices(splat_object: Any, head: Any, avatar: Avatar, depsgraph: Any) -> np.ndarray:
@@ -353,16 +365,16 @@ def _is_seen(owner: Any, instance: Any, depsgraph: Any) -> bool:
     """Whether the camera sees an object of a final image, which is an instance of `owner`."""
     layers = shown_view_layers(depsgraph)
     is_indirect = any(owner.indirect_only_get(view_layer=layer) for layer in layers)
-    seen = (each.evaluated_get(depsgraph).visible_camera for each in (owner, instance))
-    return not is_indirect and all(seen)
+    visible = (each.evaluated_get(depsgraph).visible_camera for each in (owner, instance))
+    return not is_indirect and all(visible)
 
 
 def _is_holdout(owner: Any, instance: Any, depsgraph: Any) -> bool:
     """Whether an object of a final image hides what it covers, by its collections or its own."""
     layers = shown_view_layers(depsgraph)
     is_masked = any(owner.holdout_get(view_layer=layer) for layer in layers)
-    own = (each.evaluated_get(depsgraph).is_holdout for each in (owner, instance))
-    return is_masked or any(own)
+    holdouts = (each.evaluated_get(depsgraph).is_holdout for each in (owner, instance))
+    return is_masked or any(holdouts)
 
 
 def relight_frame(splat_object: Any, scene: Any) -> None:
@@ -370,7 +382,7 @@ def relight_frame(splat_object: Any, scene: Any) -> None:
     StgaError."""
     with kept_evaluated(with_heads(scene)):
         depsgraph = bpy.context.evaluated_depsgraph_get()
-        only = lambda shown: shown == splat_object  # noqa: E731
+        only = lambda candidate: candidate == splat_object  # noqa: E731
         layers = visible_layers(depsgraph, SplatCache(), is_wanted=only)
     if not layers or layers[0].relit is None:
         raise StgaError(
@@ -419,7 +431,7 @@ def light_hint(scene: Any) -> str | None:
     """A sentence where EEVEE and Cycles render in another light than the scene's, or in a shadow
     that is none, or None."""
     rendered = [each for each in scene.objects if tags.CONVENTION in each and not each.hide_render]
-    if any(is_lit(shown) and throws_shadow(shown) for shown in rendered):
+    if any(is_lit(splat_object) and throws_shadow(splat_object) for splat_object in rendered):
         return (
             "The head's mesh darkens its own splats, which throw their shadow without it in Scene "
             "Light: turn Head Shadow off"
@@ -427,10 +439,14 @@ def light_hint(scene: Any) -> str | None:
     settings = lighting_settings(scene)
     if settings is None or settings.mode == "recorded":
         return None
-    for shown in rendered:
-        if stored_light(shown) is None or is_lit(shown):
+    for splat_object in rendered:
+        if stored_light(splat_object) is None or is_lit(splat_object):
             continue
-        frame = shown.data.get(tags.RELIT_FRAME) if RELIT_COLOR in shown.data.attributes else None
+        frame = (
+            splat_object.data.get(tags.RELIT_FRAME)
+            if RELIT_COLOR in splat_object.data.attributes
+            else None
+        )
         if frame != scene.frame_current:
             now = "colors as recorded" if frame is None else f"the light of frame {frame}"
             return (

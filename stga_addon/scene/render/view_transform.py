@@ -43,22 +43,24 @@ _measured: dict[tuple[Any, ...], "InverseView"] = {}
 
 
 class InverseView:
-    """The inverse of a view transform. shown: (G, G, G, 3) sRGB 0…1 of the scene-linear colors
+    """The inverse of a view transform. displayed: (G, G, G, 3) sRGB 0…1 of the scene-linear colors
     whose red, green and blue are `axis` (G,)."""
 
-    def __init__(self, axis: np.ndarray, shown: np.ndarray) -> None:
+    def __init__(self, axis: np.ndarray, displayed: np.ndarray) -> None:
         self._axis = axis
-        self._shown = shown
+        self._shown = displayed
         nodes = np.linspace(0, 1, INVERSE_GRID) ** 2  # denser in the dark
         target = np.stack(np.meshgrid(nodes, nodes, nodes, indexing="ij"), -1).reshape(-1, 3)
         # Places in samples that show `target` best, by damped Gauss-Newton steps.
         last = len(axis) - 1
-        grays = np.maximum.accumulate(np.einsum("iiic->ci", shown), axis=1)
+        grays = np.maximum.accumulate(np.einsum("iiic->ci", displayed), axis=1)
         by_channel = zip(target.T, grays, strict=True)
         place = np.stack([np.interp(t, gray, np.arange(last + 1)) for t, gray in by_channel], 1)
-        slopes = np.stack(np.gradient(shown, axis=(0, 1, 2)), -1).reshape(*shown.shape[:3], 9)
+        slopes = np.stack(np.gradient(displayed, axis=(0, 1, 2)), -1).reshape(
+            *displayed.shape[:3], 9
+        )
         for _ in range(INVERSE_STEPS):
-            rest = interpolate(shown, place) - target
+            rest = interpolate(displayed, place) - target
             jacobian = interpolate(slopes, place).reshape(-1, 3, 3)
             transposed = jacobian.transpose(0, 2, 1)
             normal = transposed @ jacobian + DAMPING * np.eye(3)
@@ -165,8 +167,8 @@ def _scalars(data: Any) -> list[Any]:
 def _inverse(scene: Any) -> InverseView:
     axis = _axis(scene)
     grid = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), -1)
-    shown = _shown(scene, grid.reshape(GRID**2, GRID, 3))
-    return InverseView(axis, shown.reshape(grid.shape))
+    displayed = _shown(scene, grid.reshape(GRID**2, GRID, 3))
+    return InverseView(axis, displayed.reshape(grid.shape))
 
 
 def _axis(scene: Any) -> np.ndarray:
@@ -174,8 +176,8 @@ def _axis(scene: Any) -> np.ndarray:
     more, as just above the black level of curves."""
     stops = np.linspace(DARKEST, BRIGHTEST, RAMP - 1) - scene.view_settings.exposure
     ramp = np.append(0, 2**stops)
-    shown = _shown(scene, np.repeat(ramp[None, :, None], 3, axis=2))[0]
-    steps = np.abs(np.diff(shown, axis=0)).max(axis=1)
+    displayed = _shown(scene, np.repeat(ramp[None, :, None], 3, axis=2))[0]
+    steps = np.abs(np.diff(displayed, axis=0)).max(axis=1)
     even = np.full(len(steps), 1 / len(steps))
     total = np.cumsum(even + STEP_WEIGHT * steps / max(steps.sum(), 1e-12))
     place = np.interp(np.linspace(0, total[-1], GRID), np.append(0, total), np.arange(RAMP))
@@ -237,9 +239,9 @@ def combined(
     color = rgb[:, covered].T
     fraction = alpha[covered][:, None]
     held_out = np.broadcast_to(hidden, alpha.shape)
-    seen = 1 - held_out[covered][:, None]
+    visible = 1 - held_out[covered][:, None]
     if background is None:
-        seen = fraction - held_out[covered][:, None]
+        visible = fraction - held_out[covered][:, None]
         image[..., 3] = alpha - held_out
     else:
         linear = np.array(background, np.float32)
@@ -247,7 +249,7 @@ def combined(
         image[...] = *background, 1
         color = np.clip(color + (1 - fraction) * behind, 0, 1)
         image[..., 3] = 1 - held_out
-    image[covered, :3] = to_linear(color / np.maximum(seen, MIN_SEEN)) * seen
+    image[covered, :3] = to_linear(color / np.maximum(visible, MIN_SEEN)) * visible
     return image
 
 

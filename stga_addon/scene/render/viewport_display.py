@@ -100,7 +100,7 @@ class GpuDisplay:
             context.evaluated_depsgraph_get(),
             self.cache,
             space,
-            lambda shown: everything or display_mode(shown) == AS_TRAINED,
+            lambda splat_object: everything or display_mode(splat_object) == AS_TRAINED,
         )
         if everything:  # else Blender draws native splats
             layers += native_layers(context.evaluated_depsgraph_get(), self.cache, space)

@@ -172,13 +172,13 @@ def _other_keys(head: Any, capture: Capture) -> dict[str, OtherKey]:
     pattern = TIMESTEP_KEY if find_rig(head) is None else FLAME_KEY
     made = set(head.get(keyframes.EXPRESSION_NAMES, "").split(","))
     made |= keyframes.added_shapes(head)
-    own = [key for key in keys.key_blocks[1:] if not pattern.fullmatch(key.name)]
+    others = [key for key in keys.key_blocks[1:] if not pattern.fullmatch(key.name)]
     return {
         each.name: (
             key_points(each) - key_points(each.relative_key),
             {field: getattr(each, field) for field in KEY_FIELDS},
         )
-        for each in own
+        for each in others
         if each.name not in made
     }
 
