@@ -105,9 +105,9 @@ class SelectPanel(SidebarPanel, bpy.types.Panel):
             return
         row = layout.row(align=True)
         row.operator("stga.count_selected", icon="FILE_REFRESH")
-        shown = has_heat_map(head) and not shows_residuals(head)
-        how = {"text": "Hide Heat Map" if shown else "Show Heat Map", "depress": shown}
-        row.operator("stga.heat_map", icon="BRUSHES_ALL", **how).show = not shown
+        is_visible = has_heat_map(head) and not shows_residuals(head)
+        how = {"text": "Hide Heat Map" if is_visible else "Show Heat Map", "depress": is_visible}
+        row.operator("stga.heat_map", icon="BRUSHES_ALL", **how).show = not is_visible
 
 
 def has_selection(head: Any) -> bool:

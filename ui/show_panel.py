@@ -132,8 +132,8 @@ class LightingPanel(SidebarPanel, bpy.types.Panel):
             column.use_property_split = True
             if settings.mode == "mix":
                 column.prop(settings, "mix")
-            shown = ("exposure", "white", "roughness", "specular", "shadows", "world", "lights")
-            for name in shown:
+            names = ("exposure", "white", "roughness", "specular", "shadows", "world", "lights")
+            for name in names:
                 column.prop(settings, name)
             if settings.world and world_light(context.scene.world) is None:
                 hint = "Of worlds, colors and environment textures count"
@@ -144,9 +144,9 @@ class LightingPanel(SidebarPanel, bpy.types.Panel):
         row = layout.row(align=True)
         row.operator("stga.relight_frame")
         row.operator("stga.relight_frame", text="", icon="X").clear = True
-        shown = context.scene.stga.splats
+        splats = context.scene.stga.splats
         # native splats throw their own
-        if splat_object.display_mode(shown) != NATIVE or throws_shadow(shown):
+        if splat_object.display_mode(splats) != NATIVE or throws_shadow(splats):
             layout.operator("stga.head_shadow")
 
 
@@ -232,8 +232,8 @@ class RenderPanel(bpy.types.Panel):
         layout = self.layout
         has_python = has_training_python(context)
         layout.use_property_split = True
-        shown = "Shown" if shows_set(context.scene) else "Left Out"
-        layout.operator_menu_enum("stga.choose_set", "shown", text=f"Set: {shown}")
+        state = "Shown" if shows_set(context.scene) else "Left Out"
+        layout.operator_menu_enum("stga.choose_set", "shown", text=f"Set: {state}")
         if lens.is_blurred(context.scene):
             layout.prop(context.scene.eevee, "taa_render_samples", text="Samples")
             draw_text(layout, context, "Each sample takes the time of an image", "INFO")

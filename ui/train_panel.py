@@ -135,11 +135,13 @@ class ContinuePanel(HeadPanel, bpy.types.Panel):
         column = self.layout.column()
         head = settings.head
         options = settings.refine
-        shown = shows_residuals(head)
+        is_visible = shows_residuals(head)
         editing = head.mode == "EDIT"
-        text = "Hide Residuals" if shown else "Show Residuals"
-        residuals = column.operator("stga.heat_map", text=text, icon="BRUSHES_ALL", depress=shown)
-        residuals.show = not shown
+        text = "Hide Residuals" if is_visible else "Show Residuals"
+        residuals = column.operator(
+            "stga.heat_map", text=text, icon="BRUSHES_ALL", depress=is_visible
+        )
+        residuals.show = not is_visible
         residuals.of = "RESIDUAL"
         if not editing:
             column.prop_search(options, "group", head, "vertex_groups", text="Region")

@@ -84,7 +84,7 @@ class Level:
         import cv2
 
         along = np.array([[-0.5, 0, 0.5]], np.float32)
-        return np.stack([cv2.filter2D(self.channels, -1, own) for own in (along, along.T)])
+        return np.stack([cv2.filter2D(self.channels, -1, kernel) for kernel in (along, along.T)])
 
     @cached_property
     def luma(self) -> np.ndarray:
@@ -189,7 +189,7 @@ def mean_around(
     scale = min(1.0, MIN_NEIGHBORHOOD_PX / deviations[0])
     small = tuple(max(1, round(scale * side)) for side in image.shape[1::-1])
     both = cv2.bitwise_and(image, image, mask=known), 255 * known
-    weighted, weight = (reduced(own, small) for own in both)
+    weighted, weight = (reduced(plane, small) for plane in both)
     weighted = weighted.astype(np.float32)
     weight = weight.astype(np.float32) / 255
     total = np.zeros_like(weighted)
@@ -326,11 +326,11 @@ def average_texture(samples: Sequence[Sample]) -> Texture:
     Texture and lighting are solved in turns, beginning with skin of one color. Robust against what
     hides the skin.
     """
-    weight = np.stack([own.weight for own in samples])
+    weight = np.stack([sample.weight for sample in samples])
     known = weight.sum(0) > MIN_OBSERVATIONS
-    first = _robust_mean([own.values[0] for own in samples], weight)
+    first = _robust_mean([sample.values[0] for sample in samples], weight)
     luma = np.tile(np.median(first[known if known.any() else ...], axis=0), (len(first), 1))
-    lights = {own.camera: np.eye(own.basis.shape[1])[0] for own in samples}
+    lights = {sample.camera: np.eye(sample.basis.shape[1])[0] for sample in samples}
     lit = [sample.values for sample in samples]
     values = [luma]
     for number in range(TEXTURE_ITERATIONS):
@@ -340,19 +340,23 @@ def average_texture(samples: Sequence[Sample]) -> Texture:
             for s in samples
         ]
         for name in lights:
-            own = [light for light, s in zip(found, samples, strict=True) if s.camera == name]
-            lights[name] = np.median(own, axis=0)
+            camera_lights = [
+                light for light, s in zip(found, samples, strict=True) if s.camera == name
+            ]
+            lights[name] = np.median(camera_lights, axis=0)
         factors = [shading(s.basis, light) for s, light in zip(samples, found, strict=True)]
         both = list(zip(samples, factors, strict=True))
         lit = [[level / factor for level in s.values] for s, factor in both]
-        values = [_robust_mean([own[level] for own in lit], weight) for level in range(len(lit[0]))]
-    difference = np.abs(np.stack([own[0] for own in lit]) - values[0])[..., 1:].max(2)
+        values = [
+            _robust_mean([levels[level] for levels in lit], weight) for level in range(len(lit[0]))
+        ]
+    difference = np.abs(np.stack([levels[0] for levels in lit]) - values[0])[..., 1:].max(2)
     deviation = (weight * np.minimum(difference, MAX_DEVIATION_LEVELS)).sum(0)
     deviation = deviation / np.maximum(weight.sum(0), 1e-9)
     trust = np.where(known, 1 / (1 + (deviation / TEXTURE_SCALE) ** 2), 0.0)
     by_camera: dict[bytes, list[np.ndarray]] = {}
     for name in lights:  # what one camera sees, drawn to what all do
-        rows = [row for row, own in enumerate(samples) if own.camera == name]
+        rows = [row for row, sample in enumerate(samples) if sample.camera == name]
         fraction = weight[rows].sum(0)[:, None]
         by_camera[name] = []
         for level, every in enumerate(values):

@@ -181,18 +181,18 @@ def take_of(footage: Footage, workers: Workers) -> tuple[str, str]:
     count = len(camera.timesteps)
     if count < MIN_IMAGES:
         return "talk", f"{count} images"
-    seen = _recognized(footage, camera, workers)
+    motion = _recognized(footage, camera, workers)
     photos = isinstance(camera.frames, ImageFrames) and count <= MAX_PHOTOS
-    is_plain = photos and seen.turns and bool(np.isnan(seen.parallax))
-    plain_photos = is_plain and seen.lip_change <= MAX_LIP_CHANGE
-    why = f"the camera sees it from directions {seen.turn_deg:.0f}° apart"
+    is_plain = photos and motion.turns and bool(np.isnan(motion.parallax))
+    plain_photos = is_plain and motion.lip_change <= MAX_LIP_CHANGE
+    why = f"the camera sees it from directions {motion.turn_deg:.0f}° apart"
     if plain_photos:
         return "around", why
-    if seen.is_around:
+    if motion.is_around:
         return "around", f"{why}, and the room moves with it"
     if is_plain:
         return "talk", f"{why}, but the mouth moves"
-    return "talk", why + (", but the room does not move with it" if seen.turns else "")
+    return "talk", why + (", but the room does not move with it" if motion.turns else "")
 
 
 def _with_cameras(footage: Footage, out: Path, workers: Workers) -> tuple[Footage, str]:

@@ -151,8 +151,8 @@ def _misfit(report: Mapping[str, Any]) -> dict[str, dict[int, float]]:
     """Region -> timestep -> fraction of the images that is not explained, from the report, if it
     has one."""
     return {
-        name: {int(t): float(value) for t, value in own.items()}
-        for name, own in report.get("image_misfit", {}).items()
+        name: {int(t): float(value) for t, value in fractions.items()}
+        for name, fractions in report.get("image_misfit", {}).items()
     }
 
 
@@ -164,7 +164,10 @@ def _trust(path: Path, report: Any, timesteps: Sequence[int]) -> np.ndarray:
         raise StgaError(f"{path}: interpolated: expected timesteps, got {shorten(without)}")
     try:
         misfit = _misfit(report)
-        worst = [max((own.get(t, 0.0) for own in misfit.values()), default=0.0) for t in timesteps]
+        worst = [
+            max((fractions.get(t, 0.0) for fractions in misfit.values()), default=0.0)
+            for t in timesteps
+        ]
         if not np.isfinite(worst).all():
             raise ValueError
     except (ValueError, TypeError, AttributeError) as error:
@@ -181,8 +184,10 @@ def report_errors(out: Path, model: Path | None) -> float:
     places, used, footage, found = _landmarks(out, capture)
     errors: dict[str, dict[int, float]] = {camera.name: {} for camera in footage.cameras}
     cameras = {camera.name: camera.camera for camera in footage.cameras}
-    for name, own in found.items():
-        rows = zip(own.timesteps.tolist(), own.points, own.confidence, strict=True)
+    for name, landmarks in found.items():
+        rows = zip(
+            landmarks.timesteps.tolist(), landmarks.points, landmarks.confidence, strict=True
+        )
         for timestep, pixels, confidence in rows:
             use = used & (confidence > 0)
             if use.any():
@@ -211,6 +216,9 @@ def _landmarks(
     footage = replace(footage, cameras=by_name)
     found = read_landmarks(footage, out / LANDMARKS_FOLDER)
     check_count(found, places)
-    if not any(own.confidence.any() and own.confidence[:, used].any() for own in found.values()):
+    if not any(
+        landmarks.confidence.any() and landmarks.confidence[:, used].any()
+        for landmarks in found.values()
+    ):
         raise StgaError(f"{out / LANDMARKS_FOLDER}: has no landmarks of a face")
     return places, used, footage, found

@@ -64,9 +64,9 @@ def shaded_image(
 ) -> np.ndarray:
     """The mesh in soft light on gray: (H, W, 3) uint8. colors (V, 3), 0 to 1; None: skin's."""
     triangle, weights = rasterize(vertices, faces, camera)
-    seen = triangle >= 0
-    corners = faces[triangle[seen]]
-    inside = weights[seen][..., None]
+    covered = triangle >= 0
+    corners = faces[triangle[covered]]
+    inside = weights[covered][..., None]
     axes = camera.rotation
     smooth = (vertex_normals(vertices, faces)[corners] * inside).sum(1) @ axes.T
     normal = unit(smooth * [1, -1, -1])
@@ -74,7 +74,7 @@ def shaded_image(
     brightness = AMBIENT * (0.75 + 0.25 * normal[:, 1]) + lit
     color = SKIN_RGB if colors is None else (colors[corners] * inside).sum(1)
     image = np.full((camera.height, camera.width, 3), BACKGROUND)
-    image[seen] = np.clip(brightness[:, None], 0, 1) * color * 1.15
+    image[covered] = np.clip(brightness[:, None], 0, 1) * color * 1.15
     return np.asarray(255 * np.clip(image, 0, 1) ** (1 / 1.8) + 0.5, np.uint8)
 
 
@@ -98,7 +98,7 @@ def calibrate(
             f"{name}: shows a face in {count} of {len(VIEWS_DEG)} pictures from the front, "
             f"expected at least {MIN_PICTURES}; it must look along +z with y up"
         )
-    seen = [(neutral, located.position)]
+    samples = [(neutral, located.position)]
     # with the mouth open, and with the eyes closed, as far as shapes or a joint are known for that
     frame = neutral_frame(model)
     names = np.array(model.expression_names)
@@ -108,13 +108,13 @@ def calibrate(
     ]
     if not len(names) and model.weights[:, JOINTS.index("jaw")].any():
         frames = [replace(frame, jaw_pose=np.array([OPEN_JAW_RAD, 0, 0]))]
-    for own in frames:
-        mesh = flame_forward(model, np.zeros(model.n_identity), own)
+    for pose in frames:
+        mesh = flame_forward(model, np.zeros(model.n_identity), pose)
         found, _ = _located(mesh, faces, colors, detector)
-        seen += [] if found is None else [(mesh, found.position)]
+        samples += [] if found is None else [(mesh, found.position)]
     # Of lids, the nearest points would lie on the eyeball, which does not blink.
     skin = np.flatnonzero(large_parts(model))
-    meshes, positions = (np.concatenate(arrays, axis=1) for arrays in zip(*seen, strict=True))
+    meshes, positions = (np.concatenate(arrays, axis=1) for arrays in zip(*samples, strict=True))
     on, _ = nearest_points(meshes, faces[skin], positions)
     places = SurfacePoints(skin[on.face], on.barycentric)
     distance = np.linalg.norm(places.on(neutral, faces) - located.position, axis=1)
@@ -154,11 +154,17 @@ def _located(
     do."""
     cameras = picture_cameras(vertices)
     found = [detector.detect(shaded_image(vertices, faces, camera, colors)) for camera in cameras]
-    seen = [(camera, shown[0]) for camera, shown in zip(cameras, found, strict=True) if shown]
-    if len(seen) < MIN_PICTURES:
-        return None, len(seen)
-    points = np.stack([face for _, face in seen])
-    return triangulate([camera for camera, _ in seen], points, np.ones(points.shape[:2])), len(seen)
+    detected = [
+        (camera, faces_found[0])
+        for camera, faces_found in zip(cameras, found, strict=True)
+        if faces_found
+    ]
+    if len(detected) < MIN_PICTURES:
+        return None, len(detected)
+    points = np.stack([face for _, face in detected])
+    return triangulate([camera for camera, _ in detected], points, np.ones(points.shape[:2])), len(
+        detected
+    )
 
 
 def picture_cameras(vertices: np.ndarray) -> list[Camera]:

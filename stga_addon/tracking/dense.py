@@ -154,7 +154,7 @@ def fit_dense(
     chosen = evenly_spread(timesteps, TEXTURE_TIMESTEPS)
     head = DenseHead(fit.head, take)
     total = 2 * len(chosen) + len(timesteps)
-    alone = all(len(own.cameras) == 1 for own in take.landmarks.values())
+    alone = all(len(at_timestep.cameras) == 1 for at_timestep in take.landmarks.values())
     stage = Stage.REFINEMENT if settled else Stage.ONLY_DENSE if alone else Stage.DENSE
 
     def in_parts(
@@ -167,8 +167,8 @@ def fit_dense(
     weights = np.maximum(weights, SETTLED_WEIGHT if settled else 0)
     some = parts_of(chosen, TEXTURE_PART_TIMESTEPS)
     rows = np.split(weights, np.cumsum([len(part) for part in some])[:-1])
-    seen = in_parts(_sampled_part, list(zip(some, rows, strict=True)), 0)
-    texture = average_texture([sample for part in seen for sample in part])
+    samples = in_parts(_sampled_part, list(zip(some, rows, strict=True)), 0)
+    texture = average_texture([sample for part in samples for sample in part])
     started = in_parts(_started_part, [(part, texture) for part in some], len(chosen))
     typical = np.quantile(np.concatenate(started), TYPICAL_QUANTILE, axis=0)
     parts = [(part, texture, typical, settled) for part in parts_of(timesteps, PART_TIMESTEPS)]
@@ -240,7 +240,9 @@ def _solved_part(
             before = after
     names = ("values", "matrix", "right", "misfit", "missed", "better")
     order = -1 if settled else 1
-    return {name: np.stack([getattr(own, name) for own in solved[::order]]) for name in names}
+    return {
+        name: np.stack([getattr(solution, name) for solution in solved[::order]]) for name in names
+    }
 
 
 class _Solver:
@@ -265,8 +267,8 @@ class _Solver:
             camera = world.camera(recording)
             key = recording.world_to_camera.tobytes()
             views.append(PyramidView(key, camera, pyramid(camera, image, center)))
-        seen = self._visibility.weighted(self._take.landmarks[timestep], parameters, world)
-        landmarks = landmarks_in_capture(seen, self._take, self._fit)
+        weighted = self._visibility.weighted(self._take.landmarks[timestep], parameters, world)
+        landmarks = landmarks_in_capture(weighted, self._take, self._fit)
         return _Shot(views, landmarks, parameters, np.zeros(len(REGIONS), bool))
 
     def solve(
@@ -279,8 +281,10 @@ class _Solver:
         if (error.regions > TYPICAL_FACTOR * typical).any():
             others = [self.head.opened(shot.start, distance) for distance in OPENINGS_M]
             if before is not None:
-                last, own = before
-                start = self.head.flow_start(last.views, own.visible, own.values, shot.views)
+                last, solution = before
+                start = self.head.flow_start(
+                    last.views, solution.visible, solution.values, shot.views
+                )
                 others.append(start)
             for other in others:
                 values, found = self.started(shot, other, visible)
@@ -293,7 +297,9 @@ class _Solver:
             best = self._descended(shot, shot.start, visible, START_STEPS)
             best, visible = self._refined(shot, best)
         by_images = np.where(shot.by_landmarks[self.head.region], 0.0, visible)
-        old, new = (self._evidence(shot, own, by_images) for own in (shot.start, best))
+        old, new = (
+            self._evidence(shot, parameters, by_images) for parameters in (shot.start, best)
+        )
         better = self._is_better(old, new)
         if better:
             matrix, right, _ = self._terms(shot, best, visible, 0)
@@ -311,11 +317,13 @@ class _Solver:
         """The start, moved as its neighbors were moved from their starts, after a few steps; None
         where that is no better than the start, explains some region worse than its neighbors do, or
         leaves its landmarks."""
-        moves = [own.values - near.start for near, own in (before, after)]
+        moves = [solved.values - near.start for near, solved in (before, after)]
         values = shot.start + np.mean(moves, axis=0)
         visible = self.head.visibility(values, shot.views)
         values = self._descended(shot, values, visible, CARRIED_STEPS)
-        misfit, old = (self._evidence(shot, own, visible) for own in (values, shot.start))
+        misfit, old = (
+            self._evidence(shot, parameters, visible) for parameters in (values, shot.start)
+        )
         typical = np.maximum(before[1].misfit, after[1].misfit)
         is_typical = (misfit.regions <= CARRIED_FACTOR * typical).all()
         if not (is_typical and self._is_better(old, misfit)):
@@ -340,11 +348,13 @@ class _Solver:
         landmarks than a face can."""
         both = (shot.start, values)
         astray = np.zeros(len(REGIONS), bool)
-        old, new = (self._evidence(shot, own, visible).regions for own in both)
-        missed = [self._missed(shot.landmarks, own) for own in both]
+        old, new = (self._evidence(shot, parameters, visible).regions for parameters in both)
+        missed = [self._missed(shot.landmarks, parameters) for parameters in both]
         for region in range(len(REGIONS)):
             use = (self.head.landmark_region == region) & (shot.landmarks.weight > 0)
-            before, after = (float(np.median(own[use])) if use.any() else 0.0 for own in missed)
+            before, after = (
+                float(np.median(distances[use])) if use.any() else 0.0 for distances in missed
+            )
             unproven = new[region] > (1 - MIN_REGION_GAIN) * old[region]
             astray[region] = unproven and after > MAX_MISS_FACTOR * before + SMALL_MISS_M
             astray[region] |= region >= UPPER_FACE and after > before + MAX_UPPER_MISS_M
@@ -400,10 +410,10 @@ class _Solver:
         missed = self._missed(shot.landmarks, values)
         weight = shot.landmarks.weight.copy()
         for region in np.flatnonzero(~shot.by_landmarks):
-            own = self.head.landmark_region == region
-            if (own & (weight > 0)).any():  # far from the head, they count less
-                weight[own] *= robust(np.median(missed[own & (weight > 0)]), REGION_SCALE_M)
-            weight[own] *= np.where(self.head.inner[own], INNER_WEIGHT, LANDMARK_WEIGHT)
+            inside = self.head.landmark_region == region
+            if (inside & (weight > 0)).any():  # far from the head, they count less
+                weight[inside] *= robust(np.median(missed[inside & (weight > 0)]), REGION_SCALE_M)
+            weight[inside] *= np.where(self.head.inner[inside], INNER_WEIGHT, LANDMARK_WEIGHT)
         weighted = replace(shot.landmarks, weight=weight)
         matrix, right = normal_equations(self.head.landmarks, values, weighted)
         matrix = matrix + fraction * flat.T @ (curvature @ jacobian).reshape(flat.shape)
@@ -432,9 +442,13 @@ def _agreeing(
     beyond = np.maximum(by_region - np.median(by_region, axis=0), 0) * better[:, None]
     moved = {}
     for timestep, far in zip(sorted(take.landmarks), beyond, strict=True):
-        own = take.landmarks[timestep]
+        landmarks = take.landmarks[timestep]
         at = head.landmarks.positions(*split(fit.parameters[timestep]))
         weight = robust(far, DISAGREEMENT_M)[head.landmark_region][:, None]
-        seen = np.stack([fit.to_capture.camera(camera).project(at)[0] for camera in own.cameras])
-        moved[timestep] = replace(own, points=weight * own.points + (1 - weight) * seen)
+        projected = np.stack(
+            [fit.to_capture.camera(camera).project(at)[0] for camera in landmarks.cameras]
+        )
+        moved[timestep] = replace(
+            landmarks, points=weight * landmarks.points + (1 - weight) * projected
+        )
     return moved

@@ -149,7 +149,7 @@ class DenseHead:
         at = self.positions(values)
         turn = head_rotation(values)
         opening = round(self.opening(values) / OPENING_STEP_M)
-        seen = []
+        weights = []
         faces = self.head.model.faces
         for camera in (view.camera for view in views):
             key = opening, *rounded_direction((camera.position - at.mean(0)) @ turn, DIRECTIONS)
@@ -158,10 +158,10 @@ class DenseHead:
                 normals = self.points.on(vertex_normals(vertices, faces), faces)
                 cosine = facing(camera, at, unit(normals))
                 fraction = min(1.0, VISIBILITY_SIDE_PX / max(camera.width, camera.height))
-                shown = in_sight(camera.scaled(fraction), vertices, faces, at)
-                self._visible[key] = np.where((cosine > MIN_COSINE) & shown, cosine**2, 0.0)
-            seen.append(self._visible[key])
-        return np.stack(seen)
+                visible = in_sight(camera.scaled(fraction), vertices, faces, at)
+                self._visible[key] = np.where((cosine > MIN_COSINE) & visible, cosine**2, 0.0)
+            weights.append(self._visible[key])
+        return np.stack(weights)
 
     def opening(self, values: np.ndarray) -> float:
         """Height in meters of the upper face above the chin."""
@@ -192,7 +192,7 @@ class DenseHead:
             still[-RIGID_SIZE + 3 : -3] = 0
             distance = ((self.positions(values) - self.positions(still)) ** 2).sum(1)
             by_region = (distance[self.region == region] for region in regions)
-            moved.append([np.sqrt(own.mean()) for own in by_region])
+            moved.append([np.sqrt(squared.mean()) for squared in by_region])
         beyond = np.maximum(moved - np.quantile(moved, REST_QUANTILE, axis=0), 0)
         return appearance.robust(beyond, REST_SCALE_M)[:, of_region]
 
@@ -201,14 +201,14 @@ class DenseHead:
         at = self.positions(values)
         basis = self.light_basis(values)
         found = []
-        for view, own in zip(views, weight, strict=True):
+        for view, view_weight in zip(views, weight, strict=True):
             projected = [level.camera.project(at) for level in view.levels]
             levels = [
                 appearance.sampled([level.channels], pixels)[0].astype(np.float64)
                 for level, (pixels, _) in zip(view.levels, projected, strict=True)
             ]
-            shown = appearance.inside(view.levels[0].camera, *projected[0])
-            found.append(Sample(view.key, levels, basis, own * shown))
+            inside = appearance.inside(view.levels[0].camera, *projected[0])
+            found.append(Sample(view.key, levels, basis, view_weight * inside))
         return found
 
     def photo_term(
@@ -220,26 +220,30 @@ class DenseHead:
         right = np.zeros((len(at), 3))
         basis = self.light_basis(values, level)
         rows = self.rows[level]
-        for view, seen in zip(views, visible, strict=True):
-            own = view.levels[level]
-            pixels, depth = own.camera.project(at)
-            within = appearance.inside(own.camera, pixels, depth)
-            weight = seen[rows] * self._texture.trust[rows] * within
+        for view, visibility in zip(views, visible, strict=True):
+            pyramid_level = view.levels[level]
+            pixels, depth = pyramid_level.camera.project(at)
+            within = appearance.inside(pyramid_level.camera, pixels, depth)
+            weight = visibility[rows] * self._texture.trust[rows] * within
             near = np.flatnonzero(weight)
             if not len(near):
                 continue
-            shown, *slopes = appearance.sampled([own.channels, *own.gradient], pixels[near])
+            channels, *slopes = appearance.sampled(
+                [pyramid_level.channels, *pyramid_level.gradient], pixels[near]
+            )
             known = self._texture.values[view.key][level][rows[near]], basis[near], weight[near]
-            lit = appearance.relit(shown, *known, self._texture.lights[view.key])
-            residual = (shown - lit) / appearance.NOISE_LEVELS
+            lit = appearance.relit(channels, *known, self._texture.lights[view.key])
+            residual = (channels - lit) / appearance.NOISE_LEVELS
             used = weight[near] * appearance.point_weights(residual, level)
             by_x, by_y = (slope / appearance.NOISE_LEVELS for slope in slopes)
             # The channels' slopes along x and y, multiplied and summed, before they become those by
             # position.
             pairs = (by_x, by_x), (by_x, by_y), (by_y, by_y), (by_x, residual), (by_y, residual)
             sums = ((one * other) @ appearance.CHANNEL_WEIGHTS for one, other in pairs)
-            xx, xy, yy, x, y = ((used * own)[:, None] for own in sums)
-            of_x, of_y = appearance.projection_derivative(own.camera, at[near]).swapaxes(0, 1)
+            xx, xy, yy, x, y = ((used * pair_sum)[:, None] for pair_sum in sums)
+            of_x, of_y = appearance.projection_derivative(pyramid_level.camera, at[near]).swapaxes(
+                0, 1
+            )
             along_x = xx * of_x + xy * of_y
             along_y = xy * of_x + yy * of_y
             matrix[near] += of_x[:, :, None] * along_x[:, None]
@@ -256,16 +260,16 @@ class DenseHead:
         rows = self.rows[points]
         total = np.zeros(len(REGIONS))
         weights = np.zeros(len(REGIONS))
-        for view, seen in zip(views, visible, strict=True):
-            weight = seen[rows] * self._texture.trust[rows]
-            own = view.levels[level]
-            pixels, depth = own.camera.project(at)
-            shown = appearance.inside(own.camera, pixels, depth)
-            (found,) = appearance.sampled([own.channels], pixels)
-            known = self._texture.values[view.key][level][rows], basis, weight * shown
+        for view, visibility in zip(views, visible, strict=True):
+            weight = visibility[rows] * self._texture.trust[rows]
+            pyramid_level = view.levels[level]
+            pixels, depth = pyramid_level.camera.project(at)
+            inside = appearance.inside(pyramid_level.camera, pixels, depth)
+            (found,) = appearance.sampled([pyramid_level.channels], pixels)
+            known = self._texture.values[view.key][level][rows], basis, weight * inside
             lit = appearance.relit(found, *known, self._texture.lights[view.key])
             residual = (found - lit) / appearance.NOISE_LEVELS
-            fraction = np.where(shown, appearance.unexplained(residual, level), 1.0)
+            fraction = np.where(inside, appearance.unexplained(residual, level), 1.0)
             total += np.bincount(self.region[rows], weight * fraction, len(REGIONS))
             weights += np.bincount(self.region[rows], weight, len(REGIONS))
         regions = total / np.maximum(weights, 1e-9)
@@ -280,7 +284,9 @@ class DenseHead:
         targets = list(appearance.flow_targets(start, before, now))
         rows = self.rows[appearance.FLOW_POINTS]
         moved = values
-        weights = {view.key: own[rows] for view, own in zip(before, visible, strict=True)}
+        weights = {
+            view.key: visibility[rows] for view, visibility in zip(before, visible, strict=True)
+        }
         for _ in range(appearance.FLOW_ITERATIONS):
             at, jacobian = self.linearized(moved, appearance.FLOW_POINTS)
             precision, right = prior_terms(self.head, moved)

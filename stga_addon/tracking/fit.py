@@ -115,8 +115,8 @@ def triangulate(
         # a point without a ray may lie in a camera, at distance 0 from its ray
         typical = np.maximum(np.maximum(scale, floor), np.finfo(np.float64).tiny)
         weights = confidence / (1 + (distance / typical) ** 2) ** 2
-    seen = (confidence > 0).sum(0) >= min(2, len(cameras))
-    return Triangulation(position, information, _median(distance, confidence > 0), seen)
+    observed = (confidence > 0).sum(0) >= min(2, len(cameras))
+    return Triangulation(position, information, _median(distance, confidence > 0), observed)
 
 
 def _median(values: np.ndarray, valid: np.ndarray) -> np.ndarray:
@@ -158,13 +158,13 @@ class RecordedTake:
 def without_cameras(take: RecordedTake, names: Collection[str]) -> RecordedTake:
     """The take without the landmarks of cameras that do not see everything the others see."""
     landmarks = {}
-    for timestep, own in take.landmarks.items():
-        kept = [row for row, name in enumerate(own.names) if name not in names]
+    for timestep, at_timestep in take.landmarks.items():
+        kept = [row for row, name in enumerate(at_timestep.names) if name not in names]
         landmarks[timestep] = TimestepLandmarks(
-            tuple(own.cameras[row] for row in kept),
-            own.points[kept],
-            own.confidence[kept],
-            tuple(own.names[row] for row in kept),
+            tuple(at_timestep.cameras[row] for row in kept),
+            at_timestep.points[kept],
+            at_timestep.confidence[kept],
+            tuple(at_timestep.names[row] for row in kept),
         )
     return replace(take, landmarks=landmarks)
 
@@ -200,8 +200,8 @@ def excerpt(
     fit: HeadFit, take: RecordedTake, timesteps: Sequence[int]
 ) -> tuple[HeadFit, RecordedTake]:
     """The fit and the take at some timesteps."""
-    own = replace(fit, parameters={t: fit.parameters[t] for t in timesteps})
-    return own, replace(take, landmarks={t: take.landmarks[t] for t in timesteps})
+    excerpted = replace(fit, parameters={t: fit.parameters[t] for t in timesteps})
+    return excerpted, replace(take, landmarks={t: take.landmarks[t] for t in timesteps})
 
 
 def in_cameras_world(fit: HeadFit) -> HeadFit:
@@ -234,8 +234,8 @@ def determines_pose(
 
     neutral (N, 3) meters: the landmarks' places on the neutral head.
     """
-    seen = (landmarks.confidence > 0).sum(0) >= min(2, len(landmarks.cameras))
-    use = seen & reliable
+    observed = (landmarks.confidence > 0).sum(0) >= min(2, len(landmarks.cameras))
+    use = observed & reliable
     return use.sum() >= MIN_LANDMARKS and bool(np.ptp(neutral[use], axis=0).max() >= MIN_FACE_M)
 
 
@@ -258,7 +258,7 @@ def fit_head(head: HeadModel, recorded: RecordedTake, step: Step = lambda: None)
     u, _, vt = np.linalg.svd(np.sum([one.rotation for one in aligned], axis=0))
     centers = [-one.rotation.T @ one.translation / one.scale for one in aligned]
     world = Similarity(size, u @ vt, -size * u @ vt @ np.median(centers, axis=0))
-    seen = dict(take)
+    weighted = dict(take)
     subject = head
     shape = np.zeros(head.model.n_identity)
     solved = np.zeros((len(timesteps), head.model.n_expression + RIGID_SIZE))
@@ -267,14 +267,16 @@ def fit_head(head: HeadModel, recorded: RecordedTake, step: Step = lambda: None)
     for number in range(ROUNDS):
         iterations = ROUGH_TAKE_ITERATIONS if number < ROUNDS - 1 else TAKE_ITERATIONS
         at = places.on(subject.model.v_template, subject.model.faces)
-        found = {t: triangulated(seen[t], reliable, at, world.scale) for t in timesteps}
+        found = {t: triangulated(weighted[t], reliable, at, world.scale) for t in timesteps}
         observed = [observed_landmarks(found[t], world, reliable) for t in spread]
-        starts = np.stack([rigid_start(at, own) for own in observed])
+        starts = np.stack([rigid_start(at, observation) for observation in observed])
         # Of one camera's rays, a head shrunk into the camera itself misses all by the least.
         sized = recorded.metric or not several
         if not several:  # timesteps count as one: a detector misses a face alike in all of them
             count = len(observed)
-            observed = [replace(own, weight=own.weight / count) for own in observed]
+            observed = [
+                replace(observation, weight=observation.weight / count) for observation in observed
+            ]
         identity = solve_identity(head, places, observed, starts, sized)
         world = scaled_down(world, identity.scale)
         shape = identity.shape
@@ -282,7 +284,9 @@ def fit_head(head: HeadModel, recorded: RecordedTake, step: Step = lambda: None)
         at = places.on(subject.model.v_template, subject.model.faces)
         take_observed = [observed_landmarks(found[t], world, reliable) for t in timesteps]
         if not number:
-            solved[:, -RIGID_SIZE:] = [rigid_start(at, own) for own in take_observed]
+            solved[:, -RIGID_SIZE:] = [
+                rigid_start(at, observation) for observation in take_observed
+            ]
             alone = solve_take(
                 subject, places, take_observed, solved, ordered=False, iterations=iterations
             )
@@ -290,7 +294,9 @@ def fit_head(head: HeadModel, recorded: RecordedTake, step: Step = lambda: None)
         solved = solve_take(subject, places, take_observed, solved, ordered, iterations)
         visibility = LandmarkVisibility(subject, places)
         parameters = dict(zip(timesteps, solved, strict=True))
-        seen = {t: visibility.weighted(take[t], own, world) for t, own in parameters.items()}
+        weighted = {
+            t: visibility.weighted(take[t], values, world) for t, values in parameters.items()
+        }
         step()
     return HeadFit(subject, shape, parameters, world, ordered=ordered)
 
@@ -311,7 +317,7 @@ def pose_from_one_camera(camera: Camera, pixels: np.ndarray, points: np.ndarray)
     POSIT (DeMenthon and Davis 1995): scaled orthographic pose, corrected for perspective until it
     no longer changes.
     """
-    seen = camera.at_depth_one(pixels)
+    directions = camera.at_depth_one(pixels)
     center = points.mean(0)
     system = np.column_stack([points - center, np.ones(len(points))])
     solve = np.linalg.pinv(system, len(system) * np.finfo(np.float64).eps)
@@ -319,7 +325,7 @@ def pose_from_one_camera(camera: Camera, pixels: np.ndarray, points: np.ndarray)
     rotation = np.eye(3)
     place = np.zeros(3)
     for _ in range(POSIT_ITERATIONS):
-        rows = (solve @ (seen * stretch[:, None])).T  # (2, 4)
+        rows = (solve @ (directions * stretch[:, None])).T  # (2, 4)
         size = float(np.sqrt(np.linalg.norm(rows[0, :3]) * np.linalg.norm(rows[1, :3])))
         u, _, vt = np.linalg.svd(rows[:, :3] / size, full_matrices=False)
         across = u @ vt
@@ -339,13 +345,13 @@ def triangulated(
         return triangulate(landmarks.cameras, landmarks.points, landmarks.confidence * reliable)
     camera = landmarks.cameras[0]
     pixels = landmarks.points[0]
-    seen = landmarks.confidence[0] * reliable > 0
+    observed = landmarks.confidence[0] * reliable > 0
     origin, directions = rays(camera, pixels)
     guess = np.tile(origin, (len(head), 1))
-    guess[seen] = pose_from_one_camera(camera, pixels[seen], head[seen] / scale)
+    guess[observed] = pose_from_one_camera(camera, pixels[observed], head[observed] / scale)
     depth = ((guess - origin) * directions).sum(1, keepdims=True)
-    across = seen[:, None, None] * (np.eye(3) - directions[:, :, None] * directions[:, None])
-    return Triangulation(origin + depth * directions, across, np.zeros(len(head)), seen, origin)
+    across = observed[:, None, None] * (np.eye(3) - directions[:, :, None] * directions[:, None])
+    return Triangulation(origin + depth * directions, across, np.zeros(len(head)), observed, origin)
 
 
 def observed_landmarks(

@@ -120,7 +120,10 @@ def is_tracked(out: Path) -> bool:
 
 def rounded(values: Mapping[str, Mapping[int, float]]) -> dict[str, dict[str, float]]:
     """Values by camera or region, and timestep, rounded for the report."""
-    return {name: {str(t): round(v, 3) for t, v in own.items()} for name, own in values.items()}
+    return {
+        name: {str(t): round(v, 3) for t, v in by_timestep.items()}
+        for name, by_timestep in values.items()
+    }
 
 
 @dataclass(frozen=True)
@@ -153,11 +156,11 @@ class TorsoMotion:
         shift = f" and {self.shift_mm:.0f} mm" if self.shift_mm else ""
         bend = f", its cloth bends by up to {self.bend_mm:.0f} mm" if self.bend_mm else ""
         apart = f", up to {self.turn_deg:.0f}°{shift} apart from the head{bend}"
-        head, still, own = (f"{self.misfit[name]:.0%}" for name in MOTIONS)
+        head, still, independent = (f"{self.misfit[name]:.0%}" for name in MOTIONS)
         return (
             f"the torso {MOTIONS[self.motion]}{'' if self.motion == 'head' else apart}; "
             f"images below the head are not explained by {head} if it turned with the head, "
-            f"{still} still, {own} on its own"
+            f"{still} still, {independent} on its own"
         )
 
 

@@ -56,12 +56,12 @@ def with_gaze(
     model = fit.head.model
     on_eyeball = (model.weights[model.faces] > EYEBALL_WEIGHT).all(axis=1)[take.places.face]
     irises = {joint: np.flatnonzero(take.reliable & on_eyeball[:, joint]) for joint in EYE_JOINTS}
-    seen = {joint: rows for joint, rows in irises.items() if len(rows)}
-    if not seen:
+    eyes = {joint: rows for joint, rows in irises.items() if len(rows)}
+    if not eyes:
         return fit, ()
-    rows = np.concatenate(list(seen.values()))
+    rows = np.concatenate(list(eyes.values()))
     first = model.n_expression
-    columns = np.concatenate([first + 3 * joint + np.arange(AXES) for joint in seen])
+    columns = np.concatenate([first + 3 * joint + np.arange(AXES) for joint in eyes])
     timesteps = sorted(fit.parameters)
     start = np.stack([fit.parameters[timestep] for timestep in timesteps])
     observed = _observed(fit, take, timesteps, rows)
@@ -74,18 +74,18 @@ def with_gaze(
         values[columns] = turns
         matrix, right = normal_equations(points, values, observed[row])
         pull = precision * (start[row, columns] - turns)
-        own = sharper * matrix[np.ix_(columns, columns)] + np.diag(precision)
-        return own, sharper * right[columns] + pull
+        sharpened = sharper * matrix[np.ix_(columns, columns)] + np.diag(precision)
+        return sharpened, sharper * right[columns] + pull
 
     stiffness = acceleration_precision(model)[columns] if fit.ordered else None
     turns = solve_in_time(None, terms, start[:, columns], stiffness, ITERATIONS)
     warnings: tuple[str, ...] = ()
     if is_stranger:
         rest = _rest(turns)
-        removed = rest - np.tile(_constant_gaze(rest), len(seen))
+        removed = rest - np.tile(_constant_gaze(rest), len(eyes))
         turns = turns - removed
         if np.abs(removed).max() >= MIN_REMOVED_RAD:
-            warnings = (_removal(list(seen), removed),)
+            warnings = (_removal(list(eyes), removed),)
     moved = start.copy()
     moved[:, columns] = np.clip(turns, -MAX_GAZE_RAD, MAX_GAZE_RAD)
     return replace(fit, parameters=dict(zip(timesteps, moved, strict=True))), warnings
@@ -130,10 +130,12 @@ def _observed(
     visibility = LandmarkVisibility(fit.head, take.places[rows])
     found = []
     for timestep in timesteps:
-        own = take.landmarks[timestep]
-        own = replace(own, points=own.points[:, rows], confidence=own.confidence[:, rows])
-        seen = visibility.weighted(own, fit.parameters[timestep], fit.to_capture)
-        triangulation = triangulate(seen.cameras, seen.points, seen.confidence)
+        landmarks = take.landmarks[timestep]
+        landmarks = replace(
+            landmarks, points=landmarks.points[:, rows], confidence=landmarks.confidence[:, rows]
+        )
+        weighted = visibility.weighted(landmarks, fit.parameters[timestep], fit.to_capture)
+        triangulation = triangulate(weighted.cameras, weighted.points, weighted.confidence)
         used = np.ones(len(rows), bool)
         found.append(observed_landmarks(triangulation, fit.to_capture, used))
     return found

@@ -80,14 +80,14 @@ def _placed_primitives(path: Path, document: Json, size: int) -> list[Placed]:
     for node, matrix in _mesh_nodes(document):
         mesh = document["meshes"][node["mesh"]]
         extras = mesh.get("extras")
-        own = extras.get("targetNames", ()) if isinstance(extras, dict) else ()
+        target_names = extras.get("targetNames", ()) if isinstance(extras, dict) else ()
         for primitive in mesh["primitives"]:
             if primitive.get("mode", TRIANGLES) != TRIANGLES:
                 continue
             targets = primitive.get("targets", ())
-            if len(own) != len(targets):
-                own = [f"target {number}" for number in range(len(targets))]
-            named = [(str(own[k]), target) for k, target in enumerate(targets)]
+            if len(target_names) != len(targets):
+                target_names = [f"target {number}" for number in range(len(targets))]
+            named = [(str(target_names[k]), target) for k, target in enumerate(targets)]
             vertices += count_of(accessors[primitive["attributes"]["POSITION"]])
             corners += PRIMITIVE_NUMBERS
             corners += count_of(accessors[primitive["indices"]]) if "indices" in primitive else 0
@@ -112,14 +112,14 @@ def _mesh_nodes(document: Json) -> Iterator[tuple[Json, np.ndarray]]:
             return
         row, above = waiting.pop()
         node = nodes[row]
-        own = np.eye(4)
+        local = np.eye(4)
         if "matrix" in node:
-            own = np.array(node["matrix"], float).reshape(4, 4).T
+            local = np.array(node["matrix"], float).reshape(4, 4).T
         else:
             turn = np.roll(np.array(node.get("rotation", (0, 0, 0, 1)), float), 1)
-            own[:3, :3] = to_matrices(turn) * np.array(node.get("scale", (1, 1, 1)), float)
-            own[:3, 3] = node.get("translation", (0, 0, 0))
-        matrix = above @ own
+            local[:3, :3] = to_matrices(turn) * np.array(node.get("scale", (1, 1, 1)), float)
+            local[:3, 3] = node.get("translation", (0, 0, 0))
+        matrix = above @ local
         waiting += [(int(child), matrix) for child in node.get("children", ())]
         if "mesh" in node:
             yield node, np.eye(4) if "skin" in node else matrix
@@ -155,9 +155,9 @@ def _joined(parts: list[MorphMesh]) -> MorphMesh:
     starts = np.cumsum([0, *(len(part.positions) for part in parts)]).tolist()
     targets = np.zeros((starts[-1], 3, len(names)))
     for start, part in zip(starts, parts, strict=False):
-        for own, name in enumerate(part.names):
+        for column, name in enumerate(part.names):
             rows = slice(start, start + len(part.positions))
-            targets[rows, :, names.index(name)] += part.targets[:, :, own]
+            targets[rows, :, names.index(name)] += part.targets[:, :, column]
     joined = [part.faces + start for start, part in zip(starts, parts, strict=False)]
     positions = np.concatenate([part.positions for part in parts])
     values = np.column_stack([positions, targets.reshape(len(positions), -1)])

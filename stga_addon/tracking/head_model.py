@@ -93,7 +93,9 @@ def write_linear_model(path: Path, arrays: dict[str, np.ndarray]) -> None:
     """Write a linear model as an npz. Raises StgaError where it is none that `read_head_model`
     would take."""
     checked(path, HeadModel(linear_model(path, arrays), "mesh"))
-    small = {name: own.astype(np.float32) for name, own in arrays.items() if own.dtype.kind == "f"}
+    small = {
+        name: array.astype(np.float32) for name, array in arrays.items() if array.dtype.kind == "f"
+    }
     write_npz(path, {**arrays, **small})
 
 

@@ -84,11 +84,11 @@ def without_own_bias(take: RecordedTake, person: KnownPerson, workers: Workers) 
         points = PosedPoints(fit.head.model, take.places)
         fractions: dict[str, list[np.ndarray]] = {}
         for timestep, values in fit.parameters.items():
-            own = take.landmarks[timestep]
+            landmarks = take.landmarks[timestep]
             mesh = posed_mesh(fit, values)
             head = points.positions(*split(values))
-            cameras = map(fit.to_capture.camera, own.cameras)
-            for name, camera in zip(own.names, cameras, strict=True):
+            cameras = map(fit.to_capture.camera, landmarks.cameras)
+            for name, camera in zip(landmarks.names, cameras, strict=True):
                 faces = networks.detect(person.draw(mesh, camera))
                 if len(faces) == 1:
                     found = landmark_bias.without_bias(faces[0], camera, neutral, take.reliable)
@@ -96,9 +96,9 @@ def without_own_bias(take: RecordedTake, person: KnownPerson, workers: Workers) 
                     fractions.setdefault(name, []).append(away / face_size(faces[0]))
         bias = {name: np.median(found, axis=0) for name, found in fractions.items()}
         moved = {}
-        for timestep, own in take.landmarks.items():
-            seen = zip(own.names, own.points, strict=True)
-            at = [pixels - bias.get(name, 0.0) * face_size(pixels) for name, pixels in seen]
-            moved[timestep] = replace(own, points=np.stack(at))
+        for timestep, landmarks in take.landmarks.items():
+            detected = zip(landmarks.names, landmarks.points, strict=True)
+            at = [pixels - bias.get(name, 0.0) * face_size(pixels) for name, pixels in detected]
+            moved[timestep] = replace(landmarks, points=np.stack(at))
         corrected = replace(take, landmarks=moved)
     return corrected

@@ -82,12 +82,16 @@ def detect_landmarks(
         if not path.exists():
             limit = max(MIN_PART_TIMESTEPS, -(-len(camera.timesteps) // MAX_HELPERS))
             parts = [(camera, part, detector) for part in parts_of(camera.timesteps, limit)]
-            seen = [
+            detected = [
                 faces
                 for part in workers.map(_detect, parts, (Stage.LANDMARKS, done, total))
                 for faces in part
             ]
-            several = [t for t, own in zip(camera.timesteps, seen, strict=True) if len(own) > 1]
+            several = [
+                t
+                for t, in_frame in zip(camera.timesteps, detected, strict=True)
+                if len(in_frame) > 1
+            ]
             if len(camera.timesteps) == 1:
                 crowded += [(camera, timestep) for timestep in several]
             elif len(several) > MAX_TWO_FACES_FRACTION * len(camera.timesteps):
@@ -96,7 +100,7 @@ def detect_landmarks(
                     f"{len(camera.timesteps)} frames with two faces, the first at timestep "
                     f"{several[0]}; expected one person"
                 )
-            faces = [own[0] if len(own) == 1 else None for own in seen]
+            faces = [in_frame[0] if len(in_frame) == 1 else None for in_frame in detected]
             number = next((len(face) for face in faces if face is not None), 0)
             points = [
                 np.zeros((number, 2)) if face is None else unbiased(face, camera.camera)
@@ -153,10 +157,10 @@ def read_camera(path: Path, camera: FootageCamera) -> CameraLandmarks:
     # also where it is not a number
     if not ((confidence >= 0) & (confidence <= MAX_CONFIDENCE)).all():
         raise StgaError(f"{path}: confidence: expected numbers from 0 to {MAX_CONFIDENCE:g}")
-    seen = points[confidence > 0]
-    if not np.isfinite(seen).all():
+    detected = points[confidence > 0]
+    if not np.isfinite(detected).all():
         raise StgaError(f"{path}: points: expected finite pixels where confidence is not 0")
-    if not (np.abs(seen) <= MAX_PIXELS).all():
+    if not (np.abs(detected) <= MAX_PIXELS).all():
         raise StgaError(
             f"{path}: points: expected pixels of at most {MAX_PIXELS:.0f}, as far as no image "
             "reaches"

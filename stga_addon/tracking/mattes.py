@@ -208,20 +208,20 @@ def _write_mattes(
     """Write the mattes of timesteps without a mask; by those, whether a person was recognized."""
     top, bottom, left, right = bars
     size = camera.camera.height, camera.camera.width
-    shown = np.s_[top : size[0] - bottom, left : size[1] - right]
+    inside_bars = np.s_[top : size[0] - bottom, left : size[1] - right]
     plate = camera.clean_plate()
-    plate = None if plate is None else np.ascontiguousarray(plate[shown])
+    plate = None if plate is None else np.ascontiguousarray(plate[inside_bars])
     network = PersonNetwork()
     recognized = {}
     for timestep, file in files.items():
         if camera.mask(timestep) is None:
-            image = np.ascontiguousarray(camera.image(timestep)[shown])
-            head = np.ascontiguousarray(head_pixels(timestep, camera)[shown])
+            image = np.ascontiguousarray(camera.image(timestep)[inside_bars])
+            head = np.ascontiguousarray(head_pixels(timestep, camera)[inside_bars])
             is_person = network.probability(image) if plate is None else by_plate(image, plate)
-            seen = float(np.median(is_person[head])) if head.any() else 1.0
-            recognized[timestep] = seen >= MIN_HEAD_PROBABILITY
+            probability = float(np.median(is_person[head])) if head.any() else 1.0
+            recognized[timestep] = probability >= MIN_HEAD_PROBABILITY
             matte = np.zeros(size, np.uint8)
-            matte[shown] = find_matte(image, is_person, head)
+            matte[inside_bars] = find_matte(image, is_person, head)
             write_png(file, matte)
         step()
     return recognized

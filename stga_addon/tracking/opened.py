@@ -109,10 +109,10 @@ def footage_state(footage: Footage) -> dict[str, Any]:
     """Each camera's first frame, the state of all files, and the undistortion; as JSON."""
     cameras = {}
     for camera in footage.cameras:
-        own: list[Any] = [camera.source(camera.timesteps[0]), file_state(camera.frames.files)]
+        state: list[Any] = [camera.source(camera.timesteps[0]), file_state(camera.frames.files)]
         if camera.undistortion is not None:
-            own += [repr(camera.undistortion.lens), *camera.camera.intrinsics[2:]]
-        cameras[camera.name] = own
+            state += [repr(camera.undistortion.lens), *camera.camera.intrinsics[2:]]
+        cameras[camera.name] = state
     timesteps = list(footage.timesteps)
     return {"footage": str(footage.root), "cameras": cameras, "timesteps": timesteps}
 

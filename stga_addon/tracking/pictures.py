@@ -96,12 +96,14 @@ def picture_of_first_frame(
         return None
     points = np.stack([face for _, face in alone])
     cameras = tuple(camera for camera, _ in alone)
-    seen = TimestepLandmarks(cameras, points, np.ones(points.shape[:2]))
+    landmarks = TimestepLandmarks(cameras, points, np.ones(points.shape[:2]))
     neutral = take.places.on(head.model.v_template, head.model.faces)
-    if not determines_pose(seen, take.reliable, neutral):
+    if not determines_pose(landmarks, take.reliable, neutral):
         return None
     with suppress(StgaError):  # the whole take may still be tracked, and says what is wrong
-        return picture_of_fit(fit_head(head, replace(take, landmarks={timestep: seen})), footage)
+        return picture_of_fit(
+            fit_head(head, replace(take, landmarks={timestep: landmarks})), footage
+        )
     return None
 
 
@@ -149,8 +151,12 @@ def write_contact_sheet(
     StgaError where the file cannot be written or a frame cannot be read.
     """
     misfit = misfit or {}
-    every = {(name, t): px for name, own in errors.items() for t, px in own.items()}
-    unexplained = {t: max(own.get(t, 0.0) for own in misfit.values()) for _, t in every if misfit}
+    every = {(name, t): px for name, by_timestep in errors.items() for t, px in by_timestep.items()}
+    unexplained = {
+        t: max(by_timestep.get(t, 0.0) for by_timestep in misfit.values())
+        for _, t in every
+        if misfit
+    }
     median = float(np.median(list(every.values()))) if every else 0.0
     typical = float(np.median(list(unexplained.values()))) if unexplained else 0.0
 
@@ -159,17 +165,17 @@ def write_contact_sheet(
         return every[view] / max(median, 1e-9) + by_images, *view
 
     chart = _chart([(errors, median), (misfit, typical)], footage.timesteps)
-    shown = sorted(every, key=rank, reverse=True)[: COLUMNS * ROWS]
+    drawn = sorted(every, key=rank, reverse=True)[: COLUMNS * ROWS]
     (width, height) = TILE_SIZE
     top = MARGIN + CAPTION + chart.height + MARGIN
-    lines = -(-len(shown) // COLUMNS)
+    lines = -(-len(drawn) // COLUMNS)
     size = 2 * MARGIN + COLUMNS * (width + GAP) - GAP, top + lines * (height + GAP) + MARGIN
     sheet = Image.new("RGB", size, BACKGROUND)
     red = f"red from {COLOR_SCALE_END * median:.1f} px, gray: no face"
     _write(sheet, (MARGIN, MARGIN), f"Reprojection error, median {median:.2f} px; {red}")
     sheet.paste(chart, (MARGIN, MARGIN + CAPTION))
     by_name = {camera.name: camera for camera in footage.cameras}
-    for number, (name, t) in enumerate(shown):
+    for number, (name, t) in enumerate(drawn):
         image = by_name[name].image(t)
         mask = by_name[name].mask(t)
         if mask is not None:
@@ -190,18 +196,18 @@ def _chart(groups: Sequence[tuple[Errors, float]], timesteps: tuple[int, ...]) -
     rows = []
     for errors, median in groups:
         worst = sorted(errors, key=lambda name: -max(errors[name].values(), default=0.0))
-        shown = [name for name in errors if name in worst[:MAX_CHART_ROWS]]
-        rows += [(name, errors[name], max(median, 1e-9 / COLOR_SCALE_END)) for name in shown]
+        charted = [name for name in errors if name in worst[:MAX_CHART_ROWS]]
+        rows += [(name, errors[name], max(median, 1e-9 / COLOR_SCALE_END)) for name in charted]
     width = COLUMNS * (TILE_SIZE[0] + GAP) - GAP
     chart = Image.new("RGB", (width, CELL_HEIGHT * len(rows)), BACKGROUND)
     stops = np.linspace(0, COLOR_SCALE_END, len(ERROR_COLORS))
-    for row, (name, own, median) in enumerate(rows):
+    for row, (name, by_timestep, median) in enumerate(rows):
         _write(chart, (0, row * CELL_HEIGHT), name[-22:], CELL_HEIGHT - 3)
         cells = np.empty((1, len(timesteps), 3), np.uint8)
         for column, timestep in enumerate(timesteps):
-            fraction = own.get(timestep, 0.0) / median
+            fraction = by_timestep.get(timestep, 0.0) / median
             color = [np.interp(fraction, stops, channel) for channel in ERROR_COLORS.T]
-            cells[0, column] = color if timestep in own else NO_FACE
+            cells[0, column] = color if timestep in by_timestep else NO_FACE
         size = width - NAME_WIDTH, CELL_HEIGHT - 1
         strip = Image.fromarray(cells).resize(size, Image.Resampling.NEAREST)
         chart.paste(strip, (NAME_WIDTH, row * CELL_HEIGHT))
@@ -251,12 +257,12 @@ def with_mesh(
 ) -> np.ndarray:
     """The mesh over the picture, colored by the direction of its surface."""
     triangle, weights = rasterize(vertices, faces, camera)
-    seen = triangle >= 0
+    covered = triangle >= 0
     normals = vertex_normals(vertices, faces) @ camera.rotation.T
-    smooth = (normals[faces[triangle[seen]]] * weights[seen][..., None]).sum(axis=1)
+    smooth = (normals[faces[triangle[covered]]] * weights[covered][..., None]).sum(axis=1)
     colors = 127.5 * (1 + smooth * [1, -1, -1])
     drawn = picture.astype(np.float64)
-    drawn[seen] += MESH_OPACITY * (colors - drawn[seen])
+    drawn[covered] += MESH_OPACITY * (colors - drawn[covered])
     return np.asarray(np.clip(drawn, 0, 255).round(), np.uint8)
 
 

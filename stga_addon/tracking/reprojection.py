@@ -26,9 +26,11 @@ def reprojection_errors(fit: HeadFit, take: RecordedTake, footage: Footage) -> E
     errors: Errors = {camera.name: {} for camera in footage.cameras}
     for timestep, parameters in fit.parameters.items():
         head = points.positions(*split(parameters))
-        own = take.landmarks[timestep]
-        seen = zip(own.names, own.cameras, own.points, own.confidence, strict=True)
-        for name, camera, pixels, confidence in seen:
+        landmarks = take.landmarks[timestep]
+        detected = zip(
+            landmarks.names, landmarks.cameras, landmarks.points, landmarks.confidence, strict=True
+        )
+        for name, camera, pixels, confidence in detected:
             use = take.reliable & (confidence > 0)
             away = fit.to_capture.camera(camera).project(head[use])[0] - pixels[use]
             distance = float(np.median(np.linalg.norm(away, axis=1)))
@@ -76,5 +78,9 @@ def check_cameras(errors: Errors) -> None:
 
 def _fractions(errors: Errors) -> dict[str, float]:
     """Camera -> median distance of its landmarks from the head's, in face sizes."""
-    seen = {name: [part for _, part in own.values()] for name, own in errors.items() if own}
-    return {name: float(np.median(own)) for name, own in seen.items()}
+    of_cameras = {
+        name: [part for _, part in by_timestep.values()]
+        for name, by_timestep in errors.items()
+        if by_timestep
+    }
+    return {name: float(np.median(fractions)) for name, fractions in of_cameras.items()}

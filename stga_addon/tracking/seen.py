@@ -184,8 +184,11 @@ def interpolated(
 def _misfits(dense: DenseFit | None) -> Misfits:
     if dense is None:
         return {}
-    fractions = {t: own.tolist() for t, own in dense.misfit.items()}
-    return {name: {t: own[n] for t, own in fractions.items()} for n, name in enumerate(REGIONS)}
+    fractions = {t: by_region.tolist() for t, by_region in dense.misfit.items()}
+    return {
+        name: {t: by_region[n] for t, by_region in fractions.items()}
+        for n, name in enumerate(REGIONS)
+    }
 
 
 def _with_images(fitted: FittedHead) -> FittedHead:
@@ -216,7 +219,7 @@ def _pictures(
     with ThreadPoolExecutor() as pool:  # decoding of a camera's images needs no lock of Python's
         pictures = list(pool.map(lambda camera: picture(camera, timestep), cameras))
     pairs = zip(cameras, pictures, strict=True)
-    return [(camera.camera, own) for camera, own in pairs if own is not None]
+    return [(camera.camera, image) for camera, image in pairs if image is not None]
 
 
 def _head_pixels(
@@ -238,7 +241,7 @@ def _warnings(fitted: FittedHead) -> tuple[str, ...]:
     single = len(footage.cameras) == 1
     scale = f"{fit.to_capture.scale:.4g}"
     is_scaled = recorded.opened.keeps_world and not recorded.take.metric
-    own = {
+    found = {
         f"no face at {fraction}, interpolated: {listed(missing, 20)}": bool(missing),
         f"no face in any frame of: {', '.join(blind)}": bool(blind),
         "one camera: size and distance of the head, and its depth, are those of the average "
@@ -250,7 +253,7 @@ def _warnings(fitted: FittedHead) -> tuple[str, ...]:
         f"{scale}": is_scaled,
     }
     warnings = *footage.warnings, *fitted.warnings
-    warnings += tuple(text for text, holds in own.items() if holds)
+    warnings += tuple(text for text, holds in found.items() if holds)
     return warnings if recorded.focal is None else (*warnings, _focal_warning(recorded.focal))
 
 

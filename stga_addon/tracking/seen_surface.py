@@ -124,8 +124,8 @@ def in_sight(
     closeness = np.zeros(triangle.shape)
     corners = faces[triangle[covered]]
     closeness[covered] = (inside[covered] / small.project(vertices)[1][corners]).sum(1)
-    x, y, seen = pixels_of(points, small)
-    return seen & (closeness[y, x] * (small.project(points)[1] - OCCLUSION_M) < 1)
+    x, y, in_image = pixels_of(points, small)
+    return in_image & (closeness[y, x] * (small.project(points)[1] - OCCLUSION_M) < 1)
 
 
 def surface_offsets(
@@ -154,7 +154,7 @@ def surface_offsets(
     window = (window / window.sum()).astype(np.float32)
     offsets = sweep.offsets.astype(np.float32)
     total = np.zeros((len(points), len(offsets), len(window)), np.float32)
-    own = np.zeros(total.shape[:2], np.float32)  # what patches add by agreeing with themselves
+    alone = np.zeros(total.shape[:2], np.float32)  # what patches add by agreeing with themselves
     for view, cosine in zip(views, usable, strict=True):
         rows = np.flatnonzero(cosine)
         if len(rows):
@@ -163,10 +163,10 @@ def surface_offsets(
             patch = (patch - (patch @ window)[..., None]) * np.sqrt(window)
             patch = patch / np.sqrt((patch**2).sum(-1, keepdims=True) + NOISE_LEVELS**2)
             total[rows] += weight[..., None] * patch
-            own[rows] += weight**2 * (patch**2).sum(2)
+            alone[rows] += weight**2 * (patch**2).sum(2)
     pairs = np.maximum(usable.sum(0) ** 2 - (usable**2).sum(0), 1e-6)
     # the mean of all pairs of patches, weighted by the cosines of both cameras
-    correlation = ((total**2).sum(2) - own) / pairs[:, None]
+    correlation = ((total**2).sum(2) - alone) / pairs[:, None]
     rows = np.arange(len(points))
     best = correlation.argmax(1)
     middle = np.clip(best, 1, len(offsets) - 2)
@@ -357,13 +357,13 @@ def outline_offsets(
     drawn = (rasterize(vertices, rim, camera.scaled(factor))[0] >= 0).astype(np.float32)
     # the mask's edge, where there is one; the last one of the drawn mesh, which has holes
     level = _sampled(mask / np.float32(255), at)
-    own = _sampled(drawn, factor * at)
+    coverage = _sampled(drawn, factor * at)
     crossings = (level[:, :-1] > 0) != (level[:, 1:] > 0)
     once = (crossings.sum(1) == 1) & (level[:, 0] > 0)
-    leaves = (own[:, :-1] > 0) & (own[:, 1:] <= 0)
+    leaves = (coverage[:, :-1] > 0) & (coverage[:, 1:] <= 0)
     last = leaves.shape[1] - 1 - leaves[:, ::-1].argmax(1)
     move = _crossed(level, crossings.argmax(1), steps, once)
-    move = (move - _crossed(own, last, steps, leaves.any(1) & (own[:, -1] <= 0))) / length
+    move = (move - _crossed(coverage, last, steps, leaves.any(1) & (coverage[:, -1] <= 0))) / length
     inside = np.abs(np.nan_to_num(move, nan=np.inf)) <= reach
     found[rows[inside]] = move[inside]
     known[rows[inside]] = True

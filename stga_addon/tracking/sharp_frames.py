@@ -55,8 +55,8 @@ def sharpest(flows: np.ndarray, sharpness: np.ndarray, count: int) -> np.ndarray
     if path[-1] <= 0:
         path = np.arange(len(flows)) + 1.0
     stretch = np.minimum((count * path / path[-1]).astype(int), count - 1)
-    own = (np.flatnonzero(stretch == number) for number in np.unique(stretch))
-    return np.array([rows[sharpness[rows].argmax()] for rows in own])
+    stretches = (np.flatnonzero(stretch == number) for number in np.unique(stretch))
+    return np.array([rows[sharpness[rows].argmax()] for rows in stretches])
 
 
 def _measured(image: np.ndarray) -> tuple[np.ndarray, float]:
@@ -90,7 +90,7 @@ def _flow(before: np.ndarray, now: np.ndarray, last: np.ndarray) -> np.ndarray:
     if corners is None or len(corners) < MIN_CORNERS:
         return last
     moved, found, _ = cv2.calcOpticalFlowPyrLK(before, now, corners, np.empty_like(corners))
-    seen = found.ravel() > 0
-    if seen.sum() < MIN_CORNERS:
+    tracked = found.ravel() > 0
+    if tracked.sum() < MIN_CORNERS:
         return last
-    return np.median((moved - corners)[seen].reshape(-1, 2), axis=0) / max(now.shape)
+    return np.median((moved - corners)[tracked].reshape(-1, 2), axis=0) / max(now.shape)

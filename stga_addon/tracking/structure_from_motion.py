@@ -145,7 +145,9 @@ def find_structure(
         if len(found.timesteps) < options.min_images or found.on_head < options.min_on_head:
             search.write_masks()
             masked = search.structure(True, lambda: None)
-            found = max(found, masked, key=lambda own: (own.on_head, len(own.timesteps)))
+            found = max(
+                found, masked, key=lambda structure: (structure.on_head, len(structure.timesteps))
+            )
         return found.arrays()
     finally:
         shutil.rmtree(folder, ignore_errors=True)
@@ -187,12 +189,12 @@ class _Search:
             none = np.zeros((0, 3, 4))
             return Structure(np.zeros(0, np.int64), none, 0.0, 0.0, 0, 0, 0.0, masked)
         best = self._with_lens(best)
-        images = sorted((own for own in best.images.values() if own.has_pose), key=_name)
+        images = sorted((image for image in best.images.values() if image.has_pose), key=_name)
         (lens,) = best.cameras.values()
         focal, _, _, *distortion = lens.params.tolist()
         return Structure(
             np.array([self._names[image.name] for image in images]),
-            np.stack([own.cam_from_world().matrix() for own in images]),
+            np.stack([image.cam_from_world().matrix() for image in images]),
             focal,
             distortion[0] if distortion else 0.0,
             best.num_points3D(),
@@ -205,8 +207,8 @@ class _Search:
         """Images of where the person is, as COLMAP names them."""
         person = PersonNetwork()
         for name, timestep in self._names.items():
-            shown = person.probability(self._camera.image(timestep)) > PERSON_PROBABILITY
-            write_png(self._folder / MASKS_FOLDER / f"{name}.png", 255 * shown.astype(np.uint8))
+            is_person = person.probability(self._camera.image(timestep)) > PERSON_PROBABILITY
+            write_png(self._folder / MASKS_FOLDER / f"{name}.png", 255 * is_person.astype(np.uint8))
 
     def _extract(self, masked: bool, step: Step) -> None:
         colmap = self._colmap

@@ -102,8 +102,8 @@ def fit_surface(
     chosen = evenly_spread(several, SURFACE_TIMESTEPS)
     visibility = head_fit.LandmarkVisibility(fit.head, take.places)
     visible = {
-        t: visibility.weighted(own, fit.parameters[t], fit.to_capture)
-        for t, own in take.landmarks.items()
+        t: visibility.weighted(landmarks, fit.parameters[t], fit.to_capture)
+        for t, landmarks in take.landmarks.items()
     }
     take = replace(take, landmarks=visible)
     points = surface_points(head, SURFACE_POINTS)
@@ -113,19 +113,24 @@ def fit_surface(
     solved = _solved_subject(head, start, take, points, search)
     if solved is None:
         return fit
-    (take, found, seen) = solved
+    (take, found, surfaces) = solved
     search.done = early
     if not dense:
         marks = take.landmarks
         observed = {t: head_fit.landmarks_in_capture(marks[t], take, found) for t in timesteps}
     else:
         observed = _fitted_landmarks(found, fit, take)
-        if np.median([len(own.cameras) for own in take.landmarks.values()]) <= FEW_CAMERAS:
+        if (
+            np.median([len(landmarks.cameras) for landmarks in take.landmarks.values()])
+            <= FEW_CAMERAS
+        ):
             # the landmarks where they are on `fit`, whose own parameters are of another identity
             poses = np.stack([fit.parameters[t] for t in observed])
             poses = solve_take(found.head, take.places, list(observed.values()), poses, fit.ordered)
             return replace(found, parameters=dict(zip(observed, poses, strict=True)))
-    often = np.mean([own.weight > 0 for own in seen.values()], axis=0) >= MIN_SEEN_FRACTION
+    often = (
+        np.mean([surface.weight > 0 for surface in surfaces.values()], axis=0) >= MIN_SEEN_FRACTION
+    )
     rows = np.flatnonzero(often)
     sought = []
     for sweep, count in TAKE_SWEEPS:
@@ -175,11 +180,11 @@ def _seen_part(
     fit: HeadFit, take: RecordedTake, sought: SurfaceSearch, step: Step
 ) -> list[SeenSurface]:
     """The surface at each of the fit's timesteps, from images and masks."""
-    seen = []
+    surfaces = []
     for t in fit.parameters:
-        seen.append(seen_surface(fit, t, sought, take.images(t), take.masks(t), {}))
+        surfaces.append(seen_surface(fit, t, sought, take.images(t), take.masks(t), {}))
         step()
-    return seen
+    return surfaces
 
 
 def with_offset(head: HeadModel, offset: np.ndarray) -> HeadModel:
@@ -198,42 +203,50 @@ def _identity(
     the surfaces that they were solved from; None where the images do not show enough of the
     surface."""
     offset = np.zeros_like(head.model.v_template)
-    seen = dict[int, SeenSurface]()
+    surfaces = dict[int, SeenSurface]()
     for number, on in enumerate(sought):
         parts = [(*head_fit.excerpt(fit, take, [t]), on) for t in fit.parameters]
-        seen = dict(zip(fit.parameters, search(_seen_part, parts), strict=True))
-        if np.median([(own.weight > 0).sum() for own in seen.values()]) < MIN_SEEN_POINTS:
+        surfaces = dict(zip(fit.parameters, search(_seen_part, parts), strict=True))
+        if (
+            np.median([(surface.weight > 0).sum() for surface in surfaces.values()])
+            < MIN_SEEN_POINTS
+        ):
             return None
         base = with_offset(head, offset)
         fraction = _landmark_fractions(base, take.places)
         together = [
-            _joined(head_fit.landmarks_in_capture(take.landmarks[t], take, fit), fraction, own)
-            for t, own in seen.items()
+            _joined(head_fit.landmarks_in_capture(take.landmarks[t], take, fit), fraction, surface)
+            for t, surface in surfaces.items()
         ]
-        starts = np.stack([fit.parameters[t][-RIGID_SIZE:] for t in seen])
+        starts = np.stack([fit.parameters[t][-RIGID_SIZE:] for t in surfaces])
         found = solve_identity(base, take.places + on.points, together, starts, take.metric)
         fit = replace(
             fit,
             head=person(base, found.shape),
             shape=found.shape,
-            parameters=dict(zip(seen, found.frames, strict=True)),
+            parameters=dict(zip(surfaces, found.frames, strict=True)),
             to_capture=head_fit.scaled_down(fit.to_capture, found.scale),
         )
-        seen = {t: replace(own, position=own.position / found.scale) for t, own in seen.items()}
+        surfaces = {
+            t: replace(surface, position=surface.position / found.scale)
+            for t, surface in surfaces.items()
+        }
         if number:  # what is left between the person's template and the surfaces, along its normals
             model = fit.head.model
             missing = []
-            for t, own in seen.items():
+            for t, surface in surfaces.items():
                 at = on.points.on(posed_mesh(fit, fit.parameters[t]), model.faces)
-                missing.append(((own.position - at) * own.normal).sum(1))
-            repeated = on.points[np.tile(np.arange(len(on.points)), len(seen))]
-            weight = np.concatenate([own.weight for own in seen.values()]) / len(seen)
+                missing.append(((surface.position - at) * surface.normal).sum(1))
+            repeated = on.points[np.tile(np.arange(len(on.points)), len(surfaces))]
+            weight = np.concatenate([surface.weight for surface in surfaces.values()]) / len(
+                surfaces
+            )
             left = repeated, np.concatenate(missing), weight
             values = smooth_offsets(model.v_template, model.faces, *left)
             offset = offset + values[:, None] * vertex_normals(model.v_template, model.faces)
             subject = person(with_offset(head, offset), fit.shape)
             fit = replace(fit, head=subject, static_offset=offset)
-    return fit, seen
+    return fit, surfaces
 
 
 def _whole_take(
@@ -258,13 +271,15 @@ def _whole_take(
     ]
     bias = np.median(missed, axis=0)  # (N, 3) in the turned head's axes
     corrected = {
-        t: replace(own, position=own.position - bias @ head_rotation(first.parameters[t]).T)
-        for t, own in observed.items()
+        t: replace(
+            observation, position=observation.position - bias @ head_rotation(first.parameters[t]).T
+        )
+        for t, observation in observed.items()
     }
     landmarks = list(corrected.values())
     at = take.places.on(model.v_template, model.faces)
     start = np.zeros((len(timesteps), model.n_expression + RIGID_SIZE))
-    start[:, -RIGID_SIZE:] = [head_fit.rigid_start(at, own) for own in landmarks]
+    start[:, -RIGID_SIZE:] = [head_fit.rigid_start(at, observation) for observation in landmarks]
     start = solve_take(fit.head, take.places, landmarks, start, fit.ordered)
     rough = replace(fit, parameters=dict(zip(timesteps, start, strict=True)))
     fraction = np.full(len(take.reliable), TAKE_LANDMARK_FRACTION)
@@ -292,11 +307,11 @@ def _found_part(
     solved from."""
     results = []
     visible_points: list[VisiblePoints] = [{} for _ in sought]
-    for (t, here), own in zip(fit.parameters.items(), landmarks, strict=True):
+    for (t, here), observation in zip(fit.parameters.items(), landmarks, strict=True):
         pictures = take.images(t), take.masks(t, MAX_OUTLINE_CAMERAS)
         for on, visible in zip(sought, visible_points, strict=True):
             rough = replace(fit, parameters={t: here})
-            joined = _joined(own, fraction, seen_surface(rough, t, on, *pictures, visible))
+            joined = _joined(observation, fraction, seen_surface(rough, t, on, *pictures, visible))
             places = take.places + on.points
             (here,) = solve_take(fit.head, places, [joined], here[None], ordered=False)
         results.append((here, joined))

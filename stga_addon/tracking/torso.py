@@ -114,22 +114,22 @@ def follow_torso(
     present = [camera for camera in footage.cameras if middle in camera.timesteps]
     masked = [camera for camera in present if camera.mask(middle) is not None]
     take = TorsoTake(fit, unchanged, evenly_spread(masked, MAX_CAMERAS))
-    seen = torso_take.seen_points(take, middle)
-    if sum(map(len, seen.rows.values())) < MIN_POINTS:
+    observed = torso_take.seen_points(take, middle)
+    if sum(map(len, observed.rows.values())) < MIN_POINTS:
         return FollowedTorso(fit, unchanged)
     walk = torso_take.BothWays(workers, Stage.TORSO, 3 * len(some) + len(unchanged))
-    motions = _motions(take, seen, some, walk)
-    deep = torso_take.at_depth(take, seen, motions)
+    motions = _motions(take, observed, some, walk)
+    deep = torso_take.at_depth(take, observed, motions)
     found = torso_take.compared(take, deep, motions, some)
-    own = "shifted" if found["shifted"] < (1 - MIN_OWN_GAIN) * found["turned"] else "turned"
-    misfit = {"head": found["head"], "still": found["still"], "own": found[own]}
+    independent = "shifted" if found["shifted"] < (1 - MIN_OWN_GAIN) * found["turned"] else "turned"
+    misfit = {"head": found["head"], "still": found["still"], "own": found[independent]}
     # what explains the images best; a simpler motion unless the gain is clear
     motion = "own" if misfit["own"] < (1 - MIN_OWN_GAIN) * misfit["still"] else "still"
     motion = motion if misfit[motion] < (1 - MIN_GAIN) * misfit["head"] else "head"
     decided = TorsoMotion(motion, misfit, 0.0)
     if motion == "head":
         return FollowedTorso(fit, unchanged, motion=decided)
-    name = own if motion == "own" else motion
+    name = independent if motion == "own" else motion
     posed = _everywhere(take, name, deep[name], walk)
     points = TorsoPoints(middle, deep[name].at)
     bending = None
@@ -143,21 +143,21 @@ def _followed(
     fit: HeadFit, take: TorsoTake, posed: Motion, bending: Bending | None, motion: TorsoMotion
 ) -> FollowedTorso:
     """The take with the motion that was chosen."""
-    necks = [own.parameters[-RIGID_SIZE:][3 * NECK : 3 * NECK + 3] for own in posed.values()]
+    necks = [pose.parameters[-RIGID_SIZE:][3 * NECK : 3 * NECK + 3] for pose in posed.values()]
     bends = [] if bending is None else bending.bends.values()
-    shifts = [np.linalg.norm(own.shift) for own in posed.values() if own.shift is not None]
+    shifts = [np.linalg.norm(pose.shift) for pose in posed.values() if pose.shift is not None]
     motion = replace(
         motion,
         turn_deg=float(np.degrees(np.linalg.norm(necks, axis=1).max())),
         shift_mm=1000 * float(max(shifts, default=0.0)),
         bend_mm=1000 * max((float(np.linalg.norm(b, axis=1).max()) for b in bends), default=0.0),
     )
-    heads = {t: own.parameters for t, own in posed.items()}
+    heads = {t: pose.parameters for t, pose in posed.items()}
     offsets = dict[int, np.ndarray]()
-    for t, own in posed.items():
-        if own.shift is not None:
+    for t, pose in posed.items():
+        if pose.shift is not None:
             bend = 0.0 if bending is None else bending.at(t)
-            heads[t], offsets[t] = take.with_offset(own, bend)
+            heads[t], offsets[t] = take.with_offset(pose, bend)
     if bending is not None:
         static = bending.drape + (0 if fit.static_offset is None else fit.static_offset)
         fit = replace(fit, head=with_offset(fit.head, bending.drape), static_offset=static)
@@ -166,16 +166,16 @@ def _followed(
 
 
 def _motions(
-    take: TorsoTake, seen: torso_take.SeenPoints, some: Sequence[int], walk: torso_take.BothWays
+    take: TorsoTake, observed: torso_take.SeenPoints, some: Sequence[int], walk: torso_take.BothWays
 ) -> dict[str, Motion]:
     """The possible motions of a torso, at some timesteps and at the timestep of the points, whose
     depth is determined first by one of these motions."""
-    seen = torso_take.at_depth(take, seen, {})["stereo"]
-    (rough,) = _poses(walk, [_Follower(take, seen, False)], some)
-    seen = torso_take.at_depth(take, seen, {"own": take.motion(rough, rigid=False)})["own"]
-    both = [_Follower(take, seen, shifts) for shifts in (False, True)]
+    observed = torso_take.at_depth(take, observed, {})["stereo"]
+    (rough,) = _poses(walk, [_Follower(take, observed, False)], some)
+    observed = torso_take.at_depth(take, observed, {"own": take.motion(rough, rigid=False)})["own"]
+    both = [_Follower(take, observed, shifts) for shifts in (False, True)]
     turned, shifted = _poses(walk, both, some)
-    still = dict.fromkeys(turned, take.straight(seen.timestep))
+    still = dict.fromkeys(turned, take.straight(observed.timestep))
     return {
         "head": {t: PosedTorso(take.parameters[t]) for t in turned},
         "still": take.motion(still, rigid=False),
@@ -185,14 +185,14 @@ def _motions(
 
 
 def _everywhere(
-    take: TorsoTake, name: str, seen: torso_take.SeenPoints, walk: torso_take.BothWays
+    take: TorsoTake, name: str, observed: torso_take.SeenPoints, walk: torso_take.BothWays
 ) -> Motion:
     """The motion that was chosen, at all timesteps."""
     if name == "still":
-        still = dict.fromkeys(take.parameters, take.straight(seen.timestep))
+        still = dict.fromkeys(take.parameters, take.straight(observed.timestep))
         return take.motion(still, rigid=False)
     shifts = name == "shifted"
-    (poses,) = _poses(walk, [_Follower(take, seen, shifts)], take.parameters)
+    (poses,) = _poses(walk, [_Follower(take, observed, shifts)], take.parameters)
     return take.motion(poses, rigid=shifts)
 
 
@@ -201,27 +201,30 @@ def _poses(
 ) -> list[dict[int, TorsoPose]]:
     """The torso's poses by timestep, for each follower."""
     found = walk.along(_Follower.follow, followers, followers[0].seen.timestep, timesteps)
-    return [{timestep: TorsoPose(**arrays) for timestep, arrays in own.items()} for own in found]
+    return [
+        {timestep: TorsoPose(**arrays) for timestep, arrays in by_timestep.items()}
+        for by_timestep in found
+    ]
 
 
 class _Follower:
     """The pose of the torso over a take, by Gauss–Newton on the images of points below the head."""
 
-    def __init__(self, take: TorsoTake, seen: torso_take.SeenPoints, shifts: bool) -> None:
+    def __init__(self, take: TorsoTake, observed: torso_take.SeenPoints, shifts: bool) -> None:
         """shifts: whether the torso is rigid, and shifted as well as turned."""
         self._take = take
-        self.seen = seen
+        self.seen = observed
         self._shifts = shifts
-        self._first = take.straight(seen.timestep)
-        first = take.with_torso(seen.timestep, self._first, shifts)
-        self._carrier = torso_take.Carrier(take, first, seen.at)
+        self._first = take.straight(observed.timestep)
+        first = take.with_torso(observed.timestep, self._first, shifts)
+        self._carrier = torso_take.Carrier(take, first, observed.at)
 
     def follow(self, way: Sequence[int], step: Step) -> torso_take.Rows:
         """Poses at the timesteps of a way, which begins with the one whose points are followed."""
         first = self._first.points() + self._pivot(way[0])
         states = torso_take.states_along(self._take, way, first, self._next, step)
         at = zip(way, states, strict=True)
-        poses = [TorsoPose.of_points(own - self._pivot(timestep)) for timestep, own in at]
+        poses = [TorsoPose.of_points(points - self._pivot(timestep)) for timestep, points in at]
         return {
             name: np.stack([getattr(pose, name) for pose in poses]) for name in ("turn", "shift")
         }
@@ -240,8 +243,8 @@ class _Follower:
         misfits = []
         for start in starts:
             at = self._posed(now.timestep, start)
-            fraction, shown = self.seen.unexplained(now, at, START_LEVEL)
-            use = shown & self.seen.fitted
+            fraction, in_sight = self.seen.unexplained(now, at, START_LEVEL)
+            use = in_sight & self.seen.fitted
             misfits.append(float(fraction[use].mean()) if use.any() else 1.0)
         best = starts[int(np.argmin(misfits))]
         found = self._descended(now, best, pose, FINE_STEPS)
@@ -259,11 +262,18 @@ class _Follower:
                 at, by_pose = self._linearized(shot.timestep, pose)
                 terms = []
                 for number, rows in self._visible(shot, at):
-                    own = shot.views[number].levels[level]
+                    pyramid_level = shot.views[number].levels[level]
                     residual = self.seen.residual(shot, number, rows, at[rows], level)
-                    pixels, _ = own.camera.project(at[rows])
-                    slope = np.stack(sampled(list(own.gradient), pixels), axis=2) / NOISE_LEVELS
-                    rate = slope @ projection_derivative(own.camera, at[rows]) @ by_pose[rows]
+                    pixels, _ = pyramid_level.camera.project(at[rows])
+                    slope = (
+                        np.stack(sampled(list(pyramid_level.gradient), pixels), axis=2)
+                        / NOISE_LEVELS
+                    )
+                    rate = (
+                        slope
+                        @ projection_derivative(pyramid_level.camera, at[rows])
+                        @ by_pose[rows]
+                    )
                     weight = np.outer(point_weights(residual, level), appearance.CHANNEL_WEIGHTS)
                     terms.append((weight, rate, residual))
                 pose, size = self._moved(pose, expected, terms)
@@ -280,11 +290,11 @@ class _Follower:
         views = list(before.views.values()), list(shot.views.values())
         flows = appearance.flow_targets(old, *views)
         targets = {key[0]: (camera, target) for key, camera, target in flows}
-        shown = [own for own in self._visible(before, old) if own[0] in targets]
+        visible = [pair for pair in self._visible(before, old) if pair[0] in targets]
         for _ in range(appearance.FLOW_ITERATIONS):
             at, by_pose = self._linearized(shot.timestep, found)
             terms = []
-            for number, rows in shown:
+            for number, rows in visible:
                 camera, target = targets[number]
                 miss = camera.project(at[rows])[0] - target[rows]
                 weight = flow_weights(miss)
@@ -297,7 +307,7 @@ class _Follower:
         """Number of each camera that sees any of its fitted points, and the rows of these."""
         known = [(number, rows) for number, rows in self.seen.rows.items() if number in shot.views]
         chosen = [(n, r[self.seen.fitted[r] & shot.shows(n, at[r])]) for n, r in known]
-        return [own for own in chosen if len(own[1])]
+        return [pair for pair in chosen if len(pair[1])]
 
     def _posed(self, timestep: int, pose: TorsoPose) -> np.ndarray:
         torso = self._take.with_torso(timestep, pose, self._shifts)

@@ -130,17 +130,17 @@ def draped(sheet: TorsoSheet, at: np.ndarray, points: np.ndarray) -> np.ndarray:
     angle = np.arctan2(points[:, 0], -points[:, 1])
     distance = np.linalg.norm(points[:, :2], axis=1)
     found = np.zeros(len(DIRECTIONS_RAD))
-    seen = np.zeros(len(DIRECTIONS_RAD))
-    for number, own in enumerate(DIRECTIONS_RAD):
-        near = np.abs(angle - own) < REACH_RAD
+    observed = np.zeros(len(DIRECTIONS_RAD))
+    for number, direction in enumerate(DIRECTIONS_RAD):
+        near = np.abs(angle - direction) < REACH_RAD
         if near.sum() >= MIN_POINTS:
             found[number] = np.quantile(distance[near], FARTHEST_FRACTION) + BEYOND_M
-            seen[number] = 1
-    sure = gaussian_filter1d(seen, DIRECTION_SIGMA, mode="constant")
+            observed[number] = 1
+    sure = gaussian_filter1d(observed, DIRECTION_SIGMA, mode="constant")
     found = gaussian_filter1d(found, DIRECTION_SIGMA, mode="constant") / np.maximum(sure, 1e-6)
     around = SLOPE * np.arctan2(at[:, 0], at[:, 2])
     is_seen, reach_m, certainty = (
-        np.interp(around, DIRECTIONS_RAD, own, 0, 0) for own in (seen, found, sure)
+        np.interp(around, DIRECTIONS_RAD, values, 0, 0) for values in (observed, found, sure)
     )
     trust = np.where(is_seen > 0.5, certainty, 0.0)
     outer = reach_m[:, None] * np.stack([np.sin(around), -np.cos(around)], axis=1)
@@ -250,8 +250,8 @@ class _Cloth:
         self._drape = drape
         mean = diags_array(1 / sheet.laplacian.diagonal()) @ sheet.laplacian
         held = HELD * ~drape.any(1)
-        own = mean.T @ mean / ROUGHNESS_M**2 + diags_array(BEND_SIGMA_M**-2 + held)
-        self._precision = kron(own, eye_array(3)).tocsr()
+        prior = mean.T @ mean / ROUGHNESS_M**2 + diags_array(BEND_SIGMA_M**-2 + held)
+        self._precision = kron(prior, eye_array(3)).tocsr()
         shot = take.shot(first)
         model = take.model
         mesh = posed_mesh(take.fit, motion[first].parameters)
@@ -259,18 +259,18 @@ class _Cloth:
         self._references: dict[int, _Reference] = {}
         for number, view in shot.views.items():
             triangle, barycentric = rasterize(mesh, model.faces, view.levels[0].camera)
-            shown = (triangle >= 0) & sheet.triangles[np.maximum(triangle, 0)]
-            rows, columns = np.nonzero(shown)
+            covered = (triangle >= 0) & sheet.triangles[np.maximum(triangle, 0)]
+            rows, columns = np.nonzero(covered)
             corners = np.searchsorted(sheet.vertices, model.faces[triangle[rows, columns]])
             weights = barycentric[rows, columns]
             at = np.einsum("pk,pki->pi", weights, mesh[sheet.vertices][corners])
             visible = self._visible(shot, number, *view.levels[0].camera.project(at))
-            shown[rows, columns] = visible
+            covered[rows, columns] = visible
             fitted = (rows // BLOCK_PX + columns // BLOCK_PX) % HELD_OUT != 0
             chosen = corners[visible], weights[visible], fitted[visible]
-            part = box_of(shown, FLOW_MARGIN_PX)
+            part = box_of(covered, FLOW_MARGIN_PX)
             bright = view.levels[0].luma[part].copy()  # in one piece
-            self._references[number] = _Reference(shown.shape, shown[part], bright, *chosen)
+            self._references[number] = _Reference(covered.shape, covered[part], bright, *chosen)
 
     def follow(self, way: Sequence[int], step: Step) -> Rows:
         """Offsets at the timesteps of a way, which begins with the first one, where they are 0."""
@@ -299,21 +299,23 @@ class _Cloth:
                 each = rigid, bends[timestep]
                 both = [self._returned(shot, number, bend) for bend in each]
                 use = both[0].visible & both[1].visible & ~reference.fitted
-                change = np.stack([own.luma.astype(float) - reference.luma for own in both])
+                change = np.stack(
+                    [returned.luma.astype(float) - reference.luma for returned in both]
+                )
                 squared = change[:, *reference.pixels][:, use] ** 2
                 total += (squared / (CHANGE_OUTLIER_LEVELS**2 + squared)).sum(1)
                 count += int(use.sum())
-        return [float(own) for own in total / max(count, 1)]
+        return [float(fraction) for fraction in total / max(count, 1)]
 
     def _numbers(self, shot: TorsoShot) -> list[int]:
         """Numbers of the cameras that see the sheet at first and now, in images of one size."""
         return [
             number
-            for number, own in self._references.items()
+            for number, reference in self._references.items()
             if number in shot.views
-            and own.corners.size
-            and shot.views[number].levels[0].channels.shape[:2] == own.shape
-            and min(own.shown.shape) >= appearance.MIN_FLOW_SIDE_PX
+            and reference.corners.size
+            and shot.views[number].levels[0].channels.shape[:2] == reference.shape
+            and min(reference.shown.shape) >= appearance.MIN_FLOW_SIDE_PX
         ]
 
     def _positions(self, timestep: int, bend: np.ndarray) -> np.ndarray:
@@ -402,9 +404,9 @@ def _missed(reference: _Reference, now: _Returned) -> tuple[np.ndarray, np.ndarr
     )
     rows, columns = reference.pixels
     places = np.stack([columns, rows], axis=1) + 0.5 + flow[rows, columns]
-    shown = np.full((*reference.shown.shape, 3), np.nan, np.float32)
-    shown[rows, columns] = np.concatenate([now.source, now.luma[rows, columns][:, None]], axis=1)
-    found = sampled([shown], places)[0]
+    image = np.full((*reference.shown.shape, 3), np.nan, np.float32)
+    image[rows, columns] = np.concatenate([now.source, now.luma[rows, columns][:, None]], axis=1)
+    found = sampled([image], places)[0]
     weight = now.visible & reference.fitted & np.isfinite(found).all(1)
     found = np.where(weight[:, None], found, 0)
     miss = np.where(weight[:, None], found[:, :2] - now.source, 0)

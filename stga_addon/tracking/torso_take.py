@@ -239,14 +239,14 @@ class BothWays:
         """For each of `who`, by timestep, rows of the arrays that follow(who, way, step) gives."""
         later = [first, *sorted(t for t in timesteps if t > first)]
         earlier = [first, *sorted((t for t in timesteps if t < first), reverse=True)]
-        every = [(own, way) for own in who for way in (later, earlier)]
+        every = [(follower, way) for follower in who for way in (later, earlier)]
         found = self._workers.map(follow, every, (self._stage, self._done, self._total), keep=True)
         self._done += len(who) * (len(later) + len(earlier) - 2)
         results: list[dict[int, Rows]] = [{} for _ in who]
-        for number, ((_, way), own) in enumerate(zip(every, found, strict=True)):
+        for number, ((_, way), arrays) in enumerate(zip(every, found, strict=True)):
             for row, t in enumerate(way):
-                results[number // 2][t] = {name: array[row] for name, array in own.items()}
-        return [dict(sorted(own.items())) for own in results]
+                results[number // 2][t] = {name: array[row] for name, array in arrays.items()}
+        return [dict(sorted(by_timestep.items())) for by_timestep in results]
 
 
 def states_along(
@@ -369,8 +369,8 @@ class SeenPoints:
         self, shot: TorsoShot, number: int, rows: np.ndarray, at: np.ndarray, level: int
     ) -> np.ndarray:
         """Channels (M, 3) of a camera's image at points less the reference's, in NOISE_LEVELS."""
-        own = shot.views[number].levels[level]
-        values = sampled([own.channels], own.camera.project(at)[0])[0]
+        pyramid_level = shot.views[number].levels[level]
+        values = sampled([pyramid_level.channels], pyramid_level.camera.project(at)[0])[0]
         return (values - self.reference[level][rows]) / NOISE_LEVELS
 
 
@@ -395,17 +395,17 @@ def seen_points(take: TorsoTake, timestep: int) -> SeenPoints:
         x, y = places.astype(int).T
         _, nearest = cKDTree(pixels).query(places)
         head = silhouette(mesh, take.model.faces[~take.torso], camera)
-        shown = grown(mask > 127, MASK_MARGIN) & ~grown(head, HEAD_MARGIN)
-        kept = np.flatnonzero(shown[y, x] & take.torso[nearest])
+        body = grown(mask > 127, MASK_MARGIN) & ~grown(head, HEAD_MARGIN)
+        kept = np.flatnonzero(body[y, x] & take.torso[nearest])
         kept = kept[:: max(1, -(-len(kept) // MAX_POINTS))]
         if not len(kept):
             continue
-        own = camera.unproject(places[kept], depth[nearest[kept]])
+        points = camera.unproject(places[kept], depth[nearest[kept]])
         block = (rows // BLOCK_POINTS + columns // BLOCK_POINTS).ravel()[kept]
-        shades = [sampled([v.channels], v.camera.project(own)[0])[0] for v in view.levels]
-        found.append((own, own - camera.position, block % HELD_OUT != 0, *shades))
-        rows_of[number] = count + np.arange(len(own))
-        count += len(own)
+        shades = [sampled([v.channels], v.camera.project(points)[0])[0] for v in view.levels]
+        found.append((points, points - camera.position, block % HELD_OUT != 0, *shades))
+        rows_of[number] = count + np.arange(len(points))
+        count += len(points)
     at, away, fitted, *reference = map(np.concatenate, zip(*found, strict=True))
     return SeenPoints(timestep, rows_of, at, unit(away), fitted, reference)
 
@@ -450,67 +450,72 @@ class Carrier:
 
 def compared(
     take: TorsoTake,
-    seen: Mapping[str, SeenPoints],
+    observed: Mapping[str, SeenPoints],
     motions: Mapping[str, Motion],
     timesteps: Sequence[int],
 ) -> dict[str, float]:
     """Motion -> mean misfit of held-out points, where all motions leave them in sight."""
-    start = seen["head"].timestep
+    start = observed["head"].timestep
     total = np.zeros(len(motions))
     count = 0
-    carriers = {name: Carrier(take, own[start], seen[name].at) for name, own in motions.items()}
+    carriers = {
+        name: Carrier(take, poses[start], observed[name].at) for name, poses in motions.items()
+    }
     for timestep in (t for t in timesteps if t != start):
         shot = take.shot(timestep)
         found = []
-        for name, own in motions.items():
-            at = carriers[name].carried(own[timestep])(seen[name].at)
-            found.append(seen[name].unexplained(shot, at, EVIDENCE_LEVEL))
-        fractions, shown = map(np.stack, zip(*found, strict=True))
-        use = shown.all(0) & ~seen["head"].fitted
+        for name, poses in motions.items():
+            at = carriers[name].carried(poses[timestep])(observed[name].at)
+            found.append(observed[name].unexplained(shot, at, EVIDENCE_LEVEL))
+        fractions, in_sight = map(np.stack, zip(*found, strict=True))
+        use = in_sight.all(0) & ~observed["head"].fitted
         count = count + int(use.sum())
         total = total + fractions[:, use].sum(1)
     return dict(zip(motions, (total / max(count, 1)).tolist(), strict=True))
 
 
 def at_depth(
-    take: TorsoTake, seen: SeenPoints, motions: Mapping[str, Motion]
+    take: TorsoTake, observed: SeenPoints, motions: Mapping[str, Motion]
 ) -> dict[str, SeenPoints]:
     """Motion -> the points at the depths along their rays at which other cameras, and other
     timesteps of the motion, look like them; "stereo": of other cameras alone."""
-    candidates = [seen.at + depth * seen.ray for depth in DEPTHS_M]
-    shot = take.shot(seen.timestep)
-    stereo = np.zeros((len(DEPTHS_M), len(seen.at)))
-    for number, rows in seen.rows.items():
+    candidates = [observed.at + depth * observed.ray for depth in DEPTHS_M]
+    shot = take.shot(observed.timestep)
+    stereo = np.zeros((len(DEPTHS_M), len(observed.at)))
+    for number, rows in observed.rows.items():
         for other in shot.views.keys() - {number}:
             for cost, at in zip(stereo, candidates, strict=True):
-                residual = seen.residual(shot, other, rows, at[rows], EVIDENCE_LEVEL)
+                residual = observed.residual(shot, other, rows, at[rows], EVIDENCE_LEVEL)
                 fraction = unexplained(residual, EVIDENCE_LEVEL, ALONG_CAMERAS)
                 cost[rows] += np.where(shot.shows(other, at[rows]), fraction, UNSEEN_COST)
     costs = {"stereo": stereo, **{name: stereo.copy() for name in motions}}
-    carriers = {name: Carrier(take, own[seen.timestep], seen.at) for name, own in motions.items()}
+    carriers = {
+        name: Carrier(take, poses[observed.timestep], observed.at)
+        for name, poses in motions.items()
+    }
     known = (
         sorted(set.intersection(*(set(motion) for motion in motions.values()))) if motions else []
     )
-    for timestep in evenly_spread([t for t in known if t != seen.timestep], DEPTH_TIMESTEPS):
+    for timestep in evenly_spread([t for t in known if t != observed.timestep], DEPTH_TIMESTEPS):
         shot = take.shot(timestep)
-        for name, own in motions.items():
-            carried = carriers[name].carried(own[timestep])
+        for name, poses in motions.items():
+            carried = carriers[name].carried(poses[timestep])
             for cost, at in zip(costs[name], candidates, strict=True):
-                fraction, shown = seen.unexplained(shot, carried(at), EVIDENCE_LEVEL)
-                cost += np.where(shown, fraction, UNSEEN_COST)
-    return {name: _moved_in_depth(seen, cost) for name, cost in costs.items()}
+                fraction, in_sight = observed.unexplained(shot, carried(at), EVIDENCE_LEVEL)
+                cost += np.where(in_sight, fraction, UNSEEN_COST)
+    return {name: _moved_in_depth(observed, cost) for name, cost in costs.items()}
 
 
-def _moved_in_depth(seen: SeenPoints, cost: np.ndarray) -> SeenPoints:
+def _moved_in_depth(observed: SeenPoints, cost: np.ndarray) -> SeenPoints:
     """The points where the cost (DEPTHS_M, N), averaged over neighbors, is least, if that is
     significant."""
     from scipy.spatial import cKDTree
 
-    moved = seen.at.copy()
-    for rows in seen.rows.values():
+    moved = observed.at.copy()
+    for rows in observed.rows.values():
         if len(rows) >= NEIGHBORS and np.ptp(cost[:, rows]) > 0:
-            near = rows[cKDTree(seen.at[rows]).query(seen.at[rows], NEIGHBORS)[1]]
+            near = rows[cKDTree(observed.at[rows]).query(observed.at[rows], NEIGHBORS)[1]]
             depth = np.zeros(len(moved))
             depth[rows] = np.array(DEPTHS_M)[cost[:, near].mean(2).argmin(0)]
-            moved[rows] += np.median(depth[near], axis=1)[:, None] * seen.ray[rows]
-    return replace(seen, at=moved)
+            moved[rows] += np.median(depth[near], axis=1)[:, None] * observed.ray[rows]
+    return replace(observed, at=moved)

@@ -104,7 +104,10 @@ def _write(head: SeenHead, workers: Workers) -> TrackingReport:
     focal = _focal_length(head)
     focal_values = dict.fromkeys(folder.FOCAL_KEYS) if focal is None else to_json(focal)
     median = median_px(head.errors)
-    pixels = {name: {t: px for t, (px, _) in own.items()} for name, own in head.errors.items()}
+    pixels = {
+        name: {t: px for t, (px, _) in by_timestep.items()}
+        for name, by_timestep in head.errors.items()
+    }
     values = {
         "median_reprojection_px": round(median, 3),
         "meters_per_unit": fit.to_capture.scale,
@@ -145,6 +148,6 @@ def _focal_length(head: SeenHead) -> folder.FocalLength | None:
 def _keep_landmarks(out: Path, recorded: RecordedFootage) -> None:
     """What a correction of the capture starts from, where it was read from another folder."""
     kept = out / folder.LANDMARKS_FOLDER
-    for name, own in recorded.detected.items():
-        write_camera(landmark_file(kept, name), own)
+    for name, landmarks in recorded.detected.items():
+        write_camera(landmark_file(kept, name), landmarks)
     write_places(kept / folder.PLACES_FILE, recorded.take.places, recorded.take.reliable)

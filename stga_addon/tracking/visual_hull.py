@@ -67,8 +67,8 @@ def _fraction_inside(
     """Median over the cameras of the fraction of the vertices in the image that a mask covers."""
     fractions = []
     for mask, camera in zip(masks, cameras, strict=True):
-        x, y, shown = pixels_of(mesh, camera)
-        fractions += [mask[y[shown], x[shown]].mean()] if shown.any() else []
+        x, y, inside = pixels_of(mesh, camera)
+        fractions += [mask[y[inside], x[inside]].mean()] if inside.any() else []
     return float(np.median(fractions)) if fractions else 0.0
 
 
@@ -91,9 +91,9 @@ def where_person_is(
     points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
     showing, agreeing = np.zeros((2, len(points)), np.int32)
     for matte, camera in small:
-        x, y, shown = pixels_of(points, camera)
-        showing += shown
-        agreeing += shown & grown(cv2, matte, _pixels(VOXEL_M / 2, camera, mesh))[y, x]
+        x, y, inside = pixels_of(points, camera)
+        showing += inside
+        agreeing += inside & grown(cv2, matte, _pixels(VOXEL_M / 2, camera, mesh))[y, x]
     solid = (showing < MIN_SHOWING) | (agreeing >= MIN_AGREEING_FRACTION * showing)
     connected, _ = label(solid.reshape([len(axis) for axis in axes]))
     rows = [
@@ -104,9 +104,9 @@ def where_person_is(
     points = points[np.isin(connected, of_head).ravel()]
     found = []
     for camera, (_, reduced_camera) in zip(cameras, small, strict=True):
-        x, y, shown = pixels_of(points, reduced_camera)
+        x, y, inside = pixels_of(points, reduced_camera)
         covered = np.zeros((reduced_camera.height, reduced_camera.width), bool)
-        covered[y[shown], x[shown]] = True
+        covered[y[inside], x[inside]] = True
         covered = grown(cv2, covered, _pixels(VOXEL_M, reduced_camera, mesh))
         size = camera.width, camera.height
         found.append(

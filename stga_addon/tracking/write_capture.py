@@ -37,7 +37,7 @@ def write_capture(
     views = list(footage.views())
     index = {camera.name: number for number, camera in enumerate(footage.cameras)}
     splits: dict[str, list[dict[str, Any]]] = {"train": [], "val": [], "test": []}
-    centers = np.array([own.camera.position for own in footage.cameras])
+    centers = np.array([each.camera.position for each in footage.cameras])
     held_out = None
     if len(centers) >= MIN_CAMERAS_TO_HOLD_OUT:
         nearest = np.linalg.norm(centers - centers.mean(0), axis=1).argmin()
@@ -51,15 +51,15 @@ def write_capture(
             entry["flame_param_path"] = f"{PARAMETERS}/{timestep:05d}.npz"
         else:
             entry["mesh_path"] = f"meshes/{timestep:05d}.obj"
-        seen = "val" if source.name == held_out else "train"
-        splits[seen if timestep in fit.parameters else "test"].append(entry)
+        split = "val" if source.name == held_out else "train"
+        splits[split if timestep in fit.parameters else "test"].append(entry)
         report(Stage.IMAGES, number + 1, len(views))
     top: dict[str, Any] = {} if flame else {"canonical_mesh_path": "meshes/neutral.obj"}
     if footage.fps is not None:
         top["fps"] = footage.fps
     neutral = np.zeros_like(next(iter(parameters.values())))
-    own = fit.static_offset
-    person = {} if own is None else {"static_offset": own.astype(np.float32)}
+    offset = fit.static_offset
+    person = {} if offset is None else {"static_offset": offset.astype(np.float32)}
     person["shape"] = fit.shape.astype(np.float32)
     for number, (timestep, values) in enumerate(parameters.items()):
         if flame:

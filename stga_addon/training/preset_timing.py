@@ -136,10 +136,10 @@ def _tracking_seconds(trainer: Trainer, settings: TrainingSettings) -> float:
     first one, which begins from a single start, is not."""
     capture = trainer.capture
     alone = replace(capture, views={"train": capture.views["train"]})
-    trained, every = (views_by_timestep(own.all_views).keys() for own in (alone, capture))
+    trained, every = (views_by_timestep(part.all_views).keys() for part in (alone, capture))
     counts = [
-        len(tracked_timesteps(settings, own, sorted(timesteps)))
-        for own, timesteps in ((alone, trained), (capture, every - trained))
+        len(tracked_timesteps(settings, part, sorted(timesteps)))
+        for part, timesteps in ((alone, trained), (capture, every - trained))
     ]
     laps: list[float] = []
 

@@ -116,20 +116,20 @@ def clean_plates(capture: Capture, correct: Correction | None = None) -> list[Cl
     return plates
 
 
-def filled(image: np.ndarray, seen: np.ndarray) -> np.ndarray:
-    """The image (H, W, 3) float32 with smooth colors where it is not `seen` (H, W) bool: those of
+def filled(image: np.ndarray, mask: np.ndarray) -> np.ndarray:
+    """The image (H, W, 3) float32 with smooth colors where `mask` (H, W) bool is not set: those of
     the image at half the size, whose pixels are means of those that have one (push and pull)."""
-    if seen.all() or not seen.any():
+    if mask.all() or not mask.any():
         return image
-    height, width = seen.shape
+    height, width = mask.shape
     weighted = np.zeros((height + height % 2, width + width % 2, 4), np.float32)
-    weighted[:height, :width, :3] = image * seen[..., None]
-    weighted[:height, :width, 3] = seen
+    weighted[:height, :width, :3] = image * mask[..., None]
+    weighted[:height, :width, 3] = mask
     half = weighted.reshape(len(weighted) // 2, 2, -1, 2, 4).mean(axis=(1, 3))
     known = half[..., 3] > 0
     smaller = filled(half[..., :3] / np.maximum(half[..., 3:], 1e-6), known)
     larger = zoom(smaller, (2, 2, 1), order=1, mode="nearest", grid_mode=True)
-    return np.where(seen[..., None], image, larger[:height, :width])
+    return np.where(mask[..., None], image, larger[:height, :width])
 
 
 def world_of(capture: Capture, settings: TrainingSettings, report: Report) -> Splats:

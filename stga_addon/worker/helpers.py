@@ -199,8 +199,8 @@ class _Unpickler(pickle.Unpickler):
     """Finds this package's names under its name in this process: another one in Blender."""
 
     def find_class(self, module: str, name: str) -> Any:
-        own = (__package__ or "").removesuffix(".worker")
-        return super().find_class(re.sub(r"^(.+\.)?stga_addon(?=\.)", own, module), name)
+        package = (__package__ or "").removesuffix(".worker")
+        return super().find_class(re.sub(r"^(.+\.)?stga_addon(?=\.)", package, module), name)
 
 
 def _send(stream: IO[bytes], message: Any) -> None:

@@ -98,8 +98,8 @@ def start_in_background(
     process = start_python(python, arguments, stdin=subprocess.DEVNULL, **options, **_DETACHED)
     if os.name != "nt":  # where it is started with a low one
         with suppress(OSError):  # the process has ended already
-            own = os.getpriority(os.PRIO_PROCESS, 0)
-            os.setpriority(os.PRIO_PROCESS, process.pid, own + niceness)
+            current = os.getpriority(os.PRIO_PROCESS, 0)
+            os.setpriority(os.PRIO_PROCESS, process.pid, current + niceness)
     return process
 
 

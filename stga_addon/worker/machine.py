@@ -71,8 +71,8 @@ def _groups(controller: str, proc: Path) -> Iterator[Path]:
                 continue
             top = Path(_unescaped(mount[4]))
             inside = Path(path)
-            shown = Path(_unescaped(mount[3]))  # which group is at the top
-            below = inside.relative_to(shown) if inside.is_relative_to(shown) else Path()
+            mount_root = Path(_unescaped(mount[3]))  # which group is at the top
+            below = inside.relative_to(mount_root) if inside.is_relative_to(mount_root) else Path()
             yield from (top / part for part in (below, *below.parents))
 
 

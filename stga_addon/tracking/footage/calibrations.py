@@ -79,8 +79,8 @@ def _read_transforms(path: Path, image_size: ImageSize) -> Calibrated:
         return read_camera_params(path, image_size)
     if is_file(path) and is_gaussian_cameras(path):
         return read_gaussian_cameras(path), ()
-    parts = [read_nerfstudio(own) for own in (transforms_files(path) or [path])]
-    messages = tuple(message for _, own in parts for message in own)
+    parts = [read_nerfstudio(file) for file in (transforms_files(path) or [path])]
+    messages = tuple(message for _, sentences in parts for message in sentences)
     return [shot for shots, _ in parts for shot in shots], messages
 
 
@@ -109,7 +109,7 @@ def _xmp_files(root: Path) -> list[Path]:
 def _xmp_folder(root: Path) -> list[Path]:
     files = _xmp_files(root)
     above = [files[0].parent, *files[0].parents] if files else []
-    return [own for own in above if all(path.is_relative_to(own) for path in files)][:1]
+    return [folder for folder in above if all(path.is_relative_to(folder) for path in files)][:1]
 
 
 def _read_xmp(path: Path, image_size: ImageSize) -> Calibrated:
@@ -168,8 +168,8 @@ def find_calibration(root: Path) -> tuple[Path | None, tuple[str, ...]]:
     for transforms_train.json and its like, for a COLMAP model or for XMP files. Raises StgaError
     for two files, and where there is none but a file that looks like one.
     """
-    found = [own for program in PROGRAMS for own in program.find(root)]
-    files = [own.name for own in found if is_file(own)]
+    found = [path for program in PROGRAMS for path in program.find(root)]
+    files = [path.name for path in found if is_file(path)]
     if len(files) > 1 and found[0].name in files and files[0] != WHOLE_FILE:
         raise StgaError(f"{root}: {files[0]} and {files[1]} are calibrations; choose one")
     named = transforms_files(root)
@@ -182,7 +182,7 @@ def find_calibration(root: Path) -> tuple[Path | None, tuple[str, ...]]:
                 f"{EXPECTED}, or none in the folder"
             )
         return None, ()
-    unused = [own.relative_to(root).as_posix() for own in (*found[1:], *others) if own != root]
+    unused = [path.relative_to(root).as_posix() for path in (*found[1:], *others) if path != root]
     unused += ["*.xmp"] if root in found[1:] else []
     message = f"{found[0]}: is the calibration; not used: {listed(unused)}"
     return found[0], (message,) if unused else ()

@@ -67,23 +67,23 @@ def colmap_models(folder: Path) -> list[Path]:
         names[:] = sorted(n for n in names if not n.startswith(".") and len(below.parts) < 3)
         if model_suffix(Path(path)):
             found.append(below)
-    counts = {own: _image_count(folder / own) if len(found) > 1 else 0 for own in found}
+    counts = {model: _image_count(folder / model) if len(found) > 1 else 0 for model in found}
 
-    def order(own: Path) -> tuple[bool, int, int, list[tuple[int, str]]]:
-        name = own.as_posix()
+    def order(model: Path) -> tuple[bool, int, int, list[tuple[int, str]]]:
+        name = model.as_posix()
         known_folder = next((n for n, known in enumerate(KNOWN_FOLDERS) if name == known), None)
         rank = len(KNOWN_FOLDERS) if known_folder is None else known_folder
-        return is_distorted(own), -counts[own], rank, natural_order(name)
+        return is_distorted(model), -counts[model], rank, natural_order(name)
 
-    return [folder / own for own in sorted(found, key=order)]
+    return [folder / model for model in sorted(found, key=order)]
 
 
 def incomplete_models(folder: Path) -> list[Path]:
     """Folders of one of footage that hold one of the two files of a model, as text or binary."""
     folders = sorted({folder, *folder.glob("sparse"), *folder.glob("sparse/*")})
     names = [f"{name}{suffix}" for name in ("cameras", "images") for suffix in (".bin", ".txt")]
-    damaged = (own for own in folders if not model_suffix(own))
-    return [own / name for own in damaged for name in names if is_file(own / name)]
+    damaged = (model for model in folders if not model_suffix(model))
+    return [model / name for model in damaged for name in names if is_file(model / name)]
 
 
 def is_distorted(folder: Path) -> bool:

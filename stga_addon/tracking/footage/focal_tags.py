@@ -58,8 +58,8 @@ def photo_focal(path: Path, width: int, height: int) -> float | None:
         equivalent = float(tags.get(EQUIVALENT) or 0)
         focal = float(tags.get(FOCAL) or 0)
         taken = sorted((float(tags.get(WIDTH) or width), float(tags.get(HEIGHT) or height)))
-        shown = sorted((float(width), float(height)))
-        if abs(taken[0] * shown[1] / (taken[1] * shown[0]) - 1) > MAX_ASPECT_DIFFERENCE:
+        sides = sorted((float(width), float(height)))
+        if abs(taken[0] * sides[1] / (taken[1] * sides[0]) - 1) > MAX_ASPECT_DIFFERENCE:
             return None
         if not equivalent and focal and tags.get(PER_UNIT):
             pixels = focal * float(tags[PER_UNIT]) / UNITS_MM[tags.get(UNIT, 2)]

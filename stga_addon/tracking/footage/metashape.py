@@ -35,15 +35,15 @@ def read_metashape(path: Path) -> Calibrated:
     sensor or camera."""
     root = read_xml(path)
     chunks = list(root.iter("chunk")) or [root]
-    chunk = max(chunks, key=lambda own: len(_aligned(own)))
-    others = [_count(own, "chunk") for own in chunks if own is not chunk and _aligned(own)]
+    chunk = max(chunks, key=lambda each: len(_aligned(each)))
+    others = [_count(each, "chunk") for each in chunks if each is not chunk and _aligned(each)]
     cameras = _aligned(chunk)
     component = None
     components = Counter(camera.get("component_id") for camera in cameras)
     if components:
         component = components.most_common(1)[0][0]
-        rest = [own for own in components if own != component]
-        others += [f"component {own} ({components[own]} cameras)" for own in rest]
+        rest = [each for each in components if each != component]
+        others += [f"component {each} ({components[each]} cameras)" for each in rest]
     sensors = {sensor.get("id"): sensor for sensor in chunk.iter("sensor")}
     labels = _labels(chunk)
     shots = []
@@ -62,7 +62,9 @@ def read_metashape(path: Path) -> Calibrated:
         "disabled cameras": disabled,
         "smaller alignments": others,
     }
-    return shots, tuple(f"left out {what}: {listed(own)}" for what, own in left_out.items() if own)
+    return shots, tuple(
+        f"left out {what}: {listed(names)}" for what, names in left_out.items() if names
+    )
 
 
 def _count(chunk: Element, what: str) -> str:
@@ -75,7 +77,9 @@ def _is_enabled(camera: Element) -> bool:
 
 def _aligned(chunk: Element) -> list[Element]:
     cameras = chunk.iter("camera")
-    return [own for own in cameras if _is_enabled(own) and own.find("transform") is not None]
+    return [
+        camera for camera in cameras if _is_enabled(camera) and camera.find("transform") is not None
+    ]
 
 
 def _labels(chunk: Element) -> dict[Element, str]:
@@ -84,8 +88,8 @@ def _labels(chunk: Element) -> dict[Element, str]:
     labels = {camera: camera.get("label") or "" for camera in chunk.iter("camera")}
     for group in chunk.iter("group"):
         name = group.get("label")
-        own = group.iter("camera") if name else ()
-        labels |= {camera: f"{name}/{labels[camera]}" for camera in own}
+        members = group.iter("camera") if name else ()
+        labels |= {camera: f"{name}/{labels[camera]}" for camera in members}
     return labels
 
 

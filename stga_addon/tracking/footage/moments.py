@@ -101,9 +101,9 @@ def _stands_still(cameras: Sequence[str], poses: Sequence[np.ndarray]) -> bool:
     of_camera = np.array(cameras)
     chosen = np.zeros(len(cameras), int)
     for camera in set(cameras):
-        own = np.flatnonzero(of_camera == camera)
-        middle = np.median(places[own], axis=0)
-        chosen[own] = own[np.linalg.norm(places[own] - middle, axis=1).argmin()]
+        rows = np.flatnonzero(of_camera == camera)
+        middle = np.median(places[rows], axis=0)
+        chosen[rows] = rows[np.linalg.norm(places[rows] - middle, axis=1).argmin()]
     centers = places[np.unique(chosen)]
     extent = float(np.median(np.linalg.norm(centers - centers.mean(axis=0), axis=1)))
     shift = np.linalg.norm(places - places[chosen], axis=1)
@@ -167,6 +167,6 @@ def _assigned(
 def _likeliness(found: dict[str, dict[str, str]]) -> tuple[int, bool, int]:
     """Sort key of folders of images and masks with the same names: most cameras first, then folders
     that are not called masks, then the most images."""
-    moments = [moment.lower() for own in found.values() for moment in own]
+    moments = [moment.lower() for images in found.values() for moment in images]
     is_other = any(word in moments[0] for word in OTHER_WORDS)
     return len(found), not is_other, len(moments)

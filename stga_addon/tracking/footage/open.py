@@ -97,7 +97,9 @@ def open_footage(
         names = [path.relative_to(root).as_posix() for path in sources.unread]
         unread = f"{root}: does not read {listed(names)}; expected {', '.join(IMAGE_SUFFIXES)}"
         footage = replace(footage, warnings=(*footage.warnings, unread))
-    plated = tuple(replace(own, plate=sources.plates.get(own.name)) for own in footage.cameras)
+    plated = tuple(
+        replace(camera, plate=sources.plates.get(camera.name)) for camera in footage.cameras
+    )
     footage = replace(footage, cameras=plated)
     if mattes is None:
         unused = _unused_masks(sources, plated)
@@ -114,8 +116,8 @@ def _masks_as_meant(footage: Footage) -> Footage:
     sentence about that."""
     masks = [
         view
-        for own in footage.cameras
-        for view in _mask_views(own.frames).values()
+        for camera in footage.cameras
+        for view in _mask_views(camera.frames).values()
         if view.mask is not None
     ]
     measured = evenly_spread(masks, MAX_MEASURED_MASKS)
@@ -148,10 +150,10 @@ def _mask_views(frames: Frames) -> Mapping[int, View]:
 def sized(footage: Footage, size: float) -> Footage:
     """The footage with images of a fraction of the recorded size."""
     cameras = []
-    for own in footage.cameras:
-        ideal = own.camera.scaled(size)
-        known = own.undistortion or Undistortion(own.camera, Lens(), ideal)
-        cameras.append(replace(own, camera=ideal, undistortion=replace(known, camera=ideal)))
+    for recorded in footage.cameras:
+        ideal = recorded.camera.scaled(size)
+        known = recorded.undistortion or Undistortion(recorded.camera, Lens(), ideal)
+        cameras.append(replace(recorded, camera=ideal, undistortion=replace(known, camera=ideal)))
     return replace(footage, cameras=tuple(cameras))
 
 
@@ -175,7 +177,9 @@ def _workspace(root: Path, calibration: Path) -> tuple[Path, tuple[str, ...]]:
         return root, (ORIGINALS, *CONTAINERS)
     above = [calibration, *calibration.parents]
     inside = above[: above.index(root)]
-    return next((own for own in inside if is_folder(own / CONTAINERS[0])), root), CONTAINERS
+    return next(
+        (folder for folder in inside if is_folder(folder / CONTAINERS[0])), root
+    ), CONTAINERS
 
 
 def _calibration_around(sources: Sources) -> Path | None:
@@ -209,7 +213,7 @@ def _calibrated(
                 )
             found[name] = shot
         files = {name: sequence_files(sources, name) for name in found}
-        sequences = {name: open_sequence(own) for name, own in files.items()}
+        sequences = {name: open_sequence(paths) for name, paths in files.items()}
         used = [
             path for file in files.values() for path in ([file] if isinstance(file, Path) else file)
         ]
@@ -244,8 +248,8 @@ def _unused(sources: Sources, calibration: Path, used: Iterable[Path]) -> tuple[
         if count > 1 and count == folders[folder] and folder != sources.root:
             names.append(f"{folder.relative_to(sources.root).as_posix()} ({count})")
         else:
-            own = sorted((path for path in rest if path.parent == folder), key=str)
-            names += [path.relative_to(sources.root).as_posix() for path in own]
+            paths = sorted((path for path in rest if path.parent == folder), key=str)
+            names += [path.relative_to(sources.root).as_posix() for path in paths]
     kinds = {is_video(path) for path in rest}
     what = "images" if kinds == {False} else "videos" if kinds == {True} else "images and videos"
     counted = f"{len(rest)} of {len(sources.files)} {what} have no camera in {calibration}"
@@ -302,7 +306,9 @@ def _rig(
     sequences: Mapping[str, Sequence],
     frames: FrameRange,
 ) -> Footage:
-    sequences = {name: _as_calibrated(own, shots[name]) for name, own in sequences.items()}
+    sequences = {
+        name: _as_calibrated(sequence, shots[name]) for name, sequence in sequences.items()
+    }
     videos = [sequence for sequence in sequences.values() if isinstance(sequence, Video)]
     warnings = [warning for video in videos for warning in video.sentences]
     recorded, fps, sentences = synchronized(sequences, shots, sources, frames)
@@ -374,7 +380,7 @@ def _with_sentences(
 ) -> tuple[tuple[FootageCamera, ...], tuple[str, ...]]:
     """Cameras, and each sentence about them once."""
     listed = list(cameras)
-    messages = dict.fromkeys(sentence for _, own in listed for sentence in own)
+    messages = dict.fromkeys(sentence for _, sentences in listed for sentence in sentences)
     return tuple(camera for camera, _ in listed), tuple(f"{where}: {each}" for each in messages)
 
 
@@ -450,14 +456,14 @@ def _with_images(shots: list[Shot], sources: Sources) -> tuple[list[Shot], tuple
     if not all(_has_one_image(shot, sources) for shot in shots):
         labels = [stem_of(shot.label).rpartition("/")[2] for shot in shots]
         images = {} if len(set(labels)) < len(labels) else images_by_camera(labels, sources.images)
-        moments = sorted({moment for own in (images or {}).values() for moment in own})
+        moments = sorted({moment for by_moment in (images or {}).values() for moment in by_moment})
         order = {moment: n for n, moment in enumerate(sorted(moments, key=natural_order))}
         found = []
         for shot, label in zip(shots, labels, strict=True):
             for moment, name in (images or {}).get(label, {}).items():
                 image = sources.images[name][0]
-                own = replace(shot, image=image, mask=sources.mask_of(image), camera_name=label)
-                found.append(replace(own, timestep=order[moment]))
+                moved = replace(shot, image=image, mask=sources.mask_of(image), camera_name=label)
+                found.append(replace(moved, timestep=order[moment]))
         if found:
             messages = f"images are of {len(shots)} cameras at {len(order)} moments, by their names"
             return found, (f"{sources.root}: {messages}",) if len(order) > 1 else ()

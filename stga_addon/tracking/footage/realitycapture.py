@@ -119,8 +119,8 @@ def read_realitycapture_xmp(
         fields: dict[str, str] = {}  # as attributes or as elements, by the version
         for element in read_xml(path).iter():
             named = {**element.attrib, element.tag: element.text or ""}
-            own = {key: text for key, text in named.items() if key.startswith(NAMESPACE)}
-            fields |= {key.removeprefix(NAMESPACE): text for key, text in own.items()}
+            tags = {key: text for key, text in named.items() if key.startswith(NAMESPACE)}
+            fields |= {key.removeprefix(NAMESPACE): text for key, text in tags.items()}
         label = path.relative_to(folder).with_suffix("").as_posix()
         if "Rotation" in fields and "Position" in fields:
             shots.append(_xmp_shot(path, label, fields, image_size(label)))

@@ -94,7 +94,9 @@ def synchronized(
     fps = _frames_per_second(sequences)
     sentences = tuple[str, ...]()
     if frames.sync != "none":
-        videos = {name: own for name, own in sequences.items() if isinstance(own, Video)}
+        videos = {
+            name: sequence for name, sequence in sequences.items() if isinstance(sequence, Video)
+        }
         if len(videos) < max(2, len(sequences)) or fps is None:
             raise StgaError(
                 f"{sources.root}: expected a video of each of several cameras, whose clocks "
@@ -107,33 +109,38 @@ def synchronized(
         raise StgaError(f"Offset for camera {min(unknown)}: expected one of {', '.join(sequences)}")
     recorded = {}
     offsets = {name: frames.offsets.get(name, 0) for name in sequences}
-    for name, own in sequences.items():  # timestep -> number of the frame, the first of several
-        shown = own.timesteps if isinstance(own, Video) else range(len(own))
-        pairs = reversed(list(enumerate(shown)))
+    for (
+        name,
+        sequence,
+    ) in sequences.items():  # timestep -> number of the frame, the first of several
+        numbered = sequence.timesteps if isinstance(sequence, Video) else range(len(sequence))
+        pairs = reversed(list(enumerate(numbered)))
         recorded[name] = {timestep - offsets[name]: number for number, timestep in pairs}
     first, last = _common_range(sequences, frames, offsets)
-    shared = sorted(set.intersection(*(set(own) for own in recorded.values())))
+    shared = sorted(set.intersection(*(set(frame_numbers) for frame_numbers in recorded.values())))
     timesteps = frames.chosen(t for t in shared if first <= t < last)
     if not timesteps:
         raise StgaError(f"Frames from {frames.start} on: the cameras have only {last} in common")
     _require_same_gaps(sequences, offsets, timesteps)
     result: dict[str, Frames] = {}
-    for name, own in sequences.items():
+    for name, sequence in sequences.items():
         numbers = {t: recorded[name][t] for t in timesteps}
-        if isinstance(own, Video):
-            result[name] = VideoFrames(own, numbers)
+        if isinstance(sequence, Video):
+            result[name] = VideoFrames(sequence, numbers)
             continue
         views = {}
         shot = shots[name]
         for t, number in numbers.items():
-            mask = sources.mask_of(own[number])
-            views[t] = View(t, 0, shot.camera, shot.label, own[number], mask)
+            mask = sources.mask_of(sequence[number])
+            views[t] = View(t, 0, shot.camera, shot.label, sequence[number], mask)
         result[name] = ImageFrames(views)
     return result, fps, sentences
 
 
 def _frames_per_second(sequences: Mapping[str, Sequence]) -> float | None:
-    rates = {name: own.fps for name, own in sequences.items() if isinstance(own, Video)}
+    rates = {
+        name: sequence.fps for name, sequence in sequences.items() if isinstance(sequence, Video)
+    }
     rates = {name: rate for name, rate in rates.items() if 0 < rate < FPS_LIMIT}
     first, common = next(iter(rates.items()), ("", None))
     for name, rate in rates.items():
@@ -151,8 +158,8 @@ def _common_range(
     """Timesteps (first, last + 1) that all cameras have. Recordings of different length may start
     at different moments, so they need a `stop` or offsets."""
     lengths = {
-        name: own.timesteps[-1] + 1 if isinstance(own, Video) else len(own)
-        for name, own in sequences.items()
+        name: sequence.timesteps[-1] + 1 if isinstance(sequence, Video) else len(sequence)
+        for name, sequence in sequences.items()
     }
     longest = max(lengths, key=lambda name: lengths[name])
     for name, length in lengths.items():
@@ -183,10 +190,10 @@ def _require_same_gaps(
             continue
         patterns[name] = [number - found[0] for number in found]
         first = next(iter(patterns))
-        for path, own, other in zip(paths, patterns[name], patterns[first], strict=True):
-            if own != other:
+        for path, gap, other in zip(paths, patterns[name], patterns[first], strict=True):
+            if gap != other:
                 raise StgaError(
-                    f"{path}: is {own} frames after the first of camera {name}, where camera "
+                    f"{path}: is {gap} frames after the first of camera {name}, where camera "
                     f"{first} has one {other} after its first; expected no missing frames, or "
                     "the same ones"
                 )

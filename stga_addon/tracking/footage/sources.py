@@ -120,8 +120,8 @@ def find_sources(root: Path, containers: Sequence[str] = CONTAINERS) -> Sources:
             elif first == PLATE_FOLDER:
                 sources.plates.setdefault("/".join((*parts[1:-1], path.stem)), path)
             else:
-                own = folders.setdefault(key.rpartition("/")[0], {})
-                own.setdefault(first if first in CONTAINERS else "", []).append(path)
+                by_container = folders.setdefault(key.rpartition("/")[0], {})
+                by_container.setdefault(first if first in CONTAINERS else "", []).append(path)
                 sources.files.append(path)
     for name, contained in folders.items():
         for path in _without_copies(contained, containers):
@@ -155,12 +155,12 @@ def _without_copies(parts: Mapping[str, list[Path]], containers: Sequence[str]) 
     """The images of a folder, by container, without containers that hold the same names as one
     before them."""
     used = {""}
-    seen = set[str]()
+    known = set[str]()
     for container in containers:
         names = {path.stem for path in parts.get(container, ())}
-        if seen.isdisjoint(names):
+        if known.isdisjoint(names):
             used.add(container)
-            seen |= names
+            known |= names
     return [path for container, paths in parts.items() if container in used for path in paths]
 
 

@@ -107,15 +107,15 @@ def read_video(path: Path) -> Video:
         numbers = tuple(range(len(times)))
         fps = next(iter(rates), 0.0)
         return replace(begin, times=numbers, timesteps=numbers, fps=fps, seekable=False)
-    shown = tuple(times[left_out:])
-    timesteps, fps, warnings = _timed(path, shown, time_base, rates)
+    kept = tuple(times[left_out:])
+    timesteps, fps, warnings = _timed(path, kept, time_base, rates)
     warnings = (*begin.warnings, *warnings)
     if left_out:
         fate = "cannot be decoded; they are left out, and not counted"
         warnings += (f"{path}: its first {left_out} frames {fate}",)
     if is_cut_off:
-        warnings += (f"{path}: is cut off; it ends after {len(shown)} frames",)
-    return replace(begin, times=shown, timesteps=timesteps, fps=fps, warnings=warnings)
+        warnings += (f"{path}: is cut off; it ends after {len(kept)} frames",)
+    return replace(begin, times=kept, timesteps=timesteps, fps=fps, warnings=warnings)
 
 
 class VideoFrames:
@@ -292,10 +292,10 @@ def _unheard(path: Path, frame: Any) -> list[str]:
             "is interlaced: every second line is of another moment, and fast motion has "
             "combs; deinterlace it"
         )
-    shown = clean_aperture(path)
-    if shown is not None and (shown[0] < frame.width or shown[1] < frame.height):
+    aperture = clean_aperture(path)
+    if aperture is not None and (aperture[0] < frame.width or aperture[1] < frame.height):
         sentences.append(
-            f"asks for {shown[0]} x {shown[1]} of its {frame.width} x {frame.height} pixels "
+            f"asks for {aperture[0]} x {aperture[1]} of its {frame.width} x {frame.height} pixels "
             "(clean aperture); all are used"
         )
     return sentences

@@ -100,12 +100,12 @@ def fit_cameras(samples: Samples, color: np.ndarray) -> CameraColors:
         mean = _mean(fitted.undo(color, samples.camera))
         fits = []
         for number in range(len(camera)):
-            own = color[row == number].reshape(-1, 3)
+            colors = color[row == number].reshape(-1, 3)
             x = np.broadcast_to(mean, color[row == number].shape).reshape(-1, 3)
-            known = ~np.isnan(own[:, 0]) & ~np.isnan(x[:, 0])
+            known = ~np.isnan(colors[:, 0]) & ~np.isnan(x[:, 0])
             offset_prior = CAMERA_PRIOR_SAMPLES + OFFSET_PENALTY * known.sum()
             prior = [[CAMERA_PRIOR_SAMPLES * TYPICAL_LEVEL**2], [offset_prior]]
-            fits.append(fit_lines(x[known].T, own[known].T, np.array(prior)))
+            fits.append(fit_lines(x[known].T, colors[known].T, np.array(prior)))
         gain, offset = np.stack(fits, axis=1)
         fitted = CameraColors(camera, gain, offset).against(np.ones(len(camera), bool))
     return fitted
@@ -130,9 +130,9 @@ def stable_colors(color: np.ndarray) -> np.ndarray:
     the others: lids and lips change ten times as much as cameras differ."""
     mean = _mean(color)
     change = ((color - mean) / (mean + RELATIVE_CHANGE_BIAS_LEVELS)) ** 2
-    seen = ~np.isnan(color[..., 0])
-    count = seen.sum(0)
-    scatter = np.where(seen[..., None], change, 0).sum((0, 2)) / (3 * np.maximum(count, 1))
+    observed = ~np.isnan(color[..., 0])
+    count = observed.sum(0)
+    scatter = np.where(observed[..., None], change, 0).sum((0, 2)) / (3 * np.maximum(count, 1))
     judged = count >= MIN_SAMPLES_PER_TRIANGLE
     limit = np.median(scatter[judged]) if judged.any() else -1.0
     return np.where((judged & (scatter <= limit))[:, None], color, np.nan)
@@ -241,12 +241,12 @@ def linear_evidence(
     for held, fitted in folds:
         # ridge regression by triangle: mean color (K, 3), NaN without a sample, mean features (K,
         # D) and slopes (K, D, 3)
-        seen = ~np.isnan(color[fitted][..., :1])
-        count = seen.sum(0)
-        mean = np.where(seen, color[fitted], 0).sum(0) / np.where(count, count, np.nan)
-        center = np.where(seen, features[fitted], 0).sum(0) / np.maximum(count, 1)
-        x = np.where(seen, features[fitted] - center, 0)
-        y = np.where(seen, color[fitted] - mean, 0)
+        observed = ~np.isnan(color[fitted][..., :1])
+        count = observed.sum(0)
+        mean = np.where(observed, color[fitted], 0).sum(0) / np.where(count, count, np.nan)
+        center = np.where(observed, features[fitted], 0).sum(0) / np.maximum(count, 1)
+        x = np.where(observed, features[fitted] - center, 0)
+        y = np.where(observed, color[fitted] - mean, 0)
         inner = np.einsum("skd,ske->kde", x, x)
         size = x.shape[2]
         weight = RIDGE_WEIGHT * np.einsum("kdd->", inner) / max(float(count.sum()) * size, 1.0)

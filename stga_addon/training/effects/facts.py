@@ -95,9 +95,9 @@ class CaptureFacts:
             folds["cameras"] = evidence.scattered_folds(samples.camera)
         return {
             kind: evidence.linear_evidence(
-                self.matched_colors, strain, own, rest=np.zeros_like(strain[0])
+                self.matched_colors, strain, kind_folds, rest=np.zeros_like(strain[0])
             )
-            for kind, own in folds.items()
+            for kind, kind_folds in folds.items()
         }
 
     def pixels_per_splat(self, percentile: float) -> float:

@@ -104,9 +104,9 @@ def exposure(facts: CaptureFacts) -> Verdict:
     drift = facts.drifts.gain
     reason = f"{facts.cameras} cameras show the same colors {found:.1f} of 255 levels apart"
     if drift >= MIN_EXPOSURE_LEVELS or facts.cameras == 1:
-        own = table[np.searchsorted(colors.camera, samples.camera)]
-        own[:, 1:4] *= facts.drift
-        table = np.column_stack([own, samples.timestep])
+        values = table[np.searchsorted(colors.camera, samples.camera)]
+        values[:, 1:4] *= facts.drift
+        table = np.column_stack([values, samples.timestep])
         found = max(found, drift)
         reason = f"a camera shows the same colors {drift:.1f} of 255 levels apart over time"
     rows = tuple(map(tuple, table.tolist()))

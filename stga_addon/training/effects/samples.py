@@ -145,10 +145,10 @@ def _sample_view(capture: Capture, view: View, faces: np.ndarray) -> dict[str, n
     x = np.where(inside, x, 0)
     y = np.where(inside, y, 0)
     in_front = np.where(nearest[y, x] >= 0, depths[nearest[y, x]], np.inf)
-    seen = inside & (towards[faces] > MIN_FACING_COSINE)
-    seen &= depths[faces] < in_front * (1 + DEPTH_TOLERANCE_FRACTION)
+    visible = inside & (towards[faces] > MIN_FACING_COSINE)
+    visible &= depths[faces] < in_front * (1 + DEPTH_TOLERANCE_FRACTION)
     if mask is not None:
-        seen &= binary_erosion(mask > 127, iterations=MASK_EDGE_PIXELS)[y, x]
+        visible &= binary_erosion(mask > 127, iterations=MASK_EDGE_PIXELS)[y, x]
     smooth = uniform_filter(image.astype(np.float32), (3, 3, 0))
     at = center.T[::-1] - 0.5
     colors = [map_coordinates(smooth[..., c], at, order=1, mode="nearest") for c in range(3)]
@@ -160,9 +160,9 @@ def _sample_view(capture: Capture, view: View, faces: np.ndarray) -> dict[str, n
     head = float(np.median(depth))
     pixels = area * np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]) / 2
     return {
-        "color": np.where(seen[:, None], np.stack(colors, -1), np.nan).astype(np.float32),
+        "color": np.where(visible[:, None], np.stack(colors, -1), np.nan).astype(np.float32),
         "direction": direction / np.maximum(distance, 1e-12),
-        "pixels": np.where(seen, pixels, np.nan),
+        "pixels": np.where(visible, pixels, np.nan),
         "pixel_width": np.array(head / view.camera.fl_x if head > 0 else np.nan),
         **_coverage(image, mask, nearest >= 0, area),
     }

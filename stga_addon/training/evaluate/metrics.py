@@ -177,8 +177,8 @@ class Quality:
 
     def as_json(self) -> dict[str, float]:
         """Flat: "psnr", "ssim", "psnr_mask" and so on, without what was not measured."""
-        own = {name: value for name, value in vars(self).items() if name != "regions"}
-        flat = {name: value for name, value in own.items() if value is not None}
+        scores = {name: value for name, value in vars(self).items() if name != "regions"}
+        flat = {name: value for name, value in scores.items() if value is not None}
         for region, quality in self.regions.items():
             flat.update({f"{name}_{region}": value for name, value in quality.as_json().items()})
         return flat
@@ -305,15 +305,15 @@ def _scores(
     """PSNR, SSIM and LPIPS (NaN if not measured) of the image, or of the region `where` (H, W): the
     pixels outside are replaced by the target's, and SSIM is scaled to a mean over the region."""
     psnr_db = psnr(image, target, where)
-    shown = target.transpose(2, 0, 1).astype(np.float32) / 255
+    expected = target.transpose(2, 0, 1).astype(np.float32) / 255
     fraction = 1.0 if where is None else float(where.mean())
     if where is not None:
-        image = np.where(where, image, shown)
+        image = np.where(where, image, expected)
     ssim = 1 - (1 - mean_ssim(image, target)) / fraction
     network = lpips.load_network() if perceptual else None
     if network is None or min(target.shape[:2]) < lpips.MIN_SIDE_PX:
         return psnr_db, ssim, np.nan
-    return psnr_db, ssim, network.distance(image, shown)
+    return psnr_db, ssim, network.distance(image, expected)
 
 
 def detail_difference(
@@ -390,8 +390,8 @@ def triangle_residuals(
             buffers=buffers,
         )
         image = render(colored, frames=frames, degree=splats.sh_degree).image
-        shown = target.transpose(2, 0, 1).astype(np.float32) / 255
-        difference = np.abs(np.clip(image, 0, 1) - shown).mean(0)
+        expected = target.transpose(2, 0, 1).astype(np.float32) / 255
+        difference = np.abs(np.clip(image, 0, 1) - expected).mean(0)
         # The gradient with respect to a color is the sum of blending weights times that with
         # respect to the image.
         v_image = np.stack([difference, np.ones_like(difference), np.zeros_like(difference)])

@@ -83,11 +83,11 @@ def step_offsets(
     stepped[rows] = True
     moved = state.parameters.xyz, gradients.xyz, gradients.log_scale
     by_color = gradients.sh.reshape(len(state), -1)
-    for name, own in state.driven_offsets.items():
+    for name, driven in state.driven_offsets.items():
         offset = OFFSETS[name]
         is_color = offset.target == COLOR
-        arrays = (own.value, own.value, own.first, own.second, own.average)
-        tables = [array.reshape(len(own.steps), 9) for array in arrays]
+        arrays = (driven.value, driven.value, driven.first, driven.second, driven.average)
+        tables = [array.reshape(len(driven.steps), 9) for array in arrays]
         rate = np.full(9, offset.rate_fraction * rates[offset.rate], np.float32)
         step_offset(
             state.rows_by_triangle,
@@ -95,7 +95,7 @@ def step_offsets(
             (by_color if is_color else gradients.xyz, *moved),
             (offset.target == SCALE, np.float32(1 / SH_C0 if is_color else 1)),
             signal(offset.signal),
-            own.steps,
+            driven.steps,
             AdamTables._make([*tables, rate]),
             options,
         )

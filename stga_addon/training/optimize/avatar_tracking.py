@@ -120,9 +120,9 @@ class AvatarTracking:
     def at(self, timesteps: Container[int]) -> "AvatarTracking":
         """Some of the timesteps."""
         kept = [row for row, timestep in enumerate(self.timesteps) if timestep in timesteps]
-        arrays = {name: own for name, own in vars(self).items() if name != "timesteps"}
+        arrays = {name: array for name, array in vars(self).items() if name != "timesteps"}
         count = len(self.timesteps)
-        arrays = {n: own[kept] if len(own) == count else own for n, own in arrays.items()}
+        arrays = {n: array[kept] if len(array) == count else array for n, array in arrays.items()}
         return AvatarTracking(tuple(self.timesteps[row] for row in kept), **arrays)
 
     def smoothed(self, model: FlameModel) -> "AvatarTracking":
@@ -192,7 +192,7 @@ class RefinedTracking:
         Returns the timesteps that stay as they were, because their head went farther than tracking
         can be wrong.
         """
-        rows, at = ([self._row[t] for t in own] for own in (timesteps, found.timesteps))
+        rows, at = ([self._row[t] for t in chosen] for chosen in (timesteps, found.timesteps))
         old = self.parameters
         start = old[at]
         moved = np.concatenate([found.parameters, found.shift], axis=1)
@@ -212,11 +212,11 @@ class RefinedTracking:
         parts = change_between(before, after), shifted - shift
         columns = np.concatenate(parts, axis=1).T
         change = np.stack([np.interp(rows, at, column) for column in columns], axis=1)
-        own = old[rows]
+        values = old[rows]
         by = change[:, :-SHIFT_SIZE]
         added = change[:, -SHIFT_SIZE:]
         self.parameters = old.copy()
-        self.parameters[rows, :-SHIFT_SIZE] = changed_by(own[:, :-SHIFT_SIZE], by)
+        self.parameters[rows, :-SHIFT_SIZE] = changed_by(values[:, :-SHIFT_SIZE], by)
         self.parameters[rows, -SHIFT_SIZE:] += added
         return [timestep for timestep, far in zip(found.timesteps, is_far, strict=True) if far]
 
@@ -252,8 +252,8 @@ def tracked_timesteps(
     if settings.iterations is None:
         return list(timesteps)
     wanted = set(timesteps)
-    shown = sum(view.timestep in wanted for view in capture.all_views)
-    views = min(MAX_VIEWS, max(1.0, shown / max(1, len(timesteps))))
+    view_count = sum(view.timestep in wanted for view in capture.all_views)
+    views = min(MAX_VIEWS, max(1.0, view_count / max(1, len(timesteps))))
     most = int(TRACKED_FRACTION * settings.iterations / views)
     return evenly_spread(timesteps, max(MIN_TRACKED_TIMESTEPS, most))
 
@@ -313,16 +313,16 @@ def track_by_avatar(
     return AvatarTracking(tuple(done), rows, missed, shift, scale, known)
 
 
-def normal_images(mesh: np.ndarray, faces: np.ndarray, shown: ArrayPair) -> ArrayPair:
-    """Pixels (H, W) bool that show a mesh, and the surface's unit normals there (H, W, 3); shown:
-    `rasterize` of the mesh."""
-    triangles, fraction = shown
-    seen = triangles >= 0
+def normal_images(mesh: np.ndarray, faces: np.ndarray, rasterized: ArrayPair) -> ArrayPair:
+    """Pixels (H, W) bool that show a mesh, and the surface's unit normals there (H, W, 3);
+    rasterized: `rasterize` of the mesh."""
+    triangles, fraction = rasterized
+    covered = triangles >= 0
     found = np.zeros((*triangles.shape, 3))
-    corners = vertex_normals(mesh, faces)[faces[triangles[seen]]]
-    own = np.einsum("nk,nkc->nc", fraction[seen], corners)
-    found[seen] = unit(own)
-    return seen, found
+    corners = vertex_normals(mesh, faces)[faces[triangles[covered]]]
+    normals = np.einsum("nk,nkc->nc", fraction[covered], corners)
+    found[covered] = unit(normals)
+    return covered, found
 
 
 def read_small(
@@ -480,11 +480,11 @@ class _Tracker:
 
     def _read(self, views: Sequence[View], height: int) -> Shots:
         shots = []
-        for whole, shown in zip(views, self._shown, strict=True):
+        for whole, rasterized in zip(views, self._shown, strict=True):
             view, image = read_small(whole, height, self._settings, self._prepare)
             if self._shading is not None:
                 mesh = self._capture.mesh(view.timestep)
-                head, normals = normal_images(mesh, self._capture.faces, shown)
+                head, normals = normal_images(mesh, self._capture.faces, rasterized)
                 ratio = np.ones((*head.shape, 3))
                 ratio[head] = np.clip(basis(normals[head]) @ self._shading, 1 / MAX_GAIN, MAX_GAIN)
                 image = np.clip(image / _enlarged(ratio, image) + 0.5, 0, 255).astype(np.uint8)
@@ -504,9 +504,9 @@ class _Tracker:
         inside = silhouette(self._mesh(view.timestep), self._capture.faces, view.camera)
         inside = binary_erosion(inside, iterations=margin)
         drawn = to_uint8(self._backend.render(view, self._options))
-        shown = np.where(inside[..., None], image, drawn)
-        shown.setflags(write=False)
-        return shown
+        cut = np.where(inside[..., None], image, drawn)
+        cut.setflags(write=False)
+        return cut
 
     def _precision(self) -> np.ndarray:
         """(E + 18,) inverse variances of the change; joints that the model lacks do not turn."""
@@ -556,12 +556,12 @@ class _Tracker:
             level = appearance.pyramid(camera, image, at.mean(0), appearance.LEVELS_M[:1])[0]
             pixels, depth = level.camera.project(at)
             cosine = facing(camera, at, normals)
-            seen = (cosine > MIN_COSINE) & in_sight(_small(camera), mesh, faces, at)
-            seen &= appearance.inside(level.camera, pixels, depth)
+            visible = (cosine > MIN_COSINE) & in_sight(_small(camera), mesh, faces, at)
+            visible &= appearance.inside(level.camera, pixels, depth)
             # (N, 3 channels, 2)
             slopes = np.stack(appearance.sampled(list(level.gradient), pixels), -1)
             moved = slopes @ appearance.projection_derivative(level.camera, at) / NOISE_LEVELS
-            weight = POINT_FRACTION * (cosine * seen)[:, None] * appearance.CHANNEL_WEIGHTS
+            weight = POINT_FRACTION * (cosine * visible)[:, None] * appearance.CHANNEL_WEIGHTS
             curvature += np.einsum("nc,ncx,ncy->nxy", weight, moved, moved)
         _, jacobian = self._posed_points.linearized(values[:-RIGID_SIZE], values[-RIGID_SIZE:])
         flat = jacobian.reshape(-1, jacobian.shape[2])

@@ -90,13 +90,13 @@ class CpuBackend:
 
     def render(self, view: View, options: RenderOptions) -> np.ndarray:
         frames = self._moved_frames(view.timestep, averaged=True)
-        seen = rasterize.frames_in_camera(frames, view.camera, self._buffers)
-        return self._forward(self.state.average, seen, options).image.copy()
+        camera_frames = rasterize.frames_in_camera(frames, view.camera, self._buffers)
+        return self._forward(self.state.average, camera_frames, options).image.copy()
 
     def blend_weights(self, view: View) -> np.ndarray:
         frames = self._moved_frames(view.timestep)
-        seen = rasterize.frames_in_camera(frames, view.camera, self._buffers)
-        rendering = self._forward(self.state.parameters, seen, WITHOUT_COLOR)
+        camera_frames = rasterize.frames_in_camera(frames, view.camera, self._buffers)
+        rendering = self._forward(self.state.parameters, camera_frames, WITHOUT_COLOR)
         return rasterize.blend_weights(rendering, self._buffers)
 
     def coefficients(self) -> dict[str, np.ndarray]:
@@ -130,8 +130,8 @@ class CpuBackend:
         height = view.camera.height
         width = view.camera.width
         state = self.state
-        seen = rasterize.frames_in_camera(frames, view.camera, self._buffers)
-        rendering = self._forward(state.parameters, seen, options, focus)
+        camera_frames = rasterize.frames_in_camera(frames, view.camera, self._buffers)
+        rendering = self._forward(state.parameters, camera_frames, options, focus)
         if focus is None:
             key = height, width, threads()
             rectangles = self._buffers.kept("rectangles", key, lambda *key: whole_image(*key[:2]))
@@ -143,7 +143,7 @@ class CpuBackend:
             rendering,
             state.parameters,
             state.face,
-            seen,
+            camera_frames,
             v_image,
             state.gradients,
             buffers=self._buffers,
@@ -161,14 +161,14 @@ class CpuBackend:
     def _forward(
         self,
         splats: Parameters,
-        seen: CameraFrames,
+        camera_frames: CameraFrames,
         options: RenderOptions,
         focus: np.ndarray | None = None,
     ) -> rasterize.RenderOutput:
         return rasterize.render_forward(
             splats,
             self.state.face,
-            seen,
+            camera_frames,
             options.sh_degree,
             options.background,
             focus,

@@ -88,16 +88,16 @@ def over_color(image: np.ndarray, mask: np.ndarray, color: Sequence[float]) -> n
         columns, rows = edge.reshape(-1, 2).T
         places = rows, columns
         cover = mask[places][:, None].astype(np.float32) / 255
-        shown = cover * image[places]
+        foreground = cover * image[places]
         if not mask.all():
             deviations = [max(1.0, fraction * len(image)) for fraction in BLUR_FRACTIONS]
             clear = (mask == 0).astype(np.uint8)
             behind = mean_around(image, clear, deviations, np.stack(places, axis=1))
-            shown = np.clip(image[places] - (1 - cover) * behind, 0, 255 * cover)
+            foreground = np.clip(image[places] - (1 - cover) * behind, 0, 255 * cover)
             if (key := screen_channel(image, mask)) is not None:
-                shown = limited_channel(shown, key)
+                foreground = limited_channel(foreground, key)
         rest = (1 - cover) * 255 * np.asarray(color, np.float32)
-        over[places] = _levels(shown + rest)
+        over[places] = _levels(foreground + rest)
     return np.asarray(over)
 
 
@@ -108,7 +108,7 @@ def _levels(values: np.ndarray) -> np.ndarray:
 
 def fit_exposure(
     drawn: np.ndarray,
-    seen: np.ndarray,
+    observed: np.ndarray,
     expected: np.ndarray | None = None,
     fraction: float = EXPOSURE_PRIOR,
 ) -> np.ndarray:
@@ -121,9 +121,9 @@ def fit_exposure(
     found = expected
     for _ in range(EXPOSURE_ITERATIONS if drawn.size else 0):
         gain, offset = found[..., None]
-        weight = (1 + ((seen - gain * drawn - offset) / EXPOSURE_SCALE) ** 2) ** -2.0
+        weight = (1 + ((observed - gain * drawn - offset) / EXPOSURE_SCALE) ** 2) ** -2.0
         prior = fraction * weight.sum(1) * np.stack([drawn.var(1) + 1e-4, np.ones(3)])
-        found = fit_lines(drawn, seen, prior, expected, weight)
+        found = fit_lines(drawn, observed, prior, expected, weight)
         found[0] = np.clip(found[0], 1 / MAX_GAIN, MAX_GAIN)
     return found
 
@@ -154,8 +154,11 @@ def view_exposure(rows: Iterable[Sequence[float]]) -> ViewExposure:
     listed: dict[int, list[Sequence[float]]] = {}
     for row in rows:
         listed.setdefault(int(row[0]), []).append(row[1:])
-    rows_of = {n: sorted(((*row, 0.0)[6], *row[:6]) for row in own) for n, own in listed.items()}
-    curves = {camera: np.array(own).T for camera, own in rows_of.items()}
+    rows_of = {
+        n: sorted(((*row, 0.0)[6], *row[:6]) for row in curve_rows)
+        for n, curve_rows in listed.items()
+    }
+    curves = {camera: np.array(curve_rows).T for camera, curve_rows in rows_of.items()}
 
     def exposure(view: View) -> np.ndarray | None:
         if view.camera_index not in curves:

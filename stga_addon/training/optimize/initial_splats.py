@@ -135,29 +135,29 @@ def triangle_colors(capture: Capture, views: Sequence[View]) -> np.ndarray:
     """
     by_timestep = views_by_timestep(views)
     color, pixels = mean_colors(capture, by_timestep.pop(views[0].timestep))
-    shown = pixels > 0
+    visible = pixels > 0
     later: list[View] = []  # a few, of timesteps that are evenly spread, by other cameras in each
     for n, timestep in enumerate(evenly_spread(sorted(by_timestep), MAX_LATER_TIMESTEPS)):
         step = -(-len(by_timestep[timestep]) // MAX_LATER_VIEWS)
         later += by_timestep[timestep][n % step :: step]
     late_color, pixels = mean_colors(capture, later)
-    late = (pixels > 0) & ~shown
+    late = (pixels > 0) & ~visible
     color[late] = late_color[late]
-    shown |= late
-    if not shown.any():
+    visible |= late
+    if not visible.any():
         return np.full(color.shape, MIDDLE_GRAY)
-    hidden, mirrored = mirror_images(capture, ~shown, shown)
+    hidden, mirrored = mirror_images(capture, ~visible, visible)
     area = np.linalg.norm(triangle_normals(capture.neutral[capture.faces]), axis=1)
     if area[hidden].sum() >= MIN_ONE_SIDED_FRACTION * area.sum():
         color[hidden] = color[mirrored]
-        shown[hidden] = True
+        visible[hidden] = True
     centers = capture.neutral[capture.faces].mean(1)
-    others = late if late.any() else shown
+    others = late if late.any() else visible
     nearest = np.flatnonzero(others)[cKDTree(centers[others]).query(centers)[1]]
     part = connected_parts(len(capture.neutral), capture.faces)[capture.faces[:, 0]]
-    for number in np.unique(part[shown]):
+    for number in np.unique(part[visible]):
         members = np.flatnonzero(part == number)
-        known = np.flatnonzero((part == number) & shown)
+        known = np.flatnonzero((part == number) & visible)
         nearest[members] = known[cKDTree(centers[known]).query(centers[members])[1]]
     return np.asarray(color[nearest])
 
@@ -169,11 +169,11 @@ def mean_colors(capture: Capture, views: Sequence[View]) -> tuple[np.ndarray, np
     for view in views:
         small, image, mask = read_view(view, min(1.0, SAMPLED_HEIGHT_PIXELS / view.camera.height))
         triangle, _ = rasterize(capture.mesh(view.timestep), capture.faces, small.camera)
-        shown = triangle >= 0
+        inside = triangle >= 0
         if mask is not None:
-            shown &= binary_erosion(mask > 127, iterations=MASK_EDGE_PIXELS)
-        pixels = image[shown]
-        found = triangle[shown]
+            inside &= binary_erosion(mask > 127, iterations=MASK_EDGE_PIXELS)
+        pixels = image[inside]
+        found = triangle[inside]
         count += np.bincount(found, minlength=len(count))
         for channel in range(3):
             total[:, channel] += np.bincount(found, pixels[:, channel], len(count))
@@ -186,13 +186,13 @@ def mirrored(points: np.ndarray) -> np.ndarray:
 
 
 def mirror_images(
-    capture: Capture, hidden: np.ndarray, shown: np.ndarray
+    capture: Capture, hidden: np.ndarray, visible: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Triangles that are `hidden` (F,) bool and whose mirror images are `shown`, and these; none
+    """Triangles that are `hidden` (F,) bool and whose mirror images are `visible`, and these; none
     where the mesh is not symmetric."""
     centers = capture.neutral[capture.faces].mean(1)
     distance, partner = cKDTree(centers).query(mirrored(centers))
-    rows = np.flatnonzero(hidden & shown[partner])
+    rows = np.flatnonzero(hidden & visible[partner])
     if np.median(distance) > MAX_ASYMMETRY_FRACTION * np.linalg.norm(
         np.ptp(capture.neutral, axis=0)
     ):
@@ -222,22 +222,28 @@ def visual_hull_points(
     world.sh[:, 0] = (_colors_within(world.xyz, views, beside) - 0.5) / SH_C0
     frames = face_frames(mesh, capture.faces, capture.neutral, convention)
     hull = to_local(world, frames, face[outside])
-    seen = read_torso_points(capture.root) if torso and len(views) <= FEW_CAMERAS else None
-    if seen is None or capture.flame is None or seen.timestep not in capture.timesteps:
+    torso_points = read_torso_points(capture.root) if torso and len(views) <= FEW_CAMERAS else None
+    if (
+        torso_points is None
+        or capture.flame is None
+        or torso_points.timestep not in capture.timesteps
+    ):
         return hull
     triangles = np.flatnonzero(torso_faces(capture.flame.model))
     if not len(triangles):
         return hull
     rest = hull.rows(~below_neck(capture.flame, views[0].timestep, points[outside]))
     # around the points at which the torso is seen, in its triangles
-    mesh = capture.mesh(seen.timestep)
-    voxel = voxel_size(capture.mesh(seen.timestep))
-    spread = np.random.default_rng(0).normal(0, SEEN_SPREAD * voxel, (SEEN_COPIES, *seen.at.shape))
-    points = (seen.at + spread).reshape(-1, 3)
+    mesh = capture.mesh(torso_points.timestep)
+    voxel = voxel_size(capture.mesh(torso_points.timestep))
+    spread = np.random.default_rng(0).normal(
+        0, SEEN_SPREAD * voxel, (SEEN_COPIES, *torso_points.at.shape)
+    )
+    points = (torso_points.at + spread).reshape(-1, 3)
     _, among = _nearest_triangle(points, mesh, capture.faces[triangles])
     frames = face_frames(mesh, capture.faces, capture.neutral, convention)
     world = _new_splats(points, voxel, sh_degree)
-    views = [view for view in capture.views["train"] if view.timestep == seen.timestep]
+    views = [view for view in capture.views["train"] if view.timestep == torso_points.timestep]
     within = [_foreground(view) for view in views]
     world.sh[:, 0] = (_colors_within(world.xyz, views, within) - 0.5) / SH_C0
     return joined([rest, to_local(world, frames, triangles[among])])
@@ -345,10 +351,10 @@ def _followed(
     mesh = capture.mesh(timestep)
     distance, face = _nearest_triangle(points, mesh, capture.faces)
     if torso and capture.flame is not None:
-        own = np.flatnonzero(torso_faces(capture.flame.model))
+        rows = np.flatnonzero(torso_faces(capture.flame.model))
         below = below_neck(capture.flame, timestep, points)
-        if len(own) and below.any():
-            face[below] = own[_nearest_triangle(points[below], mesh, capture.faces[own])[1]]
+        if len(rows) and below.any():
+            face[below] = rows[_nearest_triangle(points[below], mesh, capture.faces[rows])[1]]
     return distance, face
 
 
@@ -389,8 +395,8 @@ def _hull_surface(
         outside += np.where(before, beyond > reach, depth + radius <= MIN_DEPTH_M)
         # Beyond an image, what is background is not known.
         clear = distance_transform_cdt(np.pad(~mask, 1), "chessboard")[1:-1, 1:-1]
-        x, y, seen = pixels_of(points, camera)
-        kept &= ~(before & seen & (clear[y, x] > reach))
+        x, y, in_image = pixels_of(points, camera)
+        kept &= ~(before & in_image & (clear[y, x] > reach))
     kept &= len(views) - outside >= min_visible
     within = kept.reshape([len(along) for along in centers])
     for number, axis in enumerate(axes):
@@ -403,10 +409,10 @@ def _hull_surface(
     for view, mask in zip(views, foreground, strict=True):
         beside = ~_silhouette(mesh, faces, view.camera)
         remaining = np.flatnonzero(inside)
-        x, y, seen = pixels_of(points[remaining], view.camera)
-        remaining = remaining[seen]
-        x = x[seen]
-        y = y[seen]
+        x, y, in_image = pixels_of(points[remaining], view.camera)
+        remaining = remaining[in_image]
+        x = x[in_image]
+        y = y[in_image]
         visible[remaining] += 1
         exposed[remaining] += beside[y, x]
         inside[remaining] = mask[y, x]
@@ -427,9 +433,9 @@ def _colors_within(
     count = np.zeros(len(points))
     for view, mask in zip(views, masks, strict=True):
         x, y, inside = pixels_of(points, view.camera)
-        shown = np.flatnonzero(inside & mask[y, x])
-        total[shown] += read_image(view)[y[shown], x[shown]] / 255
-        count[shown] += 1
+        rows = np.flatnonzero(inside & mask[y, x])
+        total[rows] += read_image(view)[y[rows], x[rows]] / 255
+        count[rows] += 1
     mean = total / np.maximum(count, 1)[:, None]
     return np.where(count[:, None] > 0, mean, MIDDLE_GRAY)
 

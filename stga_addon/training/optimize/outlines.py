@@ -111,11 +111,11 @@ def is_outside(
 ) -> np.ndarray:
     """(N,) bool: whether points (N, 3), local to triangles (N,), lie outside of most of the
     outlines in whose image they lie; frames: of a timestep's triangles."""
-    seen, outside = np.zeros((2, len(face)), np.int32)
+    inside, outside = np.zeros((2, len(face)), np.int32)
     rows = np.arange(len(face), dtype=np.int32)
     for n, outline in enumerate(outlines):
         left = len(outlines) - n  # without those that all of these could not take for outside
-        rows = rows[outside[rows] + left > MAX_OUTSIDE_FRACTION * (seen[rows] + left)]
+        rows = rows[outside[rows] + left > MAX_OUTSIDE_FRACTION * (inside[rows] + left)]
         in_camera = frames_in_camera(frames(outline.timestep), outline.camera)
-        count_marked(rows, xyz, face, in_camera, outline.clear, seen, outside)
-    return np.asarray(outside > MAX_OUTSIDE_FRACTION * seen)
+        count_marked(rows, xyz, face, in_camera, outline.clear, inside, outside)
+    return np.asarray(outside > MAX_OUTSIDE_FRACTION * inside)

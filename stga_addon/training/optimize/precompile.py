@@ -67,10 +67,14 @@ def compile_for_cpu() -> None:
 def _render() -> None:
     """Forward and backward pass."""
     state = _two_splats()
-    seen = frames_in_camera(WORLD, CAMERA)
-    rendering = render_forward(state.parameters, state.face, seen, 3, focus=np.ones(2, bool))
+    camera_frames = frames_in_camera(WORLD, CAMERA)
+    rendering = render_forward(
+        state.parameters, state.face, camera_frames, 3, focus=np.ones(2, bool)
+    )
     v_image = np.zeros_like(rendering.image)
-    render_backward(rendering, state.parameters, state.face, seen, v_image, state.gradients)
+    render_backward(
+        rendering, state.parameters, state.face, camera_frames, v_image, state.gradients
+    )
 
 
 def _step() -> None:
@@ -108,9 +112,9 @@ def _step() -> None:
     signal = np.zeros((1, 3), np.float32)
     adam.step_offsets(state, rows, lambda name: signal, rates, adam.PLAIN)
     coefficients = {name: offset.value for name, offset in state.driven_offsets.items()}
-    seen = frames_in_camera(moved_frames(WORLD, coefficients, lambda name: signal), CAMERA)
+    camera_frames = frames_in_camera(moved_frames(WORLD, coefficients, lambda name: signal), CAMERA)
     counts = np.zeros((2, 2), np.int32)
-    count_marked(rows, xyz, face, seen, np.ones((16, 16), bool), *counts)
+    count_marked(rows, xyz, face, camera_frames, np.ones((16, 16), bool), *counts)
 
 
 def _two_splats() -> TrainState:

@@ -214,28 +214,28 @@ def hairy_triangles(
 
 
 def inside_colors(
-    capture: Capture, color: np.ndarray, shown: np.ndarray, inside: np.ndarray
+    capture: Capture, color: np.ndarray, visible: np.ndarray, inside: np.ndarray
 ) -> np.ndarray:
     """Colors (M, 3) of triangles `inside` (F,) bool that no view shows and that motion of mouth or
     lids exposes: teeth, gums and lining near the mouth, in the light on the person's lips and eyes;
     the hidden part of eyeballs, as white as the visible part; elsewhere the color of the skin
-    around. color, shown: of `mean_colors`."""
+    around. color, visible: of `mean_colors`."""
     faces = capture.faces
     centers = np.asarray(capture.neutral)[faces].mean(1)
     skin = skin_of(capture)
-    known = np.flatnonzero(shown & skin)
+    known = np.flatnonzero(visible & skin)
     if not len(known) or not inside.any():
         return np.asarray(color[inside])
     near = nearest_rows(centers[known], centers[inside], SMOOTHED)
     found = np.median(color[known[near]], axis=1)
     eyeballs = eyeballs_of(capture)
-    white = _white_of_eyes(color[eyeballs & shown])
+    white = _white_of_eyes(color[eyeballs & visible])
     found[eyeballs[inside]] = white
     at = head_coordinates(capture)
     if at is None:
         return np.asarray(found)
     mouth = capture.regions["mouth"]
-    lips = mouth & skin & shown
+    lips = mouth & skin & visible
     if not lips.any():
         return np.asarray(found)
     part = connected_parts(len(capture.neutral), faces)[faces[:, 0]]

@@ -151,12 +151,12 @@ class Surface:
     def outside(self) -> np.ndarray:
         """(F,) bool: triangles of the neutral mesh that some camera around it sees; no teeth, which
         a slit between lips may show."""
-        seen = np.zeros(len(self.capture.faces), bool)
+        visible = np.zeros(len(self.capture.faces), bool)
         for number in range(OUTSIDE_CAMERAS):
             angle = 2 * np.pi * number / OUTSIDE_CAMERAS
             height = (-0.5, 0.2, 0.9)[number % 3]
-            seen |= self.seen_from(np.array([np.sin(angle), height, np.cos(angle)]))[0]
-        return seen & ~teeth_of(self.capture)
+            visible |= self.seen_from(np.array([np.sin(angle), height, np.cos(angle)]))[0]
+        return visible & ~teeth_of(self.capture)
 
     def seen_from(self, direction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """(F,) bool: triangles of the neutral mesh that a camera in this direction (3,) from its
@@ -173,10 +173,10 @@ class Surface:
         focal_length = side * OUTSIDE_DISTANCE / OUTSIDE_WIDTH
         camera = look_at(eye, center, side, side, focal_length=focal_length)
         triangle, _ = rasterize(neutral, self.capture.faces, camera)
-        seen = np.zeros(len(self.capture.faces), bool)
-        seen[np.unique(triangle[triangle >= 0])] = True
+        visible = np.zeros(len(self.capture.faces), bool)
+        visible[np.unique(triangle[triangle >= 0])] = True
         normal = unit(normal, 1e-20)
-        return seen, facing(camera, corners.mean(1), normal)
+        return visible, facing(camera, corners.mean(1), normal)
 
     @cached_property
     def filmed_along(self) -> np.ndarray | None:
@@ -245,16 +245,16 @@ class Surface:
         margin_fraction  of the masks' height, which still counts as inside; negative: as outside
         """
         offsets = np.broadcast_to(offsets, (len(rows), *offsets.shape[-2:]))
-        seen, beside = np.zeros((2, *offsets.shape[:2]), int)
+        inside, beside = np.zeros((2, *offsets.shape[:2]), int)
         for (view, mask), frames in zip(self.masks, self._mask_frames, strict=True):
             points = np.einsum("nij,nkj->nki", frames.rotation[rows], offsets)
             points += frames.origin[rows, None]
             column, row, within = pixels_of(points.reshape(-1, 3), view.camera)
-            seen += within.reshape(seen.shape)
+            inside += within.reshape(inside.shape)
             beside += (within & clear_of(mask > 127, margin_fraction)[row, column]).reshape(
-                seen.shape
+                inside.shape
             )
-        return np.asarray(beside > MAX_BESIDE_FRACTION * np.maximum(seen, 1))
+        return np.asarray(beside > MAX_BESIDE_FRACTION * np.maximum(inside, 1))
 
     @cached_property
     def masks(self) -> list[tuple[View, np.ndarray]]:
@@ -291,10 +291,10 @@ class Surface:
             return found
         timesteps = views_by_timestep(self.capture.views["train"])
         weights = np.array([flame.frame(timestep).expr for timestep in timesteps])
-        for blink, own in self._lids.items():
+        for blink, lid in self._lids.items():
             columns, fractions = lid_fractions(flame.model, blink.removeprefix("eyeBlink"))
             if (weights[:, columns] @ fractions).max() < CLOSED_FRACTION:
-                found |= own
+                found |= lid
         return found
 
     @cached_property

@@ -99,31 +99,31 @@ def unseen_sides(surface: Surface) -> UnseenSides:
     density = pixels / np.maximum(face_areas(capture.neutral, capture.faces), MIN_DIVISOR)
     facing = density[cosine > WELL_SHOWN_COSINE]
     median = np.median(facing[facing > 0]) if facing.any() else 0.0
-    shown = density > MIN_SHOWN_FRACTION * median
-    shown |= _around_shown_teeth(surface, shown)
+    visible = density > MIN_SHOWN_FRACTION * median
+    visible |= _around_shown_teeth(surface, visible)
     is_source = (pixels > 0) & is_outside & (cosine > SOURCE_COSINE) & ~surface.lids
     if not is_source.any():
-        none = np.zeros_like(shown)
-        return UnseenSides(none, shown, color, none, none.astype(float), color)
+        none = np.zeros_like(visible)
+        return UnseenSides(none, visible, color, none, none.astype(float), color)
     unseen = is_outside & (cosine < SOURCE_COSINE)
     well_shown = is_source & (cosine > WELL_SHOWN_COSINE)
     hair = _hair(surface, color, pixels > 0, is_source)
     sides = _Sides(surface, color)
-    hidden = unseen | ~shown | surface.lids
+    hidden = unseen | ~visible | surface.lids
     found = color.copy()
     ears = surface.regions.within(Region.EAR)
     found[hidden] = sides.nearest(is_source & ~ears, hidden)
     turned = np.where(is_outside, surface.turned_from(SHOWN_COSINE, SOURCE_COSINE), 0.0)
     off_axis = color.copy()
-    is_hair = np.zeros_like(shown)
+    is_hair = np.zeros_like(visible)
     may_be_mirrored = unseen.copy()
     if surface.at is not None:
         # what faces a camera beyond its image goes on as the image ends
         body = surface.kinds["body"]
         of_kind = (body, body & ~unseen, False), (body, body & unseen, True), (ears, ears, False)
-        for like, own, is_level in of_kind:
-            if (like & is_source).any() and (own & hidden).any():
-                found[own & hidden] = sides.nearest(like & is_source, own & hidden, is_level)
+        for like, kind, is_level in of_kind:
+            if (like & is_source).any() and (kind & hidden).any():
+                found[kind & hidden] = sides.nearest(like & is_source, kind & hidden, is_level)
         if surface.has_few_cameras:
             turns_away = sides.of_face & is_outside & (cosine < WELL_SHOWN_COSINE)
             off_axis[turns_away] = sides.nearest(is_source & ~ears, turns_away)
@@ -136,16 +136,18 @@ def unseen_sides(surface: Surface) -> UnseenSides:
             found[scalp & unseen] = np.median(color[hair], axis=0)
     rows, mirrored = sides.mirrored(may_be_mirrored, well_shown)
     found[rows] = mirrored
-    shown[rows] = False
-    inside = _unseen_inside(capture, pixels > 0, is_outside) | _unseen_teeth(capture, pixels, shown)
-    within = inside | (~is_outside & (~shown | (pixels == 0)))
-    found[within] = inside_colors(capture, color, shown, within)
+    visible[rows] = False
+    inside = _unseen_inside(capture, pixels > 0, is_outside) | _unseen_teeth(
+        capture, pixels, visible
+    )
+    within = inside | (~is_outside & (~visible | (pixels == 0)))
+    found[within] = inside_colors(capture, color, visible, within)
     lids, of_skin = _lid_colors(surface, well_shown, color)
     found[lids] = of_skin
-    shown[lids] = False
+    visible[lids] = False
     triangles = (is_outside & (cosine < UNSEEN_COSINE)) | inside
-    off_axis = np.where((unseen | ~(shown | is_hair))[:, None], found, off_axis)
-    return UnseenSides(triangles, shown, found, is_hair, np.where(is_hair, 1.0, turned), off_axis)
+    off_axis = np.where((unseen | ~(visible | is_hair))[:, None], found, off_axis)
+    return UnseenSides(triangles, visible, found, is_hair, np.where(is_hair, 1.0, turned), off_axis)
 
 
 def plausible_off_axis(
@@ -160,17 +162,19 @@ def plausible_off_axis(
     fraction[sides.triangles[face]] = 0  # they have one color from everywhere, and hair its locks
     plausible = sides.off_axis[face]
     steepness = np.ones(len(face))
-    shown = sh_color(splats.sh, along[face])
+    color = sh_color(splats.sh, along[face])
     beside = np.flatnonzero(splats.unbound & ~sides.is_hair[face])
     if len(beside):
         places = points_to_world(splats.xyz[beside], neutral, face[beside])
         around = beside[nearest_rows(places, places, NEAREST)]
-        plausible[beside] = np.median(shown[around], axis=1)
+        plausible[beside] = np.median(color[around], axis=1)
         fraction[beside] = 1
         steepness[beside] = ALSO_BEHIND_STEEPNESS
     if sides.is_hair.any():
         hair = np.median(sides.off_axis[sides.is_hair], axis=0)
-        from_hair, from_skin = (np.linalg.norm(shown - own, axis=1) for own in (hair, plausible))
+        from_hair, from_skin = (
+            np.linalg.norm(color - prior, axis=1) for prior in (hair, plausible)
+        )
         is_behind = (fraction > 0) & ~sides.is_hair[face] & (from_hair < from_skin)
         is_behind[beside] = False
         fraction[is_behind] = 1
@@ -218,11 +222,11 @@ class _Sides:
         sources (F,) bool or mirror images of these, of the same connected part where it has
         any. is_level: whether those above and below count as farther (LEVEL_WEIGHT)."""
         centers = self._raised if is_level else self.centers
-        own = np.flatnonzero(sources)
+        direct = np.flatnonzero(sources)
         of_source = sources[self._image]
-        rows = np.concatenate([own, self._partner[of_source]])
+        rows = np.concatenate([direct, self._partner[of_source]])
         places = centers[rows]
-        colors = self._color[np.concatenate([own, self._image[of_source]])]
+        colors = self._color[np.concatenate([direct, self._image[of_source]])]
         parts = self._part[rows]
         found = self._color.copy()
         for number in np.unique(self._part[hidden]):
@@ -234,10 +238,10 @@ class _Sides:
             found[rows] = np.median(colors[known][near], axis=1)
         return np.asarray(found[hidden])
 
-    def mirrored(self, hidden: np.ndarray, shown: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Which of the triangles `hidden` (F,) bool have mirror images that are `shown`, and their
-        colors (N, 3)."""
-        are_shown = hidden[self._partner] & shown[self._image]
+    def mirrored(self, hidden: np.ndarray, visible: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Which of the triangles `hidden` (F,) bool have mirror images that are `visible`, and
+        their colors (N, 3)."""
+        are_shown = hidden[self._partner] & visible[self._image]
         return self._partner[are_shown], self._color[self._image[are_shown]]
 
 
@@ -258,9 +262,9 @@ def _lid_colors(
     return lids, skin_color[lids]
 
 
-def _fringe(at: HeadCoordinates, shown: np.ndarray) -> np.ndarray:
+def _fringe(at: HeadCoordinates, visible: np.ndarray) -> np.ndarray:
     """The highest of the triangles (F,) bool that are shown above the brows."""
-    above = np.flatnonzero(shown & (at.level > BROWS_LEVEL))
+    above = np.flatnonzero(visible & (at.level > BROWS_LEVEL))
     return above[np.argsort(at.level[above])][int(len(above) * (1 - FRINGE_FRACTION)) :]
 
 
@@ -281,36 +285,36 @@ def _color_views(capture: Capture) -> list[View]:
         height[timestep] = np.linalg.svd(place - place.mean(0), compute_uv=False)[1]
     highest = sorted(height, key=lambda timestep: -height[timestep])[:OPEN_VIEWS]
     opened = [by_timestep[timestep] for timestep in highest]
-    return [*spread, *(own[len(own) // 2] for own in opened)]
+    return [*spread, *(part[len(part) // 2] for part in opened)]
 
 
-def _unseen_inside(capture: Capture, shown: np.ndarray, is_outside: np.ndarray) -> np.ndarray:
+def _unseen_inside(capture: Capture, visible: np.ndarray, is_outside: np.ndarray) -> np.ndarray:
     """(F,) bool: triangles inside of mouth and eyes that neither a view nor a view of a neighbor
     shows. Folds of ears are left out, because other views show them. None in a long recording whose
     meshes are files, because not all open mouths were looked for."""
     if capture.flame is None and len(capture.timesteps) > SPREAD_VIEWS:
-        return np.zeros(len(shown), bool)
+        return np.zeros(len(visible), bool)
     touched = np.zeros(len(capture.neutral), bool)
-    touched[capture.faces[shown]] = True
+    touched[capture.faces[visible]] = True
     may_line = ~skin_of(capture) | lining_of(capture)
     return np.asarray(may_line & ~is_outside & ~touched[capture.faces].any(1))
 
 
-def _around_shown_teeth(surface: Surface, shown: np.ndarray) -> np.ndarray:
+def _around_shown_teeth(surface: Surface, visible: np.ndarray) -> np.ndarray:
     """(F,) bool: teeth near those that are shown: they may be smaller than the pixels, between
     whose centers they lie."""
     teeth = np.flatnonzero(teeth_of(surface.capture))
-    found = np.zeros(len(shown), bool)
+    found = np.zeros(len(visible), bool)
     if len(teeth):
         places = surface.centers[teeth]
-        found[teeth] = shown[teeth][nearest_rows(places, places, NEAREST)].any(1)
+        found[teeth] = visible[teeth][nearest_rows(places, places, NEAREST)].any(1)
     return found
 
 
-def _unseen_teeth(capture: Capture, pixels: np.ndarray, shown: np.ndarray) -> np.ndarray:
+def _unseen_teeth(capture: Capture, pixels: np.ndarray, visible: np.ndarray) -> np.ndarray:
     """(F,) bool: teeth that the pixels (F,) do not show well, or all where lips hide them."""
     teeth = teeth_of(capture)
     in_mouth = pixels[capture.regions.get("mouth", teeth)].sum()
     if pixels[teeth].sum() < MIN_TEETH_FRACTION * in_mouth:
         return teeth
-    return np.asarray(teeth & ~shown)
+    return np.asarray(teeth & ~visible)

@@ -209,13 +209,13 @@ def trained_strain_range(
     limits = trained_range(len(capture.faces))
     basis = strain_basis(capture.neutral, capture.faces, limits)
     timesteps = sorted({view.timestep for view in capture.views["train"]})
-    seen = seen_range(basis, (mesh(timestep) for timestep in timesteps))
+    strain_range = seen_range(basis, (mesh(timestep) for timestep in timesteps))
     parent = None if continuation is None else read_avatar(continuation.parent / AVATAR)
     if parent is None or not parent.follows_strain:
-        return seen  # it follows strain only from here on
+        return strain_range  # it follows strain only from here on
     if parent.strain_range is None:
         return limits
-    low, high = (np.stack([seen[:, k], parent.strain_range[:, k]]) for k in range(2))
+    low, high = (np.stack([strain_range[:, k], parent.strain_range[:, k]]) for k in range(2))
     lowest = np.maximum(low.min(0), limits[:, 0])
     highest = np.minimum(high.max(0), limits[:, 1])
     return np.stack([lowest, highest], axis=1)

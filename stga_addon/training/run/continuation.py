@@ -231,8 +231,8 @@ def _distance(meshes: np.ndarray, mesh: np.ndarray) -> np.ndarray:
 
 def views_of_region(capture: Capture, views: Sequence[View], region: np.ndarray) -> list[View]:
     """In which the region (F,) bool is seen large: turned to the camera, whatever covers it."""
-    seen = np.array([_facing_area(capture, view, region) for view in views])
-    large = [area >= MIN_REGION_FRACTION * seen.max() > 0 for area in seen]
+    areas = np.array([_facing_area(capture, view, region) for view in views])
+    large = [area >= MIN_REGION_FRACTION * areas.max() > 0 for area in areas]
     return [view for view, is_large in zip(views, large, strict=True) if is_large]
 
 

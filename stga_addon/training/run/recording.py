@@ -190,9 +190,9 @@ def _fit_rotation(run: Path, root: Path) -> np.ndarray | None:
     for world in (IDENTITY, replace(IDENTITY, rotation=rotation)):
         missed = []
         for _, pixels in _colors_by_camera(avatar, stored.settings, capture, world):
-            drawn, seen, _ = (np.concatenate(side, 1) for side in zip(*pixels, strict=True))
-            gain, offset = fit_exposure(drawn, seen)[..., None]
-            squared = ((seen - gain * drawn - offset) / EXPOSURE_SCALE) ** 2
+            drawn, observed, _ = (np.concatenate(side, 1) for side in zip(*pixels, strict=True))
+            gain, offset = fit_exposure(drawn, observed)[..., None]
+            squared = ((observed - gain * drawn - offset) / EXPOSURE_SCALE) ** 2
             missed.append(squared / (1 + squared))
         errors.append(np.concatenate(missed, axis=1).mean())
     return rotation if errors[1] < errors[0] else None
@@ -241,23 +241,23 @@ def _light(avatar: Avatar, settings: TrainingSettings, capture: Capture) -> Ligh
     rows = []
     lit = []
     for chosen, pixels in _colors_by_camera(avatar, settings, capture):
-        drawn, seen, normals = (np.concatenate(side, 1) for side in zip(*pixels, strict=True))
-        overall = fit_exposure(drawn, seen)
+        drawn, observed, normals = (np.concatenate(side, 1) for side in zip(*pixels, strict=True))
+        overall = fit_exposure(drawn, observed)
         for view, (own_drawn, own_seen, _) in zip(chosen, pixels, strict=True):
-            own = fit_exposure(own_drawn, own_seen, overall, CAMERA_WEIGHT)
-            scaled = own * np.array([[1.0], [255.0]])
+            exposure = fit_exposure(own_drawn, own_seen, overall, CAMERA_WEIGHT)
+            scaled = exposure * np.array([[1.0], [255.0]])
             rows.append((float(view.camera_index), *scaled.ravel().tolist(), float(view.timestep)))
-        lit.append((drawn, (seen - overall[1][:, None]) / overall[0][:, None], normals))
+        lit.append((drawn, (observed - overall[1][:, None]) / overall[0][:, None], normals))
     return tuple(rows), _fit_shading(*(np.concatenate(side, 1) for side in zip(*lit, strict=True)))
 
 
-def _fit_shading(drawn: np.ndarray, seen: np.ndarray, normals: np.ndarray) -> np.ndarray:
+def _fit_shading(drawn: np.ndarray, observed: np.ndarray, normals: np.ndarray) -> np.ndarray:
     """Harmonics (9, 3) by the normal (3, N) of a factor from colors (3, N) to those seen."""
     by_normal = basis(normals.T)
     even = uniform(1.0)
     found = even.copy()
     for _ in range(SHADING_ITERATIONS):
-        for channel, (x, y) in enumerate(zip(drawn, seen, strict=True)):
+        for channel, (x, y) in enumerate(zip(drawn, observed, strict=True)):
             residual = y - x * (by_normal @ found[:, channel])
             weight = (1 + (residual / EXPOSURE_SCALE) ** 2) ** -2.0
             system = by_normal * x[:, None]
@@ -286,7 +286,7 @@ def _head_colors(
     mesh = world.apply(capture.mesh(view.timestep))
     camera = world.camera(view.camera)
     drawn = render_avatar(avatar, mesh, camera, settings.background)
-    shown = rasterize(mesh, capture.faces, camera)
-    head, normals = normal_images(mesh, capture.faces, shown)
+    rasterized = rasterize(mesh, capture.faces, camera)
+    head, normals = normal_images(mesh, capture.faces, rasterized)
     head &= True if mask is None else mask >= MIN_COVER
     return drawn[:, head].astype(np.float64), image[head].T / 255, normals[head].T

@@ -401,8 +401,8 @@ class _Session:
         tracking = self.trainer.tracking
         # refined meshes change halfway
         mesh = self.trainer.frames.mesh_unless_kept if tracking is None else None
-        shown = capture if tracking is None else tracking.refined(capture)
-        prepare = image_preparation(shown, settings)
+        refined = capture if tracking is None else tracking.refined(capture)
+        prepare = image_preparation(refined, settings)
         limits = DEFAULT_LIMITS._replace(readers=image_readers(self.run.device))
         return ViewLoader(order, scale, settings.background_levels, limits, prepare, mesh=mesh)
 
@@ -665,10 +665,10 @@ class _Session:
         if self.trainer.tracking is not None:
             capture = folders.with_refined_tracking(capture, self.folder)
         views = [view for split in ("train", "val") for view in self.capture.views.get(split, ())]
-        shown = evenly_spread(views, RESIDUAL_VIEWS)
+        chosen = evenly_spread(views, RESIDUAL_VIEWS)
         prepare = image_preparation(capture, settings)
         avatar = self.measured = read_avatar(self.folder / AVATAR)
-        residuals = triangle_residuals(avatar, capture, shown, prepare, RESIDUAL_SCALE)
+        residuals = triangle_residuals(avatar, capture, chosen, prepare, RESIDUAL_SCALE)
         folders.write_residuals(self.folder, residuals.mean())
 
 
