@@ -28,7 +28,7 @@ from ..stga_addon.scene.rig.keyframes import (
 )
 from ..stga_addon.scene.tags import is_head
 from . import common, options
-from .common import Edit, FileImport, file_path, head_of, own_motion
+from .common import Edit, FileImport, file_path, head_of, recorded_motion
 from .options import ONCE
 
 LAST_FRAME = 1_048_574
@@ -84,7 +84,7 @@ TAKEN_OVER = ("strength", "stay_trained", "smoothing", "mirror")
 """Options of driving live that its takes are applied with; their sides are exchanged already."""
 
 
-def own_range(head: Any, motion: FlameSequence) -> TrainedRange:
+def measured_range(head: Any, motion: FlameSequence) -> TrainedRange:
     """Measure and store the range of the motion that a head was trained on."""
     trained = open_motion.trained_range([motion.frame(timestep) for timestep in motion.timesteps])
     rig_motion.store_range(head, trained)
@@ -260,7 +260,7 @@ class ApplyMotion(Edit, bpy.types.Operator, FileImport, MotionProperties):
         else:
             name = other.name
             sampled = common.scene_frames(context.scene)
-            motion = rig_motion.sample_motion(other, own_motion(other), sampled, self.warn)
+            motion = rig_motion.sample_motion(other, recorded_motion(other), sampled, self.warn)
         rate = self.fps * render.fps_base / render.fps if self.fps else 1.0
         step = float(self.speed * rate)  # timesteps of the recording in a frame of the scene
         frames = retimed(motion, step)
@@ -269,7 +269,7 @@ class ApplyMotion(Edit, bpy.types.Operator, FileImport, MotionProperties):
         self._report_range(beyond)
         tracked = None
         if self.own_offsets:  # what the head was imported from, and where its timesteps come to lie
-            recorded = own_motion(head)
+            recorded = recorded_motion(head)
             first = recorded.timesteps[0]
             tracked = recorded, [self.start + (each - first) / step for each in recorded.timesteps]
         placement = self._placement(name, parts)
@@ -292,7 +292,7 @@ class ApplyMotion(Edit, bpy.types.Operator, FileImport, MotionProperties):
             self.warn(f"{path.name}: {performance.lost} rows are missing and were interpolated")
         rig = common.rig_or_shapes(head)
         if rig is not None and not (self.sliders and has_shapes(head)):
-            recorded = own_motion(head)
+            recorded = recorded_motion(head)
             trained = self._trained(head)
             motion = open_motion.performed(performance, recorded, head.name, options, trained, rate)
             frames = [motion.sequence.frame(timestep) for timestep in motion.sequence.timesteps]
@@ -329,7 +329,7 @@ class ApplyMotion(Edit, bpy.types.Operator, FileImport, MotionProperties):
         if not self.stay_trained and self.neutral == "none":
             return None
         try:
-            return own_range(head, own_motion(head))
+            return measured_range(head, recorded_motion(head))
         except StgaError as error:
             if self.stay_trained:
                 raise

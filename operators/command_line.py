@@ -14,7 +14,7 @@ from ..stga_addon.errors import StgaError
 from ..stga_addon.flame.sequence import motion_arrays
 from ..stga_addon.jobs.avatar_source import FOLDER, OpenHead, Played, write_head
 from ..stga_addon.scene import tags
-from ..stga_addon.scene.arrays import own_vertices
+from ..stga_addon.scene.arrays import head_vertices
 from ..stga_addon.scene.objects import frames_per_second, iterate_frames
 from ..stga_addon.scene.rig.motion import sample_motion
 from ..stga_addon.scene.tags import is_head
@@ -99,7 +99,7 @@ def _played(head: Any) -> Played:
     capture has moved, or a FLAME head has no rig."""
     frames = scene_frames(bpy.context.scene)
     meshes = {
-        frame: np.asarray(own_vertices(head), np.float64)
+        frame: np.asarray(head_vertices(head), np.float64)
         for frame in iterate_frames(frames, [head])
     }
     flame = open_capture(*capture_source(head)).flame

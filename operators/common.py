@@ -21,7 +21,7 @@ from ..stga_addon.progress import Cancelled
 from ..stga_addon.scene import tags
 from ..stga_addon.scene.objects import mover_of
 from ..stga_addon.scene.record import capture_of, stored_path
-from ..stga_addon.scene.rig.head import check_local, check_own, find_rig, usable_rig
+from ..stga_addon.scene.rig.head import check_editable, check_local, find_rig, usable_rig
 from ..stga_addon.scene.rig.keyframes import shape_key_names
 from ..stga_addon.scene.tags import is_head
 from ..stga_addon.schema import alternatives, type_hints
@@ -302,7 +302,7 @@ def stored_source(head: Any) -> tuple[Path, Path | None, str]:
     return capture_of(head), model_file, head.get(point, DEFAULT_PRINCIPAL_POINT)
 
 
-def own_motion(head: Any) -> FlameSequence:
+def recorded_motion(head: Any) -> FlameSequence:
     """FLAME parameters of the capture that a head was imported from. Raises StgaError where it has
     none."""
     return open_capture(*capture_source(head)).flame_motion(head.name)
@@ -341,7 +341,7 @@ def _head_that(check: Callable[[Any], object]) -> Poll:
     return poll
 
 
-needs_own_head = _head_that(check_own)  # that can be changed here
+needs_editable_head = _head_that(check_editable)  # that can be changed here
 needs_local_head = _head_that(check_local)  # that may be overridden
 needs_rig = _head_that(usable_rig)  # with a FLAME rig that can be animated
 needs_bones = _head_that(partial(usable_rig, with_sliders=False))  # that can be posed
@@ -351,7 +351,7 @@ def needs_rig_or_shapes(operator: Any, context: Any) -> bool:
     """Poll: whether there is a head with a FLAME rig or with shape keys of ARKit's names."""
     head = context.scene.stga.head
     has_shapes = is_head(head) and find_rig(head) is None and shape_key_names(head)
-    return (needs_own_head if has_shapes else needs_rig)(operator, context)
+    return (needs_editable_head if has_shapes else needs_rig)(operator, context)
 
 
 # Files

@@ -26,7 +26,7 @@ from ..stga_addon.files import naming
 from ..stga_addon.jobs.convert_motion import SHAPES_SUFFIX, ConvertMotion
 from ..stga_addon.jobs.table import Kind
 from ..stga_addon.scene import tags
-from ..stga_addon.scene.avatar_scene import shown_screens, viewports
+from ..stga_addon.scene.avatar_scene import viewports, window_screens
 from ..stga_addon.scene.objects import (
     Identity,
     after_render,
@@ -38,8 +38,8 @@ from ..stga_addon.scene.rig.keyframes import check_sliders
 from ..stga_addon.scene.rig.motion import LivePose, stored_range
 from ..stga_addon.training.run.folder import read_run
 from . import common, options, timers
-from .apply_motion import TAKEN_OVER, MotionProperties, own_range
-from .common import Action, Edit, FileImport, file_path, head_of, need, own_motion, rig_or_none
+from .apply_motion import TAKEN_OVER, MotionProperties, measured_range
+from .common import Action, Edit, FileImport, file_path, head_of, need, recorded_motion, rig_or_none
 from .options import ONCE
 from .request import idle, start
 from .training_python import training_python
@@ -95,11 +95,11 @@ class MeasureRange(Edit, bpy.types.Operator):
     on"""
 
     bl_label = "Measure Trained Range"
-    needs = (common.needs_rig, common.needs_own_head)
+    needs = (common.needs_rig, common.needs_editable_head)
 
     def run(self, context: Any) -> None:
         head = head_of(context)
-        own_range(head, own_motion(head))
+        measured_range(head, recorded_motion(head))
 
 
 # Live
@@ -186,7 +186,7 @@ class LiveSession:
             frames = self._map.frames(self._shown)
             frames, _ = open_motion.finished(frames, options, self._trained)
             self._pose.set_frame(frames[0])
-        for area in viewports(shown_screens()):
+        for area in viewports(window_screens()):
             area.tag_redraw()
 
     def options(self) -> MotionOptions:
@@ -348,12 +348,12 @@ class DriveLive(Action, bpy.types.Operator):
         pose = LivePose(head, common.rig_or_shapes(head))
         found = trained = None
         if pose.takes_frames:
-            motion = own_motion(head)
+            motion = recorded_motion(head)
             show_progress(0.1)
             found = head_map(motion, head.name)
             check_sliders(head, found.expressions)
             show_progress(0.9)
-            trained = stored_range(head) or own_range(head, motion)
+            trained = stored_range(head) or measured_range(head, motion)
         receiver = sources.Receiver(source, settings.address, settings.port, settings.phone)
         stop_session()
         _session = LiveSession(Identity(context.scene), pose, found, trained, receiver)

@@ -9,14 +9,14 @@ from ..stga_addon.scene.display.splat_object import splats_of
 from ..stga_addon.scene.duplicate import attach_to_bone, duplicate_avatar
 from ..stga_addon.scene.objects import leave_edit_mode
 from . import options
-from .common import Edit, head_of, needs_local_head, needs_own_head
+from .common import Edit, head_of, needs_editable_head, needs_local_head
 from .options import ONCE
 
 
 class DuplicateAvatar(Edit, bpy.types.Operator):
     """Copy the head with bones, sliders, keyframes and splats, beside it"""
 
-    needs = (needs_own_head,)
+    needs = (needs_editable_head,)
 
     linked: options.boolean("Linked", "Both play the same keyframes", options=ONCE)
 

@@ -17,7 +17,7 @@ import bpy
 import numpy as np
 
 from ..stga_addon.avatar.file import Avatar, read_avatar
-from ..stga_addon.avatar.filmed import filmed_avatar
+from ..stga_addon.avatar.observed import observed_part
 from ..stga_addon.avatar.splats import Splats
 from ..stga_addon.capture.camera import Camera, camera_from_gl
 from ..stga_addon.driving.head_map import page_controls
@@ -35,7 +35,7 @@ from ..stga_addon.format import format_bytes
 from ..stga_addon.jobs.export import Export
 from ..stga_addon.progress import Cancelled
 from ..stga_addon.scene import tags
-from ..stga_addon.scene.arrays import Z_UP_TO_Y_UP, own_vertices
+from ..stga_addon.scene.arrays import Z_UP_TO_Y_UP, head_vertices
 from ..stga_addon.scene.cameras import export_cameras, scene_camera
 from ..stga_addon.scene.display.splat_nodes import NATIVE
 from ..stga_addon.scene.display.splat_object import check_head, display_mode, later_modifiers
@@ -53,7 +53,7 @@ from ..stga_addon.scene.rig.head import find_rig, has_shape_keys, shape_key_mode
 from ..stga_addon.scene.rig.motion import sample_motion
 from ..stga_addon.scene.vertex_groups import training_selection
 from ..stga_addon.tracking.head_model import shape_arrays, write_linear_model
-from ..stga_addon.worker.training_python import own_python
+from ..stga_addon.worker.training_python import this_python
 from . import common, options
 from .common import (
     Action,
@@ -64,7 +64,7 @@ from .common import (
     head_of,
     need,
     needs_head,
-    own_motion,
+    recorded_motion,
     scene_frames,
 )
 from .options import ONCE
@@ -152,7 +152,7 @@ class SplatExport(Stepwise, FileExport):
                         _show_status("Waiting for the render   Esc: Cancel")
                         yield
                     if writer.takes_frames:
-                        with view.shown():
+                        with view.in_context():
                             frame = next(posing, None)
                             found = None if frame is None else read()
                         writer.give(frame, found)
@@ -180,7 +180,7 @@ def _keeping(view: SceneView, things: Sequence[Any], steps: StepGenerator) -> St
     """Steps in which Blender evaluates these objects."""
     known = [Identity(thing) for thing in things if thing is not None]
     with ExitStack() as kept:
-        with view.shown():
+        with view.in_context():
             kept.enter_context(kept_evaluated(each.get() for each in known))
         yield from steps
 
@@ -245,7 +245,7 @@ class ExportAvatar(SplatExport, bpy.types.Operator):
         if format.source == "range":
             formats.check_free_space(path, format.size(Content(avatar), len(frames)))
         elif format.source == "motion":
-            motion = sample_motion(head, own_motion(head), frames, self.warn)
+            motion = sample_motion(head, recorded_motion(head), frames, self.warn)
 
         def write(meshes: Meshes) -> None:
             content = Content(avatar, meshes, motion, playback, python)
@@ -253,7 +253,7 @@ class ExportAvatar(SplatExport, bpy.types.Operator):
 
         python = _usd_python(context, self.format)
         owner = Identity(head)
-        return self.write_frames(context, path, lambda: own_vertices(owner.get()), write, [head])
+        return self.write_frames(context, path, lambda: head_vertices(owner.get()), write, [head])
 
 
 class ExportSplats(SplatExport, bpy.types.Operator):
@@ -295,8 +295,12 @@ class ExportSplats(SplatExport, bpy.types.Operator):
         format = SPLAT_FORMATS[self.format]
         count = len(scene_frames(context.scene))
         for scene_object in context.scene.objects:
-            is_own = tags.is_splats(scene_object) and not scene_object.hide_render
-            if is_own and display_mode(scene_object) != NATIVE and later_modifiers(scene_object):
+            is_rendered = tags.is_splats(scene_object) and not scene_object.hide_render
+            if (
+                is_rendered
+                and display_mode(scene_object) != NATIVE
+                and later_modifiers(scene_object)
+            ):
                 names = ", ".join(each.name for each in later_modifiers(scene_object))
                 self.warn(
                     f"{scene_object.name}: exported without {names}; {NATIVE} are exported with it"
@@ -327,7 +331,7 @@ def _usd_python(context: Any, format: str) -> str:
         return ""
     with suppress(StgaError):
         python = training_python(context)
-        return "" if python == own_python() else python
+        return "" if python == this_python() else python
     return ""
 
 
@@ -396,7 +400,7 @@ def _show_status(text: str | None) -> None:
 
 def _read(path: Path, filmed_only: bool) -> Avatar:
     avatar = read_avatar(path)
-    return filmed_avatar(path, avatar) if filmed_only else avatar
+    return observed_part(path, avatar) if filmed_only else avatar
 
 
 @lru_cache(maxsize=8)
@@ -443,7 +447,7 @@ def exact_motion(head: Any, frames: range, warn: Warn) -> FlameSequence | None:
     reasons: list[str] = []
     motion = None
     try:
-        motion = sample_motion(head, own_motion(head), frames, reasons.append)
+        motion = sample_motion(head, recorded_motion(head), frames, reasons.append)
     except StgaError as error:
         reasons.append(str(error))
     if reasons:
@@ -469,7 +473,7 @@ class ExportPerformance(Action, bpy.types.Operator, FileExport):
         head = head_of(context)
         frames = scene_frames(context.scene)
         path = file_path(self.filepath, "curves").with_suffix(self.filename_ext)
-        motion = sample_motion(head, own_motion(head), frames, self.warn)
+        motion = sample_motion(head, recorded_motion(head), frames, self.warn)
         fps = frames_per_second(context.scene)
         write_performance(path, captured_performance(motion, head.name, fps))
         self.inform(f"Exported {len(frames)} frames to {path}")

@@ -13,10 +13,10 @@ from typing import Any
 import bpy
 
 from ..stga_addon.avatar.file import read_avatar
-from ..stga_addon.capture.filmed import Filmed, filmed
+from ..stga_addon.capture.coverage import CaptureCoverage, capture_coverage
 from ..stga_addon.capture.meshes import MESH_SUFFIXES
 from ..stga_addon.capture.model import Capture
-from ..stga_addon.capture.open import OWN_MODELS, open_capture
+from ..stga_addon.capture.open import CAPTURE_MODELS, open_capture
 from ..stga_addon.capture.transforms import (
     DEFAULT_PRINCIPAL_POINT,
     VIDEO_SUFFIXES,
@@ -71,8 +71,8 @@ from .common import (
     head_of,
     need,
     needs_rig,
-    own_motion,
     package,
+    recorded_motion,
 )
 from .kernels import begin_preparing
 from .options import ONCE
@@ -120,7 +120,7 @@ class HeadImport(Edit):
         scene = context.scene
         if is_rendering():
             raise StgaError("Blender renders, and would get other meshes; wait until it has ended")
-        has_model = not flame and any((source / name).is_file() for name in OWN_MODELS)
+        has_model = not flame and any((source / name).is_file() for name in CAPTURE_MODELS)
         model = None if has_model else flame_model_path(context, flame)
         capture = open_capture(source, flame=model, principal_point=principal_point)
         show_progress(0.5)
@@ -174,7 +174,7 @@ def _store_source(head: Any, capture: Capture, principal_point: str) -> None:
     head[tags.PRINCIPAL_POINT] = principal_point
     head[tags.TRACKED] = is_tracked(capture.root)
     head[tags.FOCAL_LENGTH] = describe_focal_length(capture.root)
-    _store_filmed(head, filmed(capture))
+    _store_coverage(head, capture_coverage(capture))
 
 
 def _used_actions() -> set[int]:
@@ -193,12 +193,12 @@ def _finish_replacing(head: Any, used: set[int], had_sliders: bool, warn: Warn) 
         warn(f"{head.name}: keyframes made by hand {instead}: {names}")
 
 
-def _store_filmed(head: Any, found: Filmed) -> None:
+def _store_coverage(head: Any, found: CaptureCoverage) -> None:
     """Store what the panel draws of it; nothing of a capture without views."""
-    head.pop(tags.FILMED_CELLS, None)
+    head.pop(tags.OBSERVED_CELLS, None)
     if len(found.directions):
-        head[tags.FILMED] = f"{found.text}\n{found.next_take}".strip()
-        head[tags.FILMED_CELLS] = found.cells
+        head[tags.OBSERVED] = f"{found.text}\n{found.next_take}".strip()
+        head[tags.OBSERVED_CELLS] = found.cells
 
 
 def _select(head: Any, objects: Any) -> None:
@@ -413,7 +413,7 @@ class BuildDemoShot(Edit, bpy.types.Operator):
     def run(self, context: Any) -> None:
         head = head_of(context)
         leave_edit_mode()
-        build_shot(head, own_motion(head), capture_of(head).with_name(SPEECH_FILE))
+        build_shot(head, recorded_motion(head), capture_of(head).with_name(SPEECH_FILE))
 
 
 # Files that are dropped

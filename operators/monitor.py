@@ -24,7 +24,7 @@ from ..stga_addon.jobs.perform import remove_request, request_folder
 from ..stga_addon.jobs.table import STORED, TRANSIENT, Kind
 from ..stga_addon.jobs.track import CAPTURE_FOLDER, RUN_FOLDER
 from ..stga_addon.report import curve_image
-from ..stga_addon.scene.objects import own_scenes
+from ..stga_addon.scene.objects import local_scenes
 from ..stga_addon.tracking.folder import SPLIT_FILES
 from ..stga_addon.training.run.folder import AVATAR, TRACKING
 from ..stga_addon.training.run.metrics_log import METRICS, read_metrics
@@ -120,7 +120,7 @@ def inspect_status(folder: Path) -> status.WorkerSnapshot:
 def tick() -> float | None:
     """Check every request; seconds until the next call, None to stop the timer, as bpy.app.timers
     expects."""
-    intervals = [_check(scene, kind) for scene in own_scenes() for kind in Kind]
+    intervals = [_check(scene, kind) for scene in local_scenes() for kind in Kind]
     return min((interval for interval in intervals if interval is not None), default=None)
 
 

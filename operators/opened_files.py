@@ -19,9 +19,9 @@ from ..stga_addon.scene.display.splat_object import (
     hide_object,
     replace_native_splats,
 )
-from ..stga_addon.scene.objects import layers_with, mover_of, own_collections, own_scenes, remove
+from ..stga_addon.scene.objects import collections_of, layers_with, local_scenes, mover_of, remove
 from ..stga_addon.scene.record import owner_of, rebase, rebase_file, store_path, stored_path
-from ..stga_addon.scene.render.viewport_display import is_shown_as_trained
+from ..stga_addon.scene.render.viewport_display import is_displayed_as_trained
 from ..stga_addon.scene.rig.head import bone_shapes
 from ..stga_addon.scene.tags import is_head
 from . import monitor
@@ -58,8 +58,8 @@ NOTE_SIZE_M = 0.02
 def _add_notes() -> None:
     """Let the file say what is missing where nobody draws its avatars; here it is gone again as
     soon as the file is written."""
-    for scene in own_scenes():
-        avatars = [each for each in scene.objects if is_shown_as_trained(each)]
+    for scene in local_scenes():
+        avatars = [each for each in scene.objects if is_displayed_as_trained(each)]
         for avatar in avatars[:1]:
             text = bpy.data.curves.new("STGA note", "FONT")
             text.body = NOTE
@@ -139,7 +139,7 @@ def _read_older(things: Iterable[Any]) -> None:
         head = followed_head(thing)
         if avatar and head is not None and head.library is None and tags.AVATAR not in head:
             store_path(head, tags.AVATAR, avatar)
-    for scene in own_scenes():
+    for scene in local_scenes():
         owner = owner_of(scene, scene.stga.head)
         for name, tag in (("run_folder", tags.RUN), ("avatar", tags.AVATAR)):
             value = stored_value(scene.stga, name)
@@ -152,7 +152,7 @@ def _read_older(things: Iterable[Any]) -> None:
 def _choose_head() -> None:
     """Let the panel work on the one head, and the splats, of a file that was made without it, as
     `stga demo` does, or into which an avatar was appended."""
-    for scene in own_scenes():
+    for scene in local_scenes():
         settings = scene.stga
         heads = tags.heads_of(scene)
         splats = list(filter(tags.is_splats, scene.objects))
@@ -200,7 +200,7 @@ def _after_update(scene: Any, *_: Any) -> None:
     _follow_active(scene)
     for name in ("head", "splats", *HEADS.values()):
         thing = getattr(scene.stga, name)
-        if thing is not None and thing.name not in scene.objects and not own_collections(thing):
+        if thing is not None and thing.name not in scene.objects and not collections_of(thing):
             setattr(scene.stga, name, None)
 
 

@@ -12,7 +12,7 @@ from ..stga_addon.driving.head_map import head_map
 from ..stga_addon.errors import StgaError, shorten
 from ..stga_addon.scene import tags
 from ..stga_addon.scene.compat import select_bones
-from ..stga_addon.scene.objects import Identity, leave_edit_mode, own_scenes, show_kind
+from ..stga_addon.scene.objects import Identity, leave_edit_mode, local_scenes, show_kind
 from ..stga_addon.scene.rig import keyframes, poses
 from ..stga_addon.scene.rig.head import usable_rig
 from ..stga_addon.scene.rig.motion import mirror_pose
@@ -23,7 +23,7 @@ from .common import (
     head_of,
     need,
     needs_bones,
-    needs_own_head,
+    needs_editable_head,
     needs_rig,
     needs_rig_or_shapes,
     rig_or_none,
@@ -155,7 +155,7 @@ class ApplyPose(Edit, bpy.types.Operator):
             raise StgaError(f"{self.pose}: is no pose of this file; save one, or append one")
         keyed = self.keyframe or context.scene.tool_settings.use_keyframe_insert_auto
         for owner in filter(None, (rig, head.data.shape_keys) if keyed else ()):
-            keyframes.check_own_action(owner)
+            keyframes.check_keyable_action(owner)
         applied = poses.apply_pose(head, rig, action, self.strength)
         for key in applied.sliders if keyed else ():
             key.keyframe_insert("value")
@@ -176,7 +176,7 @@ class AddArkitControls(Edit, bpy.types.Operator):
 
     needs = (
         needs_rig,
-        needs_own_head,
+        needs_editable_head,
         need(
             lambda context: keyframes.EXPRESSION_NAMES not in context.scene.stga.head,
             "The head has its sliders",
@@ -255,7 +255,7 @@ class _Sliders:
 
 @persistent
 def _after_load(_: Any) -> None:
-    for scene in own_scenes():
+    for scene in local_scenes():
         begin_sliders(scene.stga.head)
 
 

@@ -229,7 +229,7 @@ def _images(
     cache = SplatCache()
     before = None
     for number, frame in enumerate(frames):
-        with view.shown() as scene:
+        with view.in_context() as scene:
             is_new = frame != before or frame != scene.frame_current
             if is_new:
                 scene.frame_set(frame)

@@ -13,7 +13,7 @@ import bpy
 from ..stga_addon.avatar.file import Avatar, read_avatar
 from ..stga_addon.errors import StgaError
 from ..stga_addon.files import read_npz
-from ..stga_addon.jobs.monitor_state import RequestState, Shown, SliceBuilt
+from ..stga_addon.jobs.monitor_state import Displayed, RequestState, SliceBuilt
 from ..stga_addon.jobs.perform import read_request, read_result
 from ..stga_addon.jobs.table import TRAINS, Kind
 from ..stga_addon.jobs.track import CAPTURE_FOLDER, RUN_FOLDER
@@ -22,7 +22,7 @@ from ..stga_addon.scene.arrays import triangle_mesh
 from ..stga_addon.scene.avatar_scene import place_tracked, show_world
 from ..stga_addon.scene.display import splat_nodes, splat_object
 from ..stga_addon.scene.display.splat_attributes import SplatAttributes, avatar_attributes
-from ..stga_addon.scene.objects import Identity, mover_of, own_collections
+from ..stga_addon.scene.objects import Identity, collections_of, mover_of
 from ..stga_addon.scene.record import (
     capture_of,
     displayed_path,
@@ -37,11 +37,11 @@ from ..stga_addon.training.run.folder import AVATAR, TRACKING, read_run
 from ..stga_addon.worker.status import WorkerState
 from .common import capture_source, is_run
 
-Answer = SliceBuilt | Shown | None
+Answer = SliceBuilt | Displayed | None
 """Result of a function of `SHOW`; None: the result is still being read."""
 
 
-def _operate(scene: Any, operator: Any, **options: Any) -> Shown:
+def _operate(scene: Any, operator: Any, **options: Any) -> Displayed:
     """Call an operator, which reports in the window that shows the scene, if there is one; undo
     takes it back there."""
     windows = bpy.context.window_manager.windows
@@ -49,7 +49,7 @@ def _operate(scene: Any, operator: Any, **options: Any) -> Shown:
     place = {"window": window} if window is not None else {"scene": scene}
     with bpy.context.temp_override(**place):
         operator("EXEC_DEFAULT", window is not None, **options)
-    return Shown()
+    return Displayed()
 
 
 # The head that a request is about
@@ -98,7 +98,7 @@ def request_head(scene: Any, state: RequestState) -> Any:
     head = _head_in_session(scene, state.kind)
     if head is None and state.kind in HEADS:
         stored = getattr(scene.stga, HEADS[state.kind])
-        head = stored if stored is not None and own_collections(stored) else None
+        head = stored if stored is not None and collections_of(stored) else None
         if head is None:
             with suppress(StgaError):  # has not begun
                 head = _head_of_capture(scene, read_run(state.run).capture)
@@ -151,7 +151,7 @@ def _run(state: RequestState) -> Path:
     return subject / RUN_FOLDER if state.kind == Kind.AVATAR else subject
 
 
-def shown_splats(scene: Any, head: Any) -> Any:
+def editable_splats(scene: Any, head: Any) -> Any:
     """The splat object that shows an avatar on the head and can be changed, the panel's where that
     does; None without one."""
     found = splat_object.splats_of(head, scene) if head is not None else []
@@ -159,10 +159,10 @@ def shown_splats(scene: Any, head: Any) -> Any:
 
 
 def check_replaceable(scene: Any, head: Any, splats: Any) -> None:
-    """Raise StgaError where an avatar cannot take the place of what `shown_splats` found, None:
+    """Raise StgaError where an avatar cannot take the place of what `editable_splats` found, None:
     nothing that can be changed."""
     if splats is not None:
-        splat_object.check_own_data(splats)
+        splat_object.check_editable_data(splats)
     elif splat_object.splats_of(head, scene, linked=True):
         raise StgaError(f"{head.name}: shows an avatar already, and {LINKED}")
 
@@ -172,7 +172,7 @@ def follow_head(settings: Any) -> None:
     the scene's, or a new one beside that of another head."""
     scene = settings.id_data
     head = settings.head
-    splats = shown_splats(scene, head)
+    splats = editable_splats(scene, head)
     others = [thing for thing in tags.heads_of(scene) if thing != head]
     if splats is not None or (head is not None and others):
         settings.splats = splats
@@ -255,12 +255,12 @@ def _show_avatar(scene: Any, state: RequestState) -> Answer:
     if head is None:
         gone = "the head that it was trained for is no longer in the scene"
         raise StgaError(f"{run}: {gone}; choose a head, then Show Avatar")
-    splats = shown_splats(scene, head)
+    splats = editable_splats(scene, head)
     worn = Path(_absolute(owner_of(scene, head), tags.AVATAR))
     is_other = splats is not None and worn.is_file() and worn.parent != run
     if is_other and _is_immature(state):
         if not is_result:
-            return Shown()
+            return Displayed()
         count = f"{state.snapshot.status.figures.get('iteration', 0):.0f} iterations"
         shows = f"{head.name} keeps the avatar that it has; Show Avatar shows the new one"
         raise StgaError(f"{run}: was cancelled after {count}, so {shows}")
@@ -281,21 +281,23 @@ def _show_avatar(scene: Any, state: RequestState) -> Answer:
             splat_object.hide_object(head, scene)
     if is_result:
         store_path(owner_of(scene, head), tags.AVATAR, str(state.loading_path))
-        is_first = head.get(tags.TRACKED) and not head.get(tags.SHOWN_UNSEEN)
-        if is_first and splat_object.is_partly_filmed(splats):
-            head[tags.SHOWN_UNSEEN] = True
+        is_first = head.get(tags.TRACKED) and not head.get(tags.UNSEEN_DISPLAYED)
+        if is_first and splat_object.is_partly_observed(splats):
+            head[tags.UNSEEN_DISPLAYED] = True
             splat_object.set_input(splats, splat_nodes.SHOW_UNSEEN, True)
     if scene.stga.head == head:
         scene.stga.splats = splats
     show_world(run / AVATAR, head, scene)
-    return Shown(undoable=not is_update)
+    return Displayed(undoable=not is_update)
 
 
 def _show_trained(scene: Any, state: RequestState) -> Answer:
     """Show the avatar; around that of the demo's shot, the shot."""
     answer = _show_avatar(scene, state)
     is_result = state.loading_path.name == AVATAR
-    if not (isinstance(answer, Shown) and is_result and scene.stga.shot_run == str(_run(state))):
+    if not (
+        isinstance(answer, Displayed) and is_result and scene.stga.shot_run == str(_run(state))
+    ):
         return answer
     scene.stga.shot_run = ""
     with _in_panel(scene, request_head(scene, state)):
@@ -307,7 +309,7 @@ def _show_made(scene: Any, state: RequestState) -> Answer:
     head that training refined."""
     if state.loading_path.name == CAPTURE_FOLDER:
         is_there = _head_of_capture(scene, state.loading_path) is not None
-        imported = Shown() if is_there else _import(scene, state)
+        imported = Displayed() if is_there else _import(scene, state)
         head = _head_of_capture(scene, state.loading_path)
         record_head(scene, state.kind, head)
         store_path(owner_of(scene, head), tags.RUN, str(_run(state)))
@@ -315,7 +317,7 @@ def _show_made(scene: Any, state: RequestState) -> Answer:
         return imported
     answer = _show_avatar(scene, state)
     is_refined = state.loading_path.name == AVATAR and state.files.tracking is not None
-    if isinstance(answer, Shown) and is_refined:
+    if isinstance(answer, Displayed) and is_refined:
         head = request_head(scene, state)
         refined = str(state.run / TRACKING)
         how = {"own_offsets": True, "start": head[tags.TIMESTEPS][0]}
@@ -340,18 +342,18 @@ def _in_panel(scene: Any, head: Any) -> Iterator[None]:
 
 def _store_added(scene: Any, state: RequestState) -> Answer:
     """Give the scene's splats what is now in the avatar of the run."""
-    splats = shown_splats(scene, request_head(scene, state))
+    splats = editable_splats(scene, request_head(scene, state))
     path = state.subject_path / AVATAR
     if splats is None or not ADDS[state.kind](splats, read_avatar(path)):
         problem = "its avatar is not the one that the scene shows; show it again"
         raise StgaError(f"{state.subject}: {problem}")
-    return Shown(undoable=True)
+    return Displayed(undoable=True)
 
 
 # Captures
 
 
-def _import(scene: Any, state: RequestState) -> Shown:
+def _import(scene: Any, state: RequestState) -> Displayed:
     """Import the capture with the model that it was tracked with, or that which lies in it."""
     request: Any = read_request(state.folder_path)
     capture = state.loading_path if state.kind == Kind.AVATAR else state.place
@@ -396,7 +398,7 @@ def _fill_effects(scene: Any, state: RequestState) -> Answer:
         row.name = decision.effect
         for name in ("choice", "on", "reason", "cost"):
             setattr(row, name, getattr(decision, name))
-    return Shown()
+    return Displayed()
 
 
 def _apply_performance(scene: Any, state: RequestState) -> Answer:
@@ -426,7 +428,7 @@ SHOW = {
 def changed_object(scene: Any, state: RequestState) -> Any:
     """The object that showing the result changes, which has to leave Edit Mode before; or None."""
     if state.kind in TRAINS:
-        return shown_splats(scene, request_head(scene, state))
+        return editable_splats(scene, request_head(scene, state))
     return request_head(scene, state) if state.kind in CHANGES_HEAD else None
 
 

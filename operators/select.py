@@ -16,7 +16,7 @@ from ..stga_addon.selection import KEY_REGIONS, SelectionOptions, select_capture
 from ..stga_addon.training.run.folder import read_residuals
 from ..stga_addon.training.settings import TrainingSettings
 from . import options
-from .common import Edit, capture_source, file_path, head_of, needs_head, needs_own_head
+from .common import Edit, capture_source, file_path, head_of, needs_editable_head, needs_head
 from .options import ONCE
 
 LARGEST_RESIDUAL_QUANTILE = 0.98
@@ -29,7 +29,7 @@ class Select(Edit, bpy.types.Operator):
     each frame"""
 
     bl_label = "Select Moving Triangles"
-    needs = (needs_own_head,)
+    needs = (needs_editable_head,)
 
     threshold: options.field(
         SelectionOptions, "threshold", soft_max=0.05, step=0.1, precision=4, unit="LENGTH"
@@ -78,7 +78,7 @@ class ToggleRegion(Edit, bpy.types.Operator):
 
     bl_label = "Key Region"
     bl_options = Edit.bl_options | {"INTERNAL"}
-    needs = (needs_own_head,)
+    needs = (needs_editable_head,)
 
     name: options.text("Name", "A region of the capture, or a vertex group of the head")
 
@@ -106,7 +106,7 @@ class HeatMap(Edit, bpy.types.Operator):
     """Color the head's triangles, in the viewport and in renders: by how often each is selected, or
     by the error of the trained avatar there"""
 
-    needs = (needs_own_head,)
+    needs = (needs_editable_head,)
 
     show: options.boolean("Show", "Off: restore the head's own colors", default=True, options=ONCE)
     of: options.choice(

@@ -20,13 +20,13 @@ from ..stga_addon.scene.light import throw_shadow, throws_shadow
 from ..stga_addon.scene.objects import show_progress
 from ..stga_addon.scene.render import film_set
 from ..stga_addon.scene.render.scene_splats import forget_frame, relight_frame
-from ..stga_addon.scene.render.viewport_display import ENGINE, is_shown_as_trained
+from ..stga_addon.scene.render.viewport_display import ENGINE, is_displayed_as_trained
 from ..stga_addon.scene.rig.head import LINKED
 from . import common, options
 from .common import Action, Edit, FileImport, file_path, head_of, is_run, need
 from .options import ONCE
 from .request import idle, start
-from .results import check_replaceable, shown_splats
+from .results import check_replaceable, editable_splats
 from .training_python import training_python
 
 GRAY = ("WIREFRAME", "SOLID")
@@ -57,7 +57,7 @@ class ShowAvatar(Edit, bpy.types.Operator, FileImport):
         settings = context.scene.stga
         avatar = read_avatar(path)
         show_progress(0.3)
-        before = shown_splats(context.scene, head)
+        before = editable_splats(context.scene, head)
         check_replaceable(context.scene, head, before)
         name = f"{head.name} {path.stem}"
         splats = splat_object.show_avatar(avatar, head, name, replaced=before)
@@ -134,10 +134,10 @@ def leaves_out_set(scene: Any) -> bool:
     return any(thing.type in SURFACES for thing in others)
 
 
-def _own_as_trained(context: Any) -> list[Any]:
+def _local_as_trained(context: Any) -> list[Any]:
     """The splat objects displayed as trained, whose display can be changed: no linked ones."""
     local = [thing for thing in context.view_layer.objects if thing.library is None]
-    return [thing for thing in local if is_shown_as_trained(thing)]
+    return [thing for thing in local if is_displayed_as_trained(thing)]
 
 
 PREVIEW_SAMPLES = 4
@@ -168,14 +168,14 @@ class PreviewImages(Edit, bpy.types.Operator):
     through the scene's camera as quads that face it, without one as points"""
 
     bl_label = "Preview for EEVEE/Cycles"
-    needs = (need(_own_as_trained, "No splats are displayed as trained"),)
+    needs = (need(_local_as_trained, "No splats are displayed as trained"),)
 
     def run(self, context: Any) -> None:
         scene = context.scene
         space = context.space_data
         mode = QUADS if scene.camera is not None else POINTS
         mode = NATIVE if compat.NATIVE_SPLATS else mode
-        for thing in _own_as_trained(context):
+        for thing in _local_as_trained(context):
             splat_object.choose_display(thing, mode)
         splat_object.use_transparent_bounces(scene)
         if scene.render.engine != ENGINE:  # others show the set themselves
@@ -218,7 +218,7 @@ def _needs_splats(operator: Any, context: Any) -> bool:
     return common.polled(operator, head is not None, "Show an avatar first")
 
 
-def _needs_own_splats(operator: Any, context: Any) -> bool:
+def _needs_editable_splats(operator: Any, context: Any) -> bool:
     """Poll: whether there are splats that follow a head, and can be changed here, as it can."""
     if not _needs_splats(operator, context):
         return False
@@ -227,7 +227,7 @@ def _needs_own_splats(operator: Any, context: Any) -> bool:
         if thing.library is not None:
             return common.polled(operator, False, f"{thing.name}: {LINKED}")
     try:
-        splat_object.check_own_data(splats)
+        splat_object.check_editable_data(splats)
     except StgaError as error:
         return common.polled(operator, False, str(error))
     return True
@@ -250,7 +250,7 @@ class EstimateLight(RunAddition, bpy.types.Operator):
     the avatar"""
 
     request = Relight
-    needs = (idle(Kind.LIGHT), _needs_own_splats)
+    needs = (idle(Kind.LIGHT), _needs_editable_splats)
 
 
 class MakeExact(RunAddition, bpy.types.Operator):
@@ -259,14 +259,14 @@ class MakeExact(RunAddition, bpy.types.Operator):
 
     bl_label = "Bake for Linear Blending"
     request = MakeExactRequest
-    needs = (idle(Kind.EXACT), _needs_own_splats)
+    needs = (idle(Kind.EXACT), _needs_editable_splats)
 
 
 class RelightFrame(Edit, bpy.types.Operator):
     """Give the splats the colors of the scene's light at this frame, for EEVEE and Cycles; other
     frames keep them"""
 
-    needs = (_needs_own_splats,)
+    needs = (_needs_editable_splats,)
     clear: options.boolean("Clear", "Show recorded colors again", options=ONCE)
 
     def run(self, context: Any) -> None:
@@ -280,7 +280,7 @@ class HeadShadow(Edit, bpy.types.Operator):
     """Let the head's mesh throw shadows onto other objects in EEVEE and Cycles, without being seen;
     again: hide it"""
 
-    needs = (_needs_own_splats,)
+    needs = (_needs_editable_splats,)
 
     def run(self, context: Any) -> None:
         splats = context.scene.stga.splats

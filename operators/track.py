@@ -140,7 +140,7 @@ class MarkKey(Edit, bpy.types.Operator):
     bl_label = "Mark as Key"
     needs = (
         needs_rig,
-        common.needs_own_head,
+        common.needs_editable_head,
         need(
             lambda context: context.scene.frame_current in context.scene.stga.head[tags.TIMESTEPS],
             "The capture has no timestep at this frame",
@@ -154,7 +154,7 @@ class MarkKey(Edit, bpy.types.Operator):
         if frame in keys:
             del keys[frame]
         else:
-            keys[frame] = sample_pose(head, common.own_motion(head).model).parameters
+            keys[frame] = sample_pose(head, common.recorded_motion(head).model).parameters
             key_current_pose(head, usable_rig(head), frame)
         stored = {str(timestep): keys[timestep].tolist() for timestep in sorted(keys)}
         head[tags.TRACKING_KEYS] = json.dumps(stored)

@@ -5,7 +5,7 @@ from itertools import count
 import bpy
 
 from ..stga_addon.jobs.monitor_state import CHECK_INTERVAL_S
-from ..stga_addon.scene.avatar_scene import open_sidebar, shown_screens
+from ..stga_addon.scene.avatar_scene import open_sidebar, window_screens
 from . import timers
 from .common import TAB
 
@@ -19,7 +19,7 @@ def push_undo(what: str = "Show Result") -> None:
 
 
 def redraw() -> None:
-    for screen in shown_screens():
+    for screen in window_screens():
         for area in screen.areas:
             if area.type in ("VIEW_3D", "PREFERENCES"):
                 for region in area.regions:
@@ -32,7 +32,7 @@ def show_panel() -> None:
     attempts = count(1)
 
     def attempt() -> float | None:
-        is_over = open_sidebar(TAB, shown_screens()) or next(attempts) >= MAX_SIDEBAR_ATTEMPTS
+        is_over = open_sidebar(TAB, window_screens()) or next(attempts) >= MAX_SIDEBAR_ATTEMPTS
         return None if is_over else CHECK_INTERVAL_S
 
     if timers.has_timer():

@@ -44,7 +44,7 @@ QUALITIES_DB = {"Good": 30.0, "Usable": 25.0, "Rough": -math.inf}
 """Word for a held-out PSNR -> from which on."""
 
 
-MIN_SEEN_GAIN_DB = 0.1
+MIN_VISIBLE_GAIN_DB = 0.1
 """Gains that nobody sees are smaller."""
 MORE_GAIN = "what may help: More Splats (--growth), or footage that shows it larger"
 """Advice where training a region further gains nothing visible."""
@@ -54,7 +54,7 @@ def describe_gain(before_db: float, after_db: float) -> str:
     """Accuracy of a region before and after it was trained further, and what would help."""
     gain = after_db - before_db
     gained = f"{before_db:.2f} dB before, {after_db:.2f} dB after ({gain:+.2f})"
-    return gained if gain >= MIN_SEEN_GAIN_DB else f"{gained}; {MORE_GAIN}"
+    return gained if gain >= MIN_VISIBLE_GAIN_DB else f"{gained}; {MORE_GAIN}"
 
 
 def describe_quality(figures: Mapping[str, float]) -> str:
@@ -62,7 +62,7 @@ def describe_quality(figures: Mapping[str, float]) -> str:
     evaluation."""
     if "before_db" in figures:
         gain = figures["after_db"] - figures["before_db"]
-        return "Better" if gain >= MIN_SEEN_GAIN_DB else "No Better"
+        return "Better" if gain >= MIN_VISIBLE_GAIN_DB else "No Better"
     psnr = figures.get("psnr", math.nan)
     return next((word for word, least in QUALITIES_DB.items() if psnr >= least), "")
 

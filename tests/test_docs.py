@@ -285,11 +285,11 @@ def figures_of_priors():
     yield f"at least {surface_prior.LEAST_WIDTH_FRACTION} of their width"
     least_mm = layer.DEPTH_VOXELS * grid_mm
     yield f"lies {least_mm:g} to {layer.MAX_DEPTHS * least_mm:g} mm behind"
-    yield f"(beyond {degrees(unseen_sides.SHOWN_COSINE)})"
+    yield f"(beyond {degrees(unseen_sides.VIEW_INDEPENDENT_COSINE)})"
     yield f"{unseen_sides.OFF_AXIS_WEIGHT} · sin²"
     yield f"(cosine {unseen_sides.SOURCE_COSINE})"
     yield f"the {unseen_sides.NEAREST} nearest"
-    yield f"face beyond {degrees(unseen_sides.WELL_SHOWN_COSINE)}"
+    yield f"face beyond {degrees(unseen_sides.WELL_VISIBLE_COSINE)}"
     yield f"(beyond {degrees(unseen_hair.STRAND_COSINE)})"
 
 

@@ -18,7 +18,7 @@ from ..stga_addon.scene import tags
 from ..stga_addon.scene.display import splat_nodes
 from ..stga_addon.scene.display.splat_object import (
     get_input,
-    is_partly_filmed,
+    is_partly_observed,
     splat_modifier,
 )
 from ..stga_addon.scene.tags import is_head
@@ -173,10 +173,10 @@ def _draw_what_to_try(layout: Any, context: Any, settings: Any) -> None:
 
 def _draw_unseen(layout: Any, context: Any, splats: Any) -> None:
     """What the color of sides that were not filmed means, while it is shown."""
-    if not is_partly_filmed(splats) or not get_input(splats, splat_nodes.SHOW_UNSEEN):
+    if not is_partly_observed(splats) or not get_input(splats, splat_nodes.SHOW_UNSEEN):
         return
     box = layout.box()
     draw_text(
-        box, context, f"{splats[tags.FILMED].partition(';')[0].capitalize()}. {FILM_MORE}", "INFO"
+        box, context, f"{splats[tags.OBSERVED].partition(';')[0].capitalize()}. {FILM_MORE}", "INFO"
     )
     draw_input(box, splat_modifier(splats), splat_nodes.SHOW_UNSEEN, toggle=True, icon="HIDE_OFF")

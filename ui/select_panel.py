@@ -6,7 +6,7 @@ from typing import Any
 import bpy
 
 from ..operators.select import key_regions, possible_regions
-from ..stga_addon.capture.filmed import directions_picture
+from ..stga_addon.capture.coverage import directions_picture
 from ..stga_addon.scene import tags
 from ..stga_addon.scene.objects import layers_of
 from ..stga_addon.scene.tags import is_head
@@ -45,18 +45,18 @@ class CapturePanel(SidebarPanel, bpy.types.Panel):
         row = layout.row(align=True)
         row.operator("stga.duplicate_avatar", icon="DUPLICATE")
         row.operator("stga.duplicate_avatar", text="", icon="LINKED").linked = True
-        if tags.FILMED_CELLS in head:
-            draw_filmed(layout, context, head)
+        if tags.OBSERVED_CELLS in head:
+            draw_coverage(layout, context, head)
 
 
-def draw_filmed(layout: Any, context: Any, head: Any) -> None:
+def draw_coverage(layout: Any, context: Any, head: Any) -> None:
     """Draw from where the head was filmed, and, before it has splats, what to film next: these may
     be of further takes."""
     settings = context.scene.stga
     if not draw_arrow(layout, settings, "show_filmed", "Filmed"):
         return
-    draw_picture(layout, head.name, directions_picture(tuple(head[tags.FILMED_CELLS])))
-    lines = head[tags.FILMED].splitlines()
+    draw_picture(layout, head.name, directions_picture(tuple(head[tags.OBSERVED_CELLS])))
+    lines = head[tags.OBSERVED].splitlines()
     for text in lines if settings.splats is None else lines[:1]:
         draw_text(layout, context, text)
 

@@ -63,9 +63,9 @@ class ShowPanel(SidebarPanel, bpy.types.Panel):
         except StgaError as error:
             layout.label(text=str(error), icon="ERROR")
             return
-        filmed = settings.splats.get(tags.FILMED)
-        if filmed:
-            draw_text(layout, context, filmed.capitalize(), "INFO")
+        sides = settings.splats.get(tags.OBSERVED)
+        if sides:
+            draw_text(layout, context, sides.capitalize(), "INFO")
         lost = splat_object.triangles_hint(settings.splats, context.view_layer.depsgraph)
         if lost:
             draw_text(layout, context, lost, "ERROR")
@@ -196,11 +196,11 @@ def draw_left_out(layout: Any, context: Any) -> None:
     """Say that images lack the set, or show it twice, with the button that changes it."""
     hint = left_out_hint(context.scene)
     if hint:
-        is_shown = shows_set(context.scene)
+        is_visible = shows_set(context.scene)
         draw_text(layout, context, hint, "INFO")
-        text = "Leave Out Set" if is_shown else "Show Set"
+        text = "Leave Out Set" if is_visible else "Show Set"
         button = layout.operator("stga.choose_set", text=text, icon="SCENE_DATA")
-        button.shown = "LEFT_OUT" if is_shown else "SHOWN"
+        button.shown = "LEFT_OUT" if is_visible else "SHOWN"
 
 
 def _pop_up(hint: str) -> None:

@@ -26,7 +26,7 @@ SCALE = 8.0
 
 _previews: Any = None
 """Blender's preview collection: pictures that are not saved in the .blend file."""
-_shown: dict[str, np.ndarray] = {}
+_drawn: dict[str, np.ndarray] = {}
 """Name of a preview -> the picture that it shows."""
 
 
@@ -170,8 +170,8 @@ def draw_curve(layout: Any, folder: Path) -> None:
 
 def draw_picture(layout: Any, name: str, pixels: np.ndarray) -> None:
     """Draw a picture (H, W, 4) float32, from the bottom up; the same array costs nothing again."""
-    if _shown.get(name) is not pixels:
-        _shown[name] = pixels
+    if _drawn.get(name) is not pixels:
+        _drawn[name] = pixels
         _previews.pop(name, None)  # a new one, because Blender keeps the texture of the old one
         preview = _previews.new(name)
         preview.image_size = pixels.shape[1], pixels.shape[0]
@@ -183,4 +183,4 @@ def register(at_end: AtEnd) -> None:
     global _previews
     _previews = bpy.utils.previews.new()
     at_end(bpy.utils.previews.remove, _previews)
-    at_end(_shown.clear)
+    at_end(_drawn.clear)

@@ -210,7 +210,7 @@ def at_rest(limits: np.ndarray) -> np.ndarray:
     return np.asarray(np.clip(np.float32(0), limits[..., 0, :], limits[..., 1, :]))
 
 
-def seen_range(basis: StrainBasis, meshes: Iterable[np.ndarray]) -> np.ndarray:
+def observed_range(basis: StrainBasis, meshes: Iterable[np.ndarray]) -> np.ndarray:
     """Lowest and highest deformation (F, 2, 6) float32 of each triangle in posed meshes (V, 3),
     with a margin.
 

@@ -86,7 +86,7 @@ CANONICAL_NAME = "canonical_flame_param.npz"
 PARAMETERS = "flame_param"
 """Folder of VHAP's FLAME parameters, one file for each timestep."""
 
-OWN_MODELS = ("flame_model.npz", "flame_model.pkl")
+CAPTURE_MODELS = ("flame_model.npz", "flame_model.pkl")
 """Names of a FLAME model file in the folder of a capture, which is used where none is given."""
 BUNDLED_MODEL = "bundled_head.npz"
 """Copy of the head model of this package in the folder of a capture that was tracked with it."""
@@ -539,12 +539,12 @@ def _model_file(root: Path, given: Path | None) -> Path:
     Raises StgaError where there is none: FLAME's license forbids passing it on."""
     if (root / BUNDLED_MODEL).is_file():
         return root / BUNDLED_MODEL
-    beside = (root / name for name in OWN_MODELS)
+    beside = (root / name for name in CAPTURE_MODELS)
     found = given or next((path for path in beside if path.is_file()), None)
     if found is None:
         raise StgaError(
             f"{root}: is tracked with FLAME; give the FLAME model file (.pkl or .npz) with "
             "--flame or in the preferences of the add-on, or put it into the folder as "
-            f"{OWN_MODELS[0]}"
+            f"{CAPTURE_MODELS[0]}"
         )
     return found

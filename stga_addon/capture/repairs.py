@@ -42,7 +42,7 @@ CENTIMETERS = (10.0, 99.0)
 """Extents of a head's mesh, with its shoulders, in centimeters."""
 MILLIMETERS = (100.0, 990.0)
 """Extents of a head's mesh, with its shoulders, in millimeters."""
-MIN_SHOWN = 0.2
+MIN_VISIBLE = 0.2
 """Fraction of the mesh within images, from which mesh and cameras have one unit."""
 Z_UP = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
 """Turns a vertex (x, y, z) with z up to y up."""
@@ -143,7 +143,7 @@ def in_meters(capture: Capture) -> tuple[Capture, str | None]:
 
             meters = _with_vertices(capture, factor * np.eye(3))
             what = "meshes"
-            if _in_images(capture) >= MIN_SHOWN or _in_images(meters) < MIN_SHOWN:
+            if _in_images(capture) >= MIN_VISIBLE or _in_images(meters) < MIN_VISIBLE:
                 what = "meshes and cameras"
                 meters = replace(meters, views=_changed(capture.views, Repair("", scaled), None))
             sentence = f"the neutral mesh measures {size:.3g}: {what} are read as {unit}meters"

@@ -13,8 +13,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..avatar.file import read_avatar
-from ..avatar.filmed import filmed_sides
-from ..capture.filmed import filmed
+from ..avatar.observed import observed_sides
+from ..capture.coverage import capture_coverage
 from ..capture.model import Capture, summarize_capture
 from ..capture.open import has_mesh_files, is_capture, needs_no_flame, open_capture
 from ..capture.other_input import other_input
@@ -399,9 +399,9 @@ def _info(options: Namespace, head: OpenHead | None) -> None:
         if avatar.light:
             light = describe_light(avatar.light)
         rows = [("splats", f"{len(avatar.splats)}, {len(avatar.faces)} triangles")]
-        sides = filmed_sides(avatar)
+        sides = observed_sides(avatar)
         rows += [("sides", sides)] if sides else []
-        rows += _filmed_by_take(path, options.flame)
+        rows += _coverage_by_take(path, options.flame)
         rows += [(name, text.strip()) for name, _, text in (line.partition(":") for line in light)]
         print(*format_table(rows), sep="\n")
         return
@@ -419,7 +419,7 @@ def _info(options: Namespace, head: OpenHead | None) -> None:
     found: Any = carry_out(request, with_bar=False)
     capture = open_capture(path, request.flame, request.principal_point)
     rows = summarize_capture(capture)
-    rows.append(("filmed", filmed(capture).text))
+    rows.append(("filmed", capture_coverage(capture).text))
     lens = describe_focal_length(capture.root)
     rows += [("focal length", lens)] if lens else []
     print(*format_table(rows), sep="\n")
@@ -429,7 +429,7 @@ def _info(options: Namespace, head: OpenHead | None) -> None:
         print("", *format_table(describe_effects(found.plan)), sep="\n")
 
 
-def _filmed_by_take(run: Path, flame: Path | None) -> list[tuple[str, str]]:
+def _coverage_by_take(run: Path, flame: Path | None) -> list[tuple[str, str]]:
     """What each take of a run filmed; nothing of an avatar file, or where a capture has gone."""
     if not has_run(run):
         return []
@@ -439,7 +439,7 @@ def _filmed_by_take(run: Path, flame: Path | None) -> list[tuple[str, str]]:
         return [("takes", f"unknown ({error})")]
     names = [f"take {number + 1}" if len(takes) > 1 else "filmed" for number in range(len(takes))]
     return [
-        (name, f"{take.root.name}: {filmed(take).text}")
+        (name, f"{take.root.name}: {capture_coverage(take).text}")
         for name, take in zip(names, takes, strict=True)
     ]
 

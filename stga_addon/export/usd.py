@@ -17,7 +17,7 @@ from ..files import check_encodable, replacing
 from ..worker.helpers import claim_stdout
 from ..worker.launch import start_piped
 from ..worker.messages import receive, send
-from ..worker.training_python import own_python
+from ..worker.training_python import this_python
 from .ply import SplatFrames
 
 PRIM_TYPE = "ParticleField3DGaussianSplat"
@@ -59,7 +59,7 @@ def write_usd(
     check_encodable(path)
     usd = find_usd()
     if usd is None and not python:
-        raise _lacks_usd(path, f"{own_python()} lacks")
+        raise _lacks_usd(path, f"{this_python()} lacks")
     with replacing(path) as partial:
         if usd is not None:
             _write_file(usd, partial, path, frames, fps, moving_color)
@@ -132,7 +132,7 @@ def _write_elsewhere(
         stdout = cast(BinaryIO, process.stdout)
         try:
             if not _answer(python, stdout)[HAS_USD]:
-                raise _lacks_usd(path, f"neither {own_python()} nor {python} has")
+                raise _lacks_usd(path, f"neither {this_python()} nor {python} has")
             with suppress(BrokenPipeError):  # it has ended, and said why
                 for number, world in frames:
                     send(stdin, {NUMBER: number, **vars(world)})

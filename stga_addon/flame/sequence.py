@@ -325,9 +325,7 @@ def motion_arrays(sequence: FlameSequence, dtype: DTypeLike = np.float64) -> dic
 def _frame(path: Path, arrays: Arrays, model: FlameModel) -> FlameFrame:
     sizes = dict.fromkeys(FRAME_FIELDS, 3) | {"expr": model.n_expression, "eyes_pose": 6}
     turns = {name: arrays[name] for name in JOINT_COUNTS if name in arrays}
-    plain = dict(arrays) | {
-        name: _axis_angles(path, name, rotation) for name, rotation in turns.items()
-    }
+    plain = dict(arrays) | {name: _axis_angles(path, name, turn) for name, turn in turns.items()}
     values = {name: _vector(path, plain, name, size) for name, size in sizes.items()}
     offset = _offset(path, arrays, "dynamic_offset", len(model.v_template))
     return FlameFrame(**values, dynamic_offset=offset)

@@ -9,7 +9,7 @@ from importlib import import_module
 from pkgutil import walk_packages
 
 from ..errors import StgaError
-from ..raster.kernel_cache import OWN_KERNELS
+from ..raster.kernel_cache import NATIVE_KERNELS
 from ..worker.launch import PREPARING, cache_folder
 from ..worker.lock import hold_folder
 
@@ -40,7 +40,7 @@ def load_ahead() -> None:
 def compile_ahead() -> None:
     """Compile Numba's kernels and the bytecode of an extension's packages for the first training on
     this machine; no effect while another process does, or without room."""
-    os.environ[OWN_KERNELS] = "1"
+    os.environ[NATIVE_KERNELS] = "1"
     with suppress(OSError, StgaError), hold_folder(cache_folder(), PREPARING, "preparation"):
         from ..raster.cpu.precompile import rasterizer_helper
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from ..avatar.file import Avatar
-from ..avatar.filmed import filmed_avatar
+from ..avatar.observed import observed_part
 from ..capture.camera import Camera
 from ..capture.model import Capture
 from ..driving.head_map import page_controls
@@ -131,7 +131,7 @@ def export(request: Export, report: Report, log: Log) -> Written:
     """Write the file or the folder. Says how much room several frames take; raises StgaError."""
     avatar, capture = avatar_source.open_avatar(request)
     if request.filmed_only:
-        avatar = filmed_avatar(avatar_source.avatar_path(request.source), avatar)
+        avatar = observed_part(avatar_source.avatar_path(request.source), avatar)
     if request.albedo:
         avatar = albedo_avatar(avatar)
     if request.motion is not None:

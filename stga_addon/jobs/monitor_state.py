@@ -36,7 +36,7 @@ class RequestState:
     snapshot        the worker's status as last read
     files           of a run, as last seen
     result_shown    the result has reached the scene, or never will
-    shown_capture, shown_preview   stamps of the capture and the preview that were loaded last
+    displayed_capture, displayed_preview   stamps of those that were loaded last
     loading         what is being read, or put into the scene: an avatar file, or the folder of the
                     request
     building        it is being built in slices
@@ -50,8 +50,8 @@ class RequestState:
     snapshot: WorkerSnapshot = field(default_factory=WorkerSnapshot)
     files: RunFiles = field(default_factory=RunFiles)
     result_shown: bool = False
-    shown_capture: Stamp | None = None
-    shown_preview: Stamp | None = None
+    displayed_capture: Stamp | None = None
+    displayed_preview: Stamp | None = None
     loading: Path | None = None
     building: bool = False
     error: str = ""
@@ -165,7 +165,7 @@ class SliceBuilt:
 
 
 @dataclass(frozen=True)
-class Shown:
+class Displayed:
     """What was loaded is in the scene. undoable: with a change that deserves an undo step."""
 
     undoable: bool = False
@@ -187,7 +187,7 @@ Event = (
     | StatusRead
     | SceneFree
     | SliceBuilt
-    | Shown
+    | Displayed
     | Failed
 )
 
@@ -219,7 +219,7 @@ class LoadAvatar(_OnPath):
 
 
 class Show(_OnPath):
-    """Put what was loaded and read into the scene; answered by SliceBuilt, Shown or Failed."""
+    """Put what was loaded and read into the scene; answered by SliceBuilt, Displayed or Failed."""
 
 
 class ReadCurve(_OnPath):
@@ -283,7 +283,7 @@ def transition(state: RequestState, event: Event) -> Outcome:
             return state, () if state.loading is None else (Show(state.loading),)
         case SliceBuilt():
             return replace(state, building=True), ()
-        case Shown(undoable):
+        case Displayed(undoable):
             return _loading_ended(state, undoable)
         case Failed(sentence, stops=True):
             state = replace(state, error=sentence, stopped=True, loading=None, building=False)
@@ -345,9 +345,9 @@ def _status_read(state: RequestState, event: StatusRead) -> Outcome:
             )
         return state, tuple(effects)
     # the tracked capture, the trained avatar, or a preview of it, once each
-    if files.capture not in (None, state.shown_capture) and (is_alive or state.has_result):
+    if files.capture not in (None, state.displayed_capture) and (is_alive or state.has_result):
         tracked = state.place / CAPTURE_FOLDER
-        return replace(state, loading=tracked, shown_capture=files.capture), tuple(effects)
+        return replace(state, loading=tracked, displayed_capture=files.capture), tuple(effects)
     if state.has_result:
         effects.append(StoreAvatar(state.run / AVATAR))
         if event.show_result:
@@ -355,8 +355,8 @@ def _status_read(state: RequestState, event: StatusRead) -> Outcome:
         else:
             state = replace(state, result_shown=True)
             effects.extend(_stored(state))
-    elif is_alive and event.live_preview and files.preview not in (None, state.shown_preview):
-        state = replace(state, loading=event.folder / PREVIEW, shown_preview=files.preview)
+    elif is_alive and event.live_preview and files.preview not in (None, state.displayed_preview):
+        state = replace(state, loading=event.folder / PREVIEW, displayed_preview=files.preview)
     if state.loading is not None:
         effects.append(LoadAvatar(state.loading))
     return state, tuple(effects)

@@ -232,7 +232,7 @@ KINDS = {
     ),
 }
 STORED, TRAINS, TRANSIENT = (
-    {kind for kind, shown in KINDS.items() if getattr(shown, name)}
+    {kind for kind, request in KINDS.items() if getattr(request, name)}
     for name in ("is_stored", "trains", "is_transient")
 )
 DISMISSIBLE = set(KINDS) - TRANSIENT

@@ -9,7 +9,7 @@ from ..worker.launch import BUNDLED, KERNELS, cache_folder
 
 LAST_COMPILED = Path(__file__).with_name("cpu") / "image_loss.py"
 """Module of a kernel that takes long to compile; its index file shows that kernels are compiled."""
-OWN_KERNELS = "STGA_OWN_KERNELS"
+NATIVE_KERNELS = "STGA_OWN_KERNELS"
 """Environment variable of a process that compiles for its own processor (`cpu.bundled`)."""
 
 

@@ -38,7 +38,7 @@ BEHIND = 0.0, 1.0
 MAX_SRGB = 1.12  # Largest value that is shown natively (`scene.display.splat_nodes`)
 
 
-class _Seen(NamedTuple):
+class _PosedView(NamedTuple):
     """A view of an avatar: frames of its triangles without their color, colors (N, 3) of the splats
     with it, sRGB; gray behind it, and the picture as trained (3, H, W), sRGB."""
 
@@ -62,7 +62,9 @@ def fit_linear(avatar: Avatar, capture: Capture, report: Report = ignore) -> np.
         view = chosen[index]
         camera = view.camera
         camera = camera.scaled(min(1.0, MAX_SIDE_PX / max(camera.width, camera.height)))
-        posed_views.append(_seen(avatar, capture.mesh(view.timestep), camera, BEHIND[place % 2]))
+        posed_views.append(
+            _posed_view(avatar, capture.mesh(view.timestep), camera, BEHIND[place % 2])
+        )
     change = np.zeros((len(avatar.splats), 4), np.float32)
     mean = np.zeros_like(change)
     square = np.zeros_like(change)
@@ -81,17 +83,19 @@ def fit_linear(avatar: Avatar, capture: Capture, report: Report = ignore) -> np.
     return np.column_stack([avatar.splats.sh[:, 0], avatar.splats.opacity]) + change
 
 
-def _seen(avatar: Avatar, mesh: np.ndarray, camera: Camera, behind: float) -> _Seen:
+def _posed_view(avatar: Avatar, mesh: np.ndarray, camera: Camera, behind: float) -> _PosedView:
     frames = avatar.frames(mesh)
     world = to_world(avatar.splats, frames)
     direction = unit(world.xyz - camera.position.astype(np.float32))
     picture = render(avatar.splats, camera, (behind,) * 3, frames, avatar.antialiased)
     colorless = replace(frames, color=NO_COLUMNS)
     fine = frames_in_camera(colorless, camera.scaled(FINENESS))
-    return _Seen(fine, sh_color(world.sh, direction), behind, picture)
+    return _PosedView(fine, sh_color(world.sh, direction), behind, picture)
 
 
-def _gradient(avatar: Avatar, change: np.ndarray, view: _Seen, buffers: BufferPool) -> np.ndarray:
+def _gradient(
+    avatar: Avatar, change: np.ndarray, view: _PosedView, buffers: BufferPool
+) -> np.ndarray:
     """(N, 4) of half the mean squared difference of a view blended in linear light from its
     picture, in display values, by the change of colors and logits."""
     splats = avatar.splats

@@ -55,7 +55,7 @@ def evaluated_vertices(obj: Any) -> np.ndarray:
             evaluated_object.to_mesh_clear()
 
 
-def own_vertices(head: Any) -> np.ndarray:
+def head_vertices(head: Any) -> np.ndarray:
     """(V, 3) float32 of a head's own vertices as `evaluated_vertices`, also where modifiers divide
     its triangles or add others. Raises StgaError where they replace them."""
     neutral = head.data

@@ -105,17 +105,17 @@ def place_beside(head: Any, others: Iterable[Any]) -> None:
 def open_sidebar(tab: str, screens: Iterable[Any]) -> bool:
     """Open the viewports' sidebar at a tab; whether they show it: Blender knows a sidebar's tabs
     only once it was drawn, so call it until it returns True."""
-    is_shown = True
+    is_open = True
     for area in viewports(screens):
         area.spaces.active.show_region_ui = True
         sidebar = next(region for region in area.regions if region.type == "UI")
         with suppress(AttributeError, TypeError):  # not drawn yet
             sidebar.active_panel_category = tab
-        is_shown &= sidebar.active_panel_category == tab
-    return is_shown
+        is_open &= sidebar.active_panel_category == tab
+    return is_open
 
 
-def shown_screens() -> list[Any]:
+def window_screens() -> list[Any]:
     """The screens of all windows."""
     return [window.screen for window in bpy.context.window_manager.windows]
 

@@ -279,18 +279,18 @@ def look_through(scene: Any, camera: Any) -> None:
     """Give the scene a camera of `import_cameras`, and its image size; `look_away` takes the size
     back."""
     render = scene.render
-    if tags.OWN_RESOLUTION not in scene or not _has_camera_size(scene):
-        scene[tags.OWN_RESOLUTION] = [render.resolution_x, render.resolution_y]
+    if tags.SCENE_RESOLUTION not in scene or not _has_camera_size(scene):
+        scene[tags.SCENE_RESOLUTION] = [render.resolution_x, render.resolution_y]
     scene.camera = camera
     render.resolution_x, render.resolution_y = camera[tags.IMAGE_SIZE]
 
 
 def look_away(scene: Any) -> None:
     """Give the scene its own resolution again, unless it has been changed meanwhile."""
-    resolution = scene.get(tags.OWN_RESOLUTION)
+    resolution = scene.get(tags.SCENE_RESOLUTION)
     if resolution is not None and _has_camera_size(scene):
         scene.render.resolution_x, scene.render.resolution_y = resolution
-    scene.pop(tags.OWN_RESOLUTION, None)
+    scene.pop(tags.SCENE_RESOLUTION, None)
 
 
 def _has_camera_size(scene: Any) -> bool:

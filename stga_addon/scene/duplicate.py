@@ -14,7 +14,7 @@ from .avatar_scene import place_beside
 from .compat import assign_action, slot_of
 from .display.splat_object import splat_modifier
 from .evaluation import kept_evaluated
-from .objects import COLLECTIONS, layers_of, mover_of, own_collections
+from .objects import COLLECTIONS, collections_of, layers_of, mover_of
 
 COPIED = (tags.HEAD, tags.RIG, tags.SPLATS)
 """Kinds of object below the Empty that a copy of an avatar has: no cameras."""
@@ -27,7 +27,7 @@ def duplicate_avatar(head: Any, linked: bool) -> Any:
 
     linked: whether both play the same keyframes. Raises StgaError where the head cannot be copied.
     """
-    root = _own_root(head)
+    root = _local_root(head)
     scene = bpy.context.scene
     if scene.objects.get(head.name) is not head:
         raise StgaError(
@@ -49,7 +49,7 @@ def duplicate_avatar(head: Any, linked: bool) -> Any:
     return new_head
 
 
-def _own_root(head: Any) -> Any:
+def _local_root(head: Any) -> Any:
     """The Empty that holds an avatar's parts. Raises StgaError without one, or for a linked one."""
     root = mover_of(head)
     if root is head or root.library is not None:
@@ -105,7 +105,7 @@ def _collect(family: list[Any], copies: list[Any]) -> None:
     # which cannot be copied
     made = {scene.collection: scene.collection for scene in bpy.data.scenes}
     for original, copy in zip(family, copies, strict=True):
-        for collection in own_collections(original):
+        for collection in collections_of(original):
             if collection not in made:
                 kind = collection.get(tags.KIND)
                 name = f"{new_root.name} {COLLECTIONS[kind]}" if kind else new_root.name
@@ -130,7 +130,7 @@ def _parent_of(collection: Any) -> Any:
 def attach_to_bone(head: Any, armature: Any, bone: str) -> None:
     """Let an avatar ride on a bone of another armature, from where it is now; it keeps its own
     neck. bone "": let it go where it is. Raises StgaError."""
-    root = _own_root(head)
+    root = _local_root(head)
     with kept_evaluated([armature]):
         _attach(root, armature, bone)
 

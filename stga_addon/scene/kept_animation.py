@@ -123,7 +123,7 @@ def keep_animation(owner: Any) -> KeptAnimation:
     held = dict[str, float]()
     for strip in holding if holding and owner.id_type == "KEY" else ():
         held |= {each.data_path: each.evaluate(0) for each in strip_curves(strip)}
-    own_rows = 1 + bool(holding)
+    imported_rows = 1 + bool(holding)
     kept = []
     lost = list[str]()
     blend = 0.0
@@ -131,10 +131,10 @@ def keep_animation(owner: Any) -> KeptAnimation:
     for row, track in enumerate(tracks):
         strips = []
         for strip in _clips(track.strips, lost):
-            is_own = row < own_rows and _is_of_import(strip.action, owner)
-            if not is_own or is_made_by_hand(strip.action):
+            is_imported = row < imported_rows and _is_of_import(strip.action, owner)
+            if not is_imported or is_made_by_hand(strip.action):
                 strip.action.use_fake_user = True
-            if is_own:
+            if is_imported:
                 blend = max(blend, strip.blend_out)
                 added = added or _copy_if_added(strip.action, slot_of(strip))
                 continue

@@ -90,14 +90,14 @@ class SceneLayer:
             frames = replace(frames, color=NO_COLUMNS)
         visible = 1 / (1 + np.exp(-splats.opacity)) >= settings.opacity_threshold
         visible &= random_percentage(len(splats)) < settings.percentage
-        for faces, is_shown, is_hidden, paint in (
+        for faces, is_painted, is_hidden, paint in (
             (self.frozen, settings.show_selection, settings.selected_only, FROZEN_COLOR_SRGB),
             (self.unseen, settings.show_unseen, settings.filmed_only, UNSEEN_COLOR_SRGB),
         ):
             if faces is None:
                 continue
             rows = faces[splats.face]
-            if is_shown:
+            if is_painted:
                 sh = splats.sh.copy()
                 sh[rows] = 0
                 sh[rows, 0] = (np.array(paint) - 0.5) / SH_C0

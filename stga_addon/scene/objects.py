@@ -60,7 +60,7 @@ COLLECTIONS = {tags.RIG: "bones", tags.CAMERA: "cameras"}
 """Kinds of object that have a collection of their own, so that they can be hidden together."""
 
 
-def own_collections(thing: Any) -> list[Any]:
+def collections_of(thing: Any) -> list[Any]:
     """The collections that an object is in, without those of sets, which follow their scenes."""
     return [each for each in thing.users_collection if each.get(tags.KIND) != tags.SET]
 
@@ -77,7 +77,7 @@ def objects_of_images(layer: Any) -> Iterator[Any]:
 
 def collection_of(root: Any, kind: str) -> Any:
     """The collection of the root's objects of this kind; None where none was placed yet."""
-    collection = own_collections(root)[0]
+    collection = collections_of(root)[0]
     if kind not in COLLECTIONS:
         return collection
     return next((child for child in collection.children if child.get(tags.KIND) == kind), None)
@@ -116,7 +116,7 @@ def place(root: Any, kind: str, name: str, data: Any, existing: Any = None) -> A
         if collection is None:
             collection = bpy.data.collections.new(f"{root.name} {COLLECTIONS[kind]}")
             collection[tags.KIND] = kind
-            own_collections(root)[0].children.link(collection)
+            collections_of(root)[0].children.link(collection)
         collection.objects.link(obj)
         obj.parent = root
         if kind != tags.CAMERA:
@@ -220,7 +220,7 @@ def set_frames_per_second(scene: Any, rate: float) -> None:
     scene.render.fps_base = whole / rate
 
 
-def own_scenes() -> list[Any]:
+def local_scenes() -> list[Any]:
     """The scenes of the open file that are not linked."""
     return [scene for scene in bpy.data.scenes if scene.library is None]
 
@@ -241,7 +241,7 @@ class Identity:
         if found is None or found.session_uid != self.uid:
             found = next((each for each in blocks if each.session_uid == self.uid), None)
         # A deleted object stays in the file as long as a panel's property points to it.
-        if found is None or not (self._is_scene or own_collections(found)):
+        if found is None or not (self._is_scene or collections_of(found)):
             return None
         self.name = found.name
         return found
@@ -262,7 +262,7 @@ class SceneView:
         self._layer = context.view_layer.name
 
     @contextmanager
-    def shown(self) -> Iterator[Any]:
+    def in_context(self) -> Iterator[Any]:
         """The scene, which is that of `bpy.context` in the block, whatever the window shows. Raises
         StgaError where scene or view layer is gone."""
         scene = self.scene.get()

@@ -20,11 +20,11 @@ IMAGE_SIZE = "stga_image_size"  # on a camera: width, height in pixels
 PIXEL_ASPECT = "stga_pixel_aspect"  # on a camera: fl_x / fl_y, the height of a pixel over its width
 CONVENTION = "stga_convention"  # on splats that follow a head: `Avatar.convention`
 ANTIALIASED = "stga_antialiased"  # on splats that follow a head: `Avatar.antialiased`
-# on splats that follow a head: `avatar.filmed.filmed_sides`; on the head: lines of
-# `capture.filmed.Filmed`, its text and its next take
-FILMED = "stga_filmed"
-FILMED_CELLS = "stga_filmed_cells"  # on the head: `capture.filmed.Filmed.cells`
-SHOWN_UNSEEN = "stga_shown_unseen"  # on the head: its first avatar has shown what is not filmed
+# on splats that follow a head: `avatar.observed.observed_sides`; on the head: lines of
+# `capture.coverage.CaptureCoverage`, its text and its next take
+OBSERVED = "stga_filmed"
+OBSERVED_CELLS = "stga_filmed_cells"  # on the head: `capture.coverage.CaptureCoverage.cells`
+UNSEEN_DISPLAYED = "stga_shown_unseen"  # on the head: its first avatar has shown what is not filmed
 REVISION = "stga_revision"  # on a splat object's mesh: changes whenever splats are written into it
 RELIT_FRAME = "stga_relit_frame"  # on that mesh: the frame in whose light other engines show it
 AVATAR = "stga_avatar"  # on the head: the file of the avatar that it wears
@@ -40,7 +40,7 @@ HELD = "stga_held"  # on an action: the part of the capture's motion that is hel
 SET = "stga_set"  # on a scene: the scene that renders its set, `render.film_set`
 # on a scene: its depth pass is on for its set alone; on splats: the shadow of their head is
 ON_FOR_SET = "stga_on_for_set"
-OWN_RESOLUTION = "stga_own_resolution"  # on a scene, while a capture's camera is looked through
+SCENE_RESOLUTION = "stga_own_resolution"  # on a scene, while a capture's camera is looked through
 
 # Kinds of object.
 ROOT = "root"

@@ -41,7 +41,7 @@ MIN_SHADING = 0.2
 """Least factor of the light on a texture."""
 MAX_SHADING = 4.0
 """Largest factor of the light on a texture."""
-OWN_VIEW_PRIOR = 6.0
+ALL_CAMERAS_PRIOR = 6.0
 """Observations by all cameras that weigh as much as a camera's own: skin shines differently to each
 side."""
 MAX_DEVIATION_LEVELS = 60.0
@@ -361,7 +361,7 @@ def average_texture(samples: Sequence[Sample]) -> Texture:
         by_camera[name] = []
         for level, every in enumerate(values):
             mean = _robust_mean([lit[row][level] for row in rows], weight[rows], every)
-            mean = (fraction * mean + OWN_VIEW_PRIOR * every) / (fraction + OWN_VIEW_PRIOR)
+            mean = (fraction * mean + ALL_CAMERAS_PRIOR * every) / (fraction + ALL_CAMERAS_PRIOR)
             by_camera[name].append(mean)
     return Texture(by_camera, lights, trust)
 

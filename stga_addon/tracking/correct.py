@@ -216,9 +216,6 @@ def _landmarks(
     footage = replace(footage, cameras=by_name)
     found = read_landmarks(footage, out / LANDMARKS_FOLDER)
     check_count(found, places)
-    if not any(
-        landmarks.confidence.any() and landmarks.confidence[:, used].any()
-        for landmarks in found.values()
-    ):
+    if not any(each.confidence.any() and each.confidence[:, used].any() for each in found.values()):
         raise StgaError(f"{out / LANDMARKS_FOLDER}: has no landmarks of a face")
     return places, used, footage, found

@@ -14,8 +14,8 @@ from ..flame.model import EYEBALL_WEIGHT, JOINTS, FlameModel
 from ..flame.quaternions import unit
 from .face_networks import FIRST_IRIS_POINT, IRIS_CENTERS, MESH_POINTS, FaceNetworks
 from .fit import MIN_LANDMARKS, Triangulation, triangulate
+from .observed_surface import large_parts
 from .posed_points import SurfacePoints
-from .seen_surface import large_parts
 
 SKIN_RGB = np.array([0.78, 0.58, 0.48])
 """Color of the drawn head."""

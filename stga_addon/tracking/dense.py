@@ -240,9 +240,7 @@ def _solved_part(
             before = after
     names = ("values", "matrix", "right", "misfit", "missed", "better")
     order = -1 if settled else 1
-    return {
-        name: np.stack([getattr(solution, name) for solution in solved[::order]]) for name in names
-    }
+    return {name: np.stack([getattr(each, name) for each in solved[::order]]) for name in names}
 
 
 class _Solver:
@@ -297,9 +295,7 @@ class _Solver:
             best = self._descended(shot, shot.start, visible, START_STEPS)
             best, visible = self._refined(shot, best)
         by_images = np.where(shot.by_landmarks[self.head.region], 0.0, visible)
-        old, new = (
-            self._evidence(shot, parameters, by_images) for parameters in (shot.start, best)
-        )
+        old, new = (self._evidence(shot, each, by_images) for each in (shot.start, best))
         better = self._is_better(old, new)
         if better:
             matrix, right, _ = self._terms(shot, best, visible, 0)
@@ -321,9 +317,7 @@ class _Solver:
         values = shot.start + np.mean(moves, axis=0)
         visible = self.head.visibility(values, shot.views)
         values = self._descended(shot, values, visible, CARRIED_STEPS)
-        misfit, old = (
-            self._evidence(shot, parameters, visible) for parameters in (values, shot.start)
-        )
+        misfit, old = (self._evidence(shot, each, visible) for each in (values, shot.start))
         typical = np.maximum(before[1].misfit, after[1].misfit)
         is_typical = (misfit.regions <= CARRIED_FACTOR * typical).all()
         if not (is_typical and self._is_better(old, misfit)):
@@ -352,9 +346,7 @@ class _Solver:
         missed = [self._missed(shot.landmarks, parameters) for parameters in both]
         for region in range(len(REGIONS)):
             use = (self.head.landmark_region == region) & (shot.landmarks.weight > 0)
-            before, after = (
-                float(np.median(distances[use])) if use.any() else 0.0 for distances in missed
-            )
+            before, after = (float(np.median(miss[use])) if use.any() else 0.0 for miss in missed)
             unproven = new[region] > (1 - MIN_REGION_GAIN) * old[region]
             astray[region] = unproven and after > MAX_MISS_FACTOR * before + SMALL_MISS_M
             astray[region] |= region >= UPPER_FACE and after > before + MAX_UPPER_MISS_M

@@ -15,14 +15,14 @@ from . import appearance
 from .appearance import Sample, Texture, Views
 from .fit import RecordedTake
 from .head_model import HeadModel
-from .posed_points import PosedPoints, head_rotation, split
-from .seen_surface import (
+from .observed_surface import (
     VisiblePoints,
     in_sight,
     large_parts,
     rounded_direction,
     surface_points,
 )
+from .posed_points import PosedPoints, head_rotation, split
 from .solve import prior_terms
 
 HEAD_POINTS = 5000
@@ -221,16 +221,14 @@ class DenseHead:
         basis = self.light_basis(values, level)
         rows = self.rows[level]
         for view, visibility in zip(views, visible, strict=True):
-            pyramid_level = view.levels[level]
-            pixels, depth = pyramid_level.camera.project(at)
-            within = appearance.inside(pyramid_level.camera, pixels, depth)
+            image = view.levels[level]
+            pixels, depth = image.camera.project(at)
+            within = appearance.inside(image.camera, pixels, depth)
             weight = visibility[rows] * self._texture.trust[rows] * within
             near = np.flatnonzero(weight)
             if not len(near):
                 continue
-            channels, *slopes = appearance.sampled(
-                [pyramid_level.channels, *pyramid_level.gradient], pixels[near]
-            )
+            channels, *slopes = appearance.sampled([image.channels, *image.gradient], pixels[near])
             known = self._texture.values[view.key][level][rows[near]], basis[near], weight[near]
             lit = appearance.relit(channels, *known, self._texture.lights[view.key])
             residual = (channels - lit) / appearance.NOISE_LEVELS
@@ -241,9 +239,7 @@ class DenseHead:
             pairs = (by_x, by_x), (by_x, by_y), (by_y, by_y), (by_x, residual), (by_y, residual)
             sums = ((one * other) @ appearance.CHANNEL_WEIGHTS for one, other in pairs)
             xx, xy, yy, x, y = ((used * pair_sum)[:, None] for pair_sum in sums)
-            of_x, of_y = appearance.projection_derivative(pyramid_level.camera, at[near]).swapaxes(
-                0, 1
-            )
+            of_x, of_y = appearance.projection_derivative(image.camera, at[near]).swapaxes(0, 1)
             along_x = xx * of_x + xy * of_y
             along_y = xy * of_x + yy * of_y
             matrix[near] += of_x[:, :, None] * along_x[:, None]
@@ -262,10 +258,10 @@ class DenseHead:
         weights = np.zeros(len(REGIONS))
         for view, visibility in zip(views, visible, strict=True):
             weight = visibility[rows] * self._texture.trust[rows]
-            pyramid_level = view.levels[level]
-            pixels, depth = pyramid_level.camera.project(at)
-            inside = appearance.inside(pyramid_level.camera, pixels, depth)
-            (found,) = appearance.sampled([pyramid_level.channels], pixels)
+            image = view.levels[level]
+            pixels, depth = image.camera.project(at)
+            inside = appearance.inside(image.camera, pixels, depth)
+            (found,) = appearance.sampled([image.channels], pixels)
             known = self._texture.values[view.key][level][rows], basis, weight * inside
             lit = appearance.relit(found, *known, self._texture.lights[view.key])
             residual = (found - lit) / appearance.NOISE_LEVELS

@@ -67,14 +67,14 @@ class Triangulation:
     information  (N, 3, 3) weighted mean over the rays of I − d dᵀ: (x − position)ᵀ information (x −
                  position) is the mean squared distance of x from the rays, up to a constant
     residual     (N,) median distance of the rays from `position`, 0 where there is none
-    seen         (N,) bool: by two cameras at least, or by the only one
+    observed     (N,) bool: by two cameras at least, or by the only one
     eye          (3,) position of the only camera; None of several
     """
 
     position: np.ndarray
     information: np.ndarray
     residual: np.ndarray
-    seen: np.ndarray
+    observed: np.ndarray
     eye: np.ndarray | None = None
 
 
@@ -361,7 +361,7 @@ def observed_landmarks(
     values, vectors = np.linalg.eigh(world.rotation @ found.information @ world.rotation.T)
     root = (vectors * np.sqrt(np.maximum(values, 0))[:, None, :]) @ vectors.swapaxes(1, 2)
     residuals = np.minimum(found.residual * world.scale / RESIDUAL_SCALE_M, MAX_RESIDUALS)
-    weight = np.where(found.seen & reliable, np.exp(-(residuals**2)), 0.0)
+    weight = np.where(found.observed & reliable, np.exp(-(residuals**2)), 0.0)
     eye = None if found.eye is None else world.apply(found.eye)
     return Observation(world.apply(found.position), root, weight, eye)
 
@@ -382,7 +382,7 @@ def _alignments(
     head's size gives their scale."""
     neutral = take.places.on(head.model.v_template, head.model.faces)
     found = [triangulated(take.landmarks[t], take.reliable, neutral, 1.0) for t in timesteps]
-    used = [one.seen & take.reliable for one in found]
+    used = [one.observed & take.reliable for one in found]
     pairs = zip(found, used, strict=True)
     return [similarity(one.position[use], neutral[use], metric) for one, use in pairs]
 

@@ -51,7 +51,7 @@ def with_gaze(
     half of what they do. is_stranger: the model's eyeballs may be some millimeters off, which turns
     each eye all the time: where they converge least, they are taken to look in parallel. What both
     do alike is kept as far as it is gaze rather than such an error (`_constant_gaze`); what is
-    removed, a warning says. Landmarks of a known person are corrected (`without_own_bias`).
+    removed, a warning says. Landmarks of a known person are corrected (`without_measured_bias`).
     """
     model = fit.head.model
     on_eyeball = (model.weights[model.faces] > EYEBALL_WEIGHT).all(axis=1)[take.places.face]

@@ -62,7 +62,9 @@ def cameras_of(capture: Capture) -> dict[int, Camera]:
     return {view.camera_index: found[view.camera_index] for view in views[:1]}
 
 
-def without_own_bias(take: RecordedTake, person: KnownPerson, workers: Workers) -> RecordedTake:
+def without_measured_bias(
+    take: RecordedTake, person: KnownPerson, workers: Workers
+) -> RecordedTake:
     """The take, each camera's landmarks corrected by the networks' bias: how far, in the median,
     they are off in pictures of the avatar, drawn with fitted heads as the camera sees them.
 

@@ -88,9 +88,7 @@ def detect_landmarks(
                 for faces in part
             ]
             several = [
-                t
-                for t, in_frame in zip(camera.timesteps, detected, strict=True)
-                if len(in_frame) > 1
+                t for t, each in zip(camera.timesteps, detected, strict=True) if len(each) > 1
             ]
             if len(camera.timesteps) == 1:
                 crowded += [(camera, timestep) for timestep in several]
@@ -100,7 +98,7 @@ def detect_landmarks(
                     f"{len(camera.timesteps)} frames with two faces, the first at timestep "
                     f"{several[0]}; expected one person"
                 )
-            faces = [in_frame[0] if len(in_frame) == 1 else None for in_frame in detected]
+            faces = [each[0] if len(each) == 1 else None for each in detected]
             number = next((len(face) for face in faces if face is not None), 0)
             points = [
                 np.zeros((number, 2)) if face is None else unbiased(face, camera.camera)

@@ -142,7 +142,7 @@ def with_mattes(
         found = workers.map(_write_mattes, work, (Stage.MATTES, done, total))
         done += len(left)
         workers.report(Stage.MATTES, done, total)
-        known = {t: is_seen for part in found for t, is_seen in part.items()}
+        known = {t: is_recognized for part in found for t, is_recognized in part.items()}
         unseen += [f"{camera.name} at timestep {t}" for t in left if not known.get(t, True)]
         mattes = {t: file for t, file in files.items() if t in kept or t in known}
         cameras.append(replace(camera, mattes=mattes))

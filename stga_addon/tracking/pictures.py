@@ -24,7 +24,7 @@ SIZE = 256
 """Width and height of a picture in pixels: Blender's icons are square."""
 FIRST_CAMERAS = 3
 """Cameras in the picture of the first frame's fit, at most."""
-SHOWN_FRAMES = 4
+PICTURE_FRAMES = 4
 """Frames of a picture at most, two in each direction."""
 COLUMNS = 4
 """Views side by side on the contact sheet."""
@@ -110,8 +110,8 @@ def picture_of_first_frame(
 def picture_of_fit(fit: HeadFit, footage: Footage) -> dict[str, np.ndarray]:
     """The head on a few of the frames that it was fitted to, black beyond an image, and its mesh in
     the first of them: `rgb`, `vertices` and `faces`."""
-    timesteps = evenly_spread(sorted(fit.parameters), SHOWN_FRAMES)
-    columns = 2 if len(timesteps) == SHOWN_FRAMES else 1
+    timesteps = evenly_spread(sorted(fit.parameters), PICTURE_FRAMES)
+    columns = 2 if len(timesteps) == PICTURE_FRAMES else 1
     side = SIZE // columns
     faces = fit.head.model.faces
     picture = np.zeros((SIZE, SIZE, 3), np.uint8)

@@ -15,17 +15,17 @@ from ..worker.helpers import Step
 from . import fit as head_fit
 from .fit import HeadFit, RecordedTake, posed_mesh
 from .head_model import HeadModel
-from .posed_points import PosedPoints, SurfacePoints, head_rotation, split
-from .seen_surface import (
-    SeenSurface,
+from .observed_surface import (
+    ObservedSurface,
     SurfaceSearch,
     Sweep,
     VisiblePoints,
     near_landmarks,
+    observed_surface,
     outlines_agree,
-    seen_surface,
     surface_points,
 )
+from .posed_points import PosedPoints, SurfacePoints, head_rotation, split
 from .solve import LANDMARK_SIGMA_M, Observation, person, solve_identity, solve_take
 from .stages import Stage, Workers
 
@@ -52,10 +52,10 @@ TAKE_LANDMARK_FRACTION = 0.2
 itself, as brows do, only landmarks show it."""
 LIPS_LANDMARK_FRACTION = 1.0
 """Weight of the lips' landmarks, beside which the surface does not show whether lips touch."""
-MIN_SEEN_POINTS = 150
+MIN_OBSERVED_POINTS = 150
 """Points of the surface that have to be found at a timestep; below it, landmarks are the better
 evidence."""
-MIN_SEEN_FRACTION = 0.5
+MIN_OBSERVED_FRACTION = 0.5
 """Fraction of the timesteps in which a point must be found to be looked for at every timestep."""
 
 PART_TIMESTEPS = 24
@@ -120,16 +120,13 @@ def fit_surface(
         observed = {t: head_fit.landmarks_in_capture(marks[t], take, found) for t in timesteps}
     else:
         observed = _fitted_landmarks(found, fit, take)
-        if (
-            np.median([len(landmarks.cameras) for landmarks in take.landmarks.values()])
-            <= FEW_CAMERAS
-        ):
+        if np.median([len(each.cameras) for each in take.landmarks.values()]) <= FEW_CAMERAS:
             # the landmarks where they are on `fit`, whose own parameters are of another identity
             poses = np.stack([fit.parameters[t] for t in observed])
             poses = solve_take(found.head, take.places, list(observed.values()), poses, fit.ordered)
             return replace(found, parameters=dict(zip(observed, poses, strict=True)))
     often = (
-        np.mean([surface.weight > 0 for surface in surfaces.values()], axis=0) >= MIN_SEEN_FRACTION
+        np.mean([each.weight > 0 for each in surfaces.values()], axis=0) >= MIN_OBSERVED_FRACTION
     )
     rows = np.flatnonzero(often)
     sought = []
@@ -158,7 +155,7 @@ class _Search:
 
 def _solved_subject(
     head: HeadModel, start: HeadFit, take: RecordedTake, points: SurfacePoints, search: _Search
-) -> tuple[RecordedTake, HeadFit, dict[int, SeenSurface]] | None:
+) -> tuple[RecordedTake, HeadFit, dict[int, ObservedSurface]] | None:
     """Result of `_identity` by the skin, and by the masks' outlines where these agree with the
     skin; and the take, without masks where they do not."""
     near = near_landmarks(head, points, take)
@@ -176,13 +173,13 @@ def _solved_subject(
     return take, *(_identity(head, again, take, by_outline, search) or solved)
 
 
-def _seen_part(
+def _observed_part(
     fit: HeadFit, take: RecordedTake, sought: SurfaceSearch, step: Step
-) -> list[SeenSurface]:
+) -> list[ObservedSurface]:
     """The surface at each of the fit's timesteps, from images and masks."""
     surfaces = []
     for t in fit.parameters:
-        surfaces.append(seen_surface(fit, t, sought, take.images(t), take.masks(t), {}))
+        surfaces.append(observed_surface(fit, t, sought, take.images(t), take.masks(t), {}))
         step()
     return surfaces
 
@@ -198,19 +195,16 @@ def _identity(
     take: RecordedTake,
     sought: Sequence[SurfaceSearch],
     search: _Search,
-) -> tuple[HeadFit, dict[int, SeenSurface]] | None:
+) -> tuple[HeadFit, dict[int, ObservedSurface]] | None:
     """Identity, scale and offsets from the timesteps of the fit, in rounds of what is sought, and
     the surfaces that they were solved from; None where the images do not show enough of the
     surface."""
     offset = np.zeros_like(head.model.v_template)
-    surfaces = dict[int, SeenSurface]()
+    surfaces = dict[int, ObservedSurface]()
     for number, on in enumerate(sought):
         parts = [(*head_fit.excerpt(fit, take, [t]), on) for t in fit.parameters]
-        surfaces = dict(zip(fit.parameters, search(_seen_part, parts), strict=True))
-        if (
-            np.median([(surface.weight > 0).sum() for surface in surfaces.values()])
-            < MIN_SEEN_POINTS
-        ):
+        surfaces = dict(zip(fit.parameters, search(_observed_part, parts), strict=True))
+        if np.median([(each.weight > 0).sum() for each in surfaces.values()]) < MIN_OBSERVED_POINTS:
             return None
         base = with_offset(head, offset)
         fraction = _landmark_fractions(base, take.places)
@@ -228,8 +222,7 @@ def _identity(
             to_capture=head_fit.scaled_down(fit.to_capture, found.scale),
         )
         surfaces = {
-            t: replace(surface, position=surface.position / found.scale)
-            for t, surface in surfaces.items()
+            t: replace(each, position=each.position / found.scale) for t, each in surfaces.items()
         }
         if number:  # what is left between the person's template and the surfaces, along its normals
             model = fit.head.model
@@ -238,9 +231,7 @@ def _identity(
                 at = on.points.on(posed_mesh(fit, fit.parameters[t]), model.faces)
                 missing.append(((surface.position - at) * surface.normal).sum(1))
             repeated = on.points[np.tile(np.arange(len(on.points)), len(surfaces))]
-            weight = np.concatenate([surface.weight for surface in surfaces.values()]) / len(
-                surfaces
-            )
+            weight = np.concatenate([each.weight for each in surfaces.values()]) / len(surfaces)
             left = repeated, np.concatenate(missing), weight
             values = smooth_offsets(model.v_template, model.faces, *left)
             offset = offset + values[:, None] * vertex_normals(model.v_template, model.faces)
@@ -311,7 +302,9 @@ def _found_part(
         pictures = take.images(t), take.masks(t, MAX_OUTLINE_CAMERAS)
         for on, visible in zip(sought, visible_points, strict=True):
             rough = replace(fit, parameters={t: here})
-            joined = _joined(observation, fraction, seen_surface(rough, t, on, *pictures, visible))
+            joined = _joined(
+                observation, fraction, observed_surface(rough, t, on, *pictures, visible)
+            )
             places = take.places + on.points
             (here,) = solve_take(fit.head, places, [joined], here[None], ordered=False)
         results.append((here, joined))
@@ -338,7 +331,7 @@ def _landmark_fractions(head: HeadModel, places: SurfacePoints) -> np.ndarray:
     return np.where(lips[places.face], LIPS_LANDMARK_FRACTION, LANDMARK_FRACTION)
 
 
-def _joined(landmarks: Observation, fraction: np.ndarray, surface: SeenSurface) -> Observation:
+def _joined(landmarks: Observation, fraction: np.ndarray, surface: ObservedSurface) -> Observation:
     """Both as one observation, landmarks at fractions (N,) of their weight; the surface counts
     along its normal."""
     along = surface.normal[:, :, None] * surface.normal[:, None, :]

@@ -56,7 +56,7 @@ COMPARED_TIMESTEPS = 24
 them."""
 MIN_GAIN = 0.1
 """Fraction by which the misfit has to fall for the torso not to move with the head."""
-MIN_OWN_GAIN = 0.05
+MIN_MOTION_GAIN = 0.05
 """Fraction by which it has to fall for the torso to move instead of being still, or to be shifted
 as well."""
 
@@ -114,17 +114,19 @@ def follow_torso(
     present = [camera for camera in footage.cameras if middle in camera.timesteps]
     masked = [camera for camera in present if camera.mask(middle) is not None]
     take = TorsoTake(fit, unchanged, evenly_spread(masked, MAX_CAMERAS))
-    observed = torso_take.seen_points(take, middle)
+    observed = torso_take.observed_points(take, middle)
     if sum(map(len, observed.rows.values())) < MIN_POINTS:
         return FollowedTorso(fit, unchanged)
     walk = torso_take.BothWays(workers, Stage.TORSO, 3 * len(some) + len(unchanged))
     motions = _motions(take, observed, some, walk)
     deep = torso_take.at_depth(take, observed, motions)
     found = torso_take.compared(take, deep, motions, some)
-    independent = "shifted" if found["shifted"] < (1 - MIN_OWN_GAIN) * found["turned"] else "turned"
+    independent = (
+        "shifted" if found["shifted"] < (1 - MIN_MOTION_GAIN) * found["turned"] else "turned"
+    )
     misfit = {"head": found["head"], "still": found["still"], "own": found[independent]}
     # what explains the images best; a simpler motion unless the gain is clear
-    motion = "own" if misfit["own"] < (1 - MIN_OWN_GAIN) * misfit["still"] else "still"
+    motion = "own" if misfit["own"] < (1 - MIN_MOTION_GAIN) * misfit["still"] else "still"
     motion = motion if misfit[motion] < (1 - MIN_GAIN) * misfit["head"] else "head"
     decided = TorsoMotion(motion, misfit, 0.0)
     if motion == "head":
@@ -166,7 +168,10 @@ def _followed(
 
 
 def _motions(
-    take: TorsoTake, observed: torso_take.SeenPoints, some: Sequence[int], walk: torso_take.BothWays
+    take: TorsoTake,
+    observed: torso_take.ObservedPoints,
+    some: Sequence[int],
+    walk: torso_take.BothWays,
 ) -> dict[str, Motion]:
     """The possible motions of a torso, at some timesteps and at the timestep of the points, whose
     depth is determined first by one of these motions."""
@@ -185,7 +190,7 @@ def _motions(
 
 
 def _everywhere(
-    take: TorsoTake, name: str, observed: torso_take.SeenPoints, walk: torso_take.BothWays
+    take: TorsoTake, name: str, observed: torso_take.ObservedPoints, walk: torso_take.BothWays
 ) -> Motion:
     """The motion that was chosen, at all timesteps."""
     if name == "still":
@@ -200,7 +205,7 @@ def _poses(
     walk: torso_take.BothWays, followers: Sequence["_Follower"], timesteps: Iterable[int]
 ) -> list[dict[int, TorsoPose]]:
     """The torso's poses by timestep, for each follower."""
-    found = walk.along(_Follower.follow, followers, followers[0].seen.timestep, timesteps)
+    found = walk.along(_Follower.follow, followers, followers[0].observed.timestep, timesteps)
     return [
         {timestep: TorsoPose(**arrays) for timestep, arrays in by_timestep.items()}
         for by_timestep in found
@@ -210,10 +215,10 @@ def _poses(
 class _Follower:
     """The pose of the torso over a take, by Gauss–Newton on the images of points below the head."""
 
-    def __init__(self, take: TorsoTake, observed: torso_take.SeenPoints, shifts: bool) -> None:
+    def __init__(self, take: TorsoTake, observed: torso_take.ObservedPoints, shifts: bool) -> None:
         """shifts: whether the torso is rigid, and shifted as well as turned."""
         self._take = take
-        self.seen = observed
+        self.observed = observed
         self._shifts = shifts
         self._first = take.straight(observed.timestep)
         first = take.with_torso(observed.timestep, self._first, shifts)
@@ -243,8 +248,8 @@ class _Follower:
         misfits = []
         for start in starts:
             at = self._posed(now.timestep, start)
-            fraction, in_sight = self.seen.unexplained(now, at, START_LEVEL)
-            use = in_sight & self.seen.fitted
+            fraction, in_sight = self.observed.unexplained(now, at, START_LEVEL)
+            use = in_sight & self.observed.fitted
             misfits.append(float(fraction[use].mean()) if use.any() else 1.0)
         best = starts[int(np.argmin(misfits))]
         found = self._descended(now, best, pose, FINE_STEPS)
@@ -262,18 +267,11 @@ class _Follower:
                 at, by_pose = self._linearized(shot.timestep, pose)
                 terms = []
                 for number, rows in self._visible(shot, at):
-                    pyramid_level = shot.views[number].levels[level]
-                    residual = self.seen.residual(shot, number, rows, at[rows], level)
-                    pixels, _ = pyramid_level.camera.project(at[rows])
-                    slope = (
-                        np.stack(sampled(list(pyramid_level.gradient), pixels), axis=2)
-                        / NOISE_LEVELS
-                    )
-                    rate = (
-                        slope
-                        @ projection_derivative(pyramid_level.camera, at[rows])
-                        @ by_pose[rows]
-                    )
+                    image = shot.views[number].levels[level]
+                    residual = self.observed.residual(shot, number, rows, at[rows], level)
+                    pixels, _ = image.camera.project(at[rows])
+                    slope = np.stack(sampled(list(image.gradient), pixels), axis=2) / NOISE_LEVELS
+                    rate = slope @ projection_derivative(image.camera, at[rows]) @ by_pose[rows]
                     weight = np.outer(point_weights(residual, level), appearance.CHANNEL_WEIGHTS)
                     terms.append((weight, rate, residual))
                 pose, size = self._moved(pose, expected, terms)
@@ -305,13 +303,15 @@ class _Follower:
 
     def _visible(self, shot: torso_take.TorsoShot, at: np.ndarray) -> list[tuple[int, np.ndarray]]:
         """Number of each camera that sees any of its fitted points, and the rows of these."""
-        known = [(number, rows) for number, rows in self.seen.rows.items() if number in shot.views]
-        chosen = [(n, r[self.seen.fitted[r] & shot.shows(n, at[r])]) for n, r in known]
+        known = [
+            (number, rows) for number, rows in self.observed.rows.items() if number in shot.views
+        ]
+        chosen = [(n, r[self.observed.fitted[r] & shot.shows(n, at[r])]) for n, r in known]
         return [pair for pair in chosen if len(pair[1])]
 
     def _posed(self, timestep: int, pose: TorsoPose) -> np.ndarray:
         torso = self._take.with_torso(timestep, pose, self._shifts)
-        return self._carrier.carried(torso)(self.seen.at)
+        return self._carrier.carried(torso)(self.observed.at)
 
     def _linearized(self, timestep: int, pose: TorsoPose) -> tuple[np.ndarray, np.ndarray]:
         """Positions (N, 3), and derivatives (N, 3, 6) by a small rotation in front of the

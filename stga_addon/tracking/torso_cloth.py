@@ -139,10 +139,10 @@ def draped(sheet: TorsoSheet, at: np.ndarray, points: np.ndarray) -> np.ndarray:
     sure = gaussian_filter1d(observed, DIRECTION_SIGMA, mode="constant")
     found = gaussian_filter1d(found, DIRECTION_SIGMA, mode="constant") / np.maximum(sure, 1e-6)
     around = SLOPE * np.arctan2(at[:, 0], at[:, 2])
-    is_seen, reach_m, certainty = (
+    is_observed, reach_m, certainty = (
         np.interp(around, DIRECTIONS_RAD, values, 0, 0) for values in (observed, found, sure)
     )
-    trust = np.where(is_seen > 0.5, certainty, 0.0)
+    trust = np.where(is_observed > 0.5, certainty, 0.0)
     outer = reach_m[:, None] * np.stack([np.sin(around), -np.cos(around)], axis=1)
     flat = at[:, :2] + sheet.height[:, None] * (outer - at[:, :2])
     near = np.exp(-((flat[:, None] - points[:, :2]) ** 2).sum(2) / (2 * DEPTH_SIGMA_M**2))
@@ -209,7 +209,7 @@ class _Reference:
     fitted (P,)."""
 
     shape: tuple[int, ...]
-    shown: np.ndarray
+    covered: np.ndarray
     luma: np.ndarray
     corners: np.ndarray
     barycentric: np.ndarray
@@ -218,7 +218,7 @@ class _Reference:
     @cached_property
     def pixels(self) -> tuple[np.ndarray, np.ndarray]:
         """Rows and columns (P,)."""
-        rows, columns = np.nonzero(self.shown)
+        rows, columns = np.nonzero(self.covered)
         return rows, columns
 
 
@@ -315,7 +315,7 @@ class _Cloth:
             if number in shot.views
             and reference.corners.size
             and shot.views[number].levels[0].channels.shape[:2] == reference.shape
-            and min(reference.shown.shape) >= appearance.MIN_FLOW_SIDE_PX
+            and min(reference.covered.shape) >= appearance.MIN_FLOW_SIDE_PX
         ]
 
     def _positions(self, timestep: int, bend: np.ndarray) -> np.ndarray:
@@ -404,7 +404,7 @@ def _missed(reference: _Reference, now: _Returned) -> tuple[np.ndarray, np.ndarr
     )
     rows, columns = reference.pixels
     places = np.stack([columns, rows], axis=1) + 0.5 + flow[rows, columns]
-    image = np.full((*reference.shown.shape, 3), np.nan, np.float32)
+    image = np.full((*reference.covered.shape, 3), np.nan, np.float32)
     image[rows, columns] = np.concatenate([now.source, now.luma[rows, columns][:, None]], axis=1)
     found = sampled([image], places)[0]
     weight = now.visible & reference.fitted & np.isfinite(found).all(1)

@@ -332,7 +332,7 @@ def grown(where: np.ndarray, fraction: float) -> np.ndarray:
 
 
 @dataclass(frozen=True)
-class SeenPoints:
+class ObservedPoints:
     """N points below the head as the cameras see them at one timestep.
 
     rows       number of a camera -> the rows of its own points, whose depth is a guess
@@ -369,12 +369,12 @@ class SeenPoints:
         self, shot: TorsoShot, number: int, rows: np.ndarray, at: np.ndarray, level: int
     ) -> np.ndarray:
         """Channels (M, 3) of a camera's image at points less the reference's, in NOISE_LEVELS."""
-        pyramid_level = shot.views[number].levels[level]
-        values = sampled([pyramid_level.channels], pyramid_level.camera.project(at)[0])[0]
+        image = shot.views[number].levels[level]
+        values = sampled([image.channels], image.camera.project(at)[0])[0]
         return (values - self.reference[level][rows]) / NOISE_LEVELS
 
 
-def seen_points(take: TorsoTake, timestep: int) -> SeenPoints:
+def observed_points(take: TorsoTake, timestep: int) -> ObservedPoints:
     """What cameras see below the head: points on pixels' rays, as deep as the mesh beside."""
     from scipy.spatial import cKDTree
 
@@ -407,7 +407,7 @@ def seen_points(take: TorsoTake, timestep: int) -> SeenPoints:
         rows_of[number] = count + np.arange(len(points))
         count += len(points)
     at, away, fitted, *reference = map(np.concatenate, zip(*found, strict=True))
-    return SeenPoints(timestep, rows_of, at, unit(away), fitted, reference)
+    return ObservedPoints(timestep, rows_of, at, unit(away), fitted, reference)
 
 
 class Carrier:
@@ -450,7 +450,7 @@ class Carrier:
 
 def compared(
     take: TorsoTake,
-    observed: Mapping[str, SeenPoints],
+    observed: Mapping[str, ObservedPoints],
     motions: Mapping[str, Motion],
     timesteps: Sequence[int],
 ) -> dict[str, float]:
@@ -475,8 +475,8 @@ def compared(
 
 
 def at_depth(
-    take: TorsoTake, observed: SeenPoints, motions: Mapping[str, Motion]
-) -> dict[str, SeenPoints]:
+    take: TorsoTake, observed: ObservedPoints, motions: Mapping[str, Motion]
+) -> dict[str, ObservedPoints]:
     """Motion -> the points at the depths along their rays at which other cameras, and other
     timesteps of the motion, look like them; "stereo": of other cameras alone."""
     candidates = [observed.at + depth * observed.ray for depth in DEPTHS_M]
@@ -506,7 +506,7 @@ def at_depth(
     return {name: _moved_in_depth(observed, cost) for name, cost in costs.items()}
 
 
-def _moved_in_depth(observed: SeenPoints, cost: np.ndarray) -> SeenPoints:
+def _moved_in_depth(observed: ObservedPoints, cost: np.ndarray) -> ObservedPoints:
     """The points where the cost (DEPTHS_M, N), averaged over neighbors, is least, if that is
     significant."""
     from scipy.spatial import cKDTree

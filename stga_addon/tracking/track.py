@@ -10,14 +10,14 @@ from ..flame.model import BUNDLED_HEAD
 from ..schema import to_json
 from ..worker.helpers import Helpers
 from . import folder
+from .fitted_head import TrackedHead, fit_expressions, fit_landmarks, fit_skin, with_torso
 from .footage.model import Footage
-from .known_person import KnownPerson, without_own_bias
+from .known_person import KnownPerson, without_measured_bias
 from .landmarks import landmark_file, write_camera, write_places
 from .opened import DEFAULT_OPTIONS, OpenedFootage, TrackingOptions, open_take
 from .pictures import PosedHead, write_contact_sheet
 from .recorded import RecordedFootage, in_world, record, with_focal
 from .reprojection import median_px
-from .seen import SeenHead, fit_expressions, fit_landmarks, fit_skin, with_torso
 from .stages import ReportStage, Show, Stage, Workers, unreported, unseen
 from .write_capture import write_capture
 
@@ -68,7 +68,7 @@ def track(
     return written
 
 
-def _stranger(opened: OpenedFootage, workers: Workers) -> SeenHead:
+def _stranger(opened: OpenedFootage, workers: Workers) -> TrackedHead:
     """The stages of a person who is seen for the first time."""
     recorded = record(opened, workers)
     recorded = in_world(with_focal(recorded, workers, None))
@@ -77,13 +77,13 @@ def _stranger(opened: OpenedFootage, workers: Workers) -> SeenHead:
     return with_torso(fitted, workers, bends=True)
 
 
-def _known(opened: OpenedFootage, person: KnownPerson, workers: Workers) -> SeenHead:
+def _known(opened: OpenedFootage, person: KnownPerson, workers: Workers) -> TrackedHead:
     """The stages of a person who is known. The only camera has the focal length of the person's,
     where its file does not have it and the landmarks allow it."""
     recorded = record(opened, workers)
     recorded = in_world(with_focal(recorded, workers, person.camera))
     if opened.options.landmarks is None and person.draw is not None:
-        recorded = replace(recorded, take=without_own_bias(recorded.take, person, workers))
+        recorded = replace(recorded, take=without_measured_bias(recorded.take, person, workers))
     fitted = fit_landmarks(recorded, workers)
     fitted = fit_expressions(fitted, person.fit, workers)
     return with_torso(fitted, workers, bends=False)
@@ -94,7 +94,7 @@ def end_tracking(out: Path) -> None:
     shutil.rmtree(out / folder.KEPT_FOLDER, ignore_errors=True)
 
 
-def _write(head: SeenHead, workers: Workers) -> TrackingReport:
+def _write(head: TrackedHead, workers: Workers) -> TrackingReport:
     """The last stage: report, contact sheet, and the capture."""
     recorded = head.fitted.recorded
     opened = recorded.opened
@@ -136,7 +136,7 @@ def _write(head: SeenHead, workers: Workers) -> TrackingReport:
     return TrackingReport(median, fit.to_capture.scale, head.warnings, torso.motion, focal)
 
 
-def _focal_length(head: SeenHead) -> folder.FocalLength | None:
+def _focal_length(head: TrackedHead) -> folder.FocalLength | None:
     if head.footage.focal == "calibration":
         return None
     pixels = round(head.footage.cameras[0].camera.fl_x, 1)

@@ -81,13 +81,13 @@ SH_DEGREE = 1
 class CleanPlate:
     """A camera, and what it shows without the person.
 
-    image  (H, W, 3) float32 in 0…1
-    seen   (H, W) bool: pixels that some view shows; the others are filled from around
+    image     (H, W, 3) float32 in 0…1
+    observed  (H, W) bool: pixels that some view shows; the others are filled from around
     """
 
     camera: Camera
     image: np.ndarray
-    seen: np.ndarray
+    observed: np.ndarray
 
 
 def clean_plates(capture: Capture, correct: Correction | None = None) -> list[CleanPlate]:
@@ -211,7 +211,7 @@ def _similarity(
     theirs = []
     rng = np.random.default_rng(0)
     for plate, detail in zip(plates, details, strict=True):
-        rows, columns = np.nonzero(plate.seen)
+        rows, columns = np.nonzero(plate.observed)
         chosen = rng.choice(len(rows), min(SAMPLED_POINTS, len(rows)), replace=False)
         rows = rows[chosen]
         columns = columns[chosen]
@@ -219,7 +219,7 @@ def _similarity(
         for other, detail_there in zip(plates, details, strict=True):
             if other is not plate:
                 x, y, inside = pixels_of(points, other.camera)
-                inside &= other.seen[y, x]
+                inside &= other.observed[y, x]
                 mine.append(detail[rows[inside], columns[inside]].ravel())
                 theirs.append(detail_there[y[inside], x[inside]].ravel())
     one = np.concatenate([np.zeros(0), *mine])

@@ -26,7 +26,7 @@ from ..errors import StgaError
 from ..files import read_npz, write_npz
 from .launch import start_piped
 from .machine import processors
-from .training_python import own_python
+from .training_python import this_python
 
 MAX_HELPERS = 8  # Each takes some 300 MB
 THREADS_VARIABLE = "OMP_NUM_THREADS"
@@ -192,7 +192,7 @@ def _kept(
 
 
 def _start() -> "subprocess.Popen[bytes]":
-    return start_piped(own_python(), ["stga_addon.worker.helpers"], SINGLE)
+    return start_piped(this_python(), ["stga_addon.worker.helpers"], SINGLE)
 
 
 class _Unpickler(pickle.Unpickler):

@@ -13,7 +13,7 @@ from ..errors import StgaError
 from ..files import naming
 from .lock import is_locked
 from .status import CANCEL_FILE, LOG_FILE, STATUS_FILE, refuse_running_worker, remove_status_folder
-from .training_python import own_python
+from .training_python import this_python
 
 CACHE_VARIABLE = "STGA_CACHE"
 """Environment variable that names the folder. Blender's extension sets it to one that uninstalling
@@ -160,18 +160,20 @@ def worker_environment(variables: Mapping[str, str], python: str) -> dict[str, s
     Blender ignores the user's site-packages. As installed by Blender, these packages have no
     bytecode; it is kept in the cache folder, if Blender named one.
     """
-    is_own = python in (sys.executable, own_python())
-    cache = variables.get(CACHE_VARIABLE) if is_own else None
-    dropped = ("PYTHON",) if is_own else ("PYTHONHOME", "PYTHONSTARTUP")
+    is_this_python = python in (sys.executable, this_python())
+    cache = variables.get(CACHE_VARIABLE) if is_this_python else None
+    dropped = ("PYTHON",) if is_this_python else ("PYTHONHOME", "PYTHONSTARTUP")
     kept = {name: value for name, value in variables.items() if not name.startswith(dropped)}
-    if is_own:
+    if is_this_python:
         kept["PYTHONNOUSERSITE"] = "1"
     if cache:
         kept["PYTHONPYCACHEPREFIX"] = os.path.join(cache, BYTECODE)
         kept["MPLCONFIGDIR"] = os.path.join(cache, CHARTS)
     else:
         kept["PYTHONDONTWRITEBYTECODE"] = "1"  # the extension's folder belongs to Blender
-    path = os.pathsep.join([str(PACKAGES_FOLDER), *filter(None, sys.path if is_own else ())])
+    path = os.pathsep.join(
+        [str(PACKAGES_FOLDER), *filter(None, sys.path if is_this_python else ())]
+    )
     always = dict.fromkeys(("PYTHONSAFEPATH", "PYTHONUNBUFFERED", "PYTHONUTF8"), "1")
     return {**kept, **always, "PYTHONPATH": path}
 

@@ -66,8 +66,8 @@ def _groups(controller: str, proc: Path) -> Iterator[Path]:
         for mount in mounts:
             kind = mount[mount.index("-") + 1]
             options = mount[-1].split(",")
-            is_own = kind == "cgroup2" if number == "0" else controller in options
-            if not (kind.startswith("cgroup") and is_own):
+            has_controller = kind == "cgroup2" if number == "0" else controller in options
+            if not (kind.startswith("cgroup") and has_controller):
                 continue
             top = Path(_unescaped(mount[4]))
             inside = Path(path)

@@ -36,7 +36,7 @@ def package_name(requirement: str) -> str:
 
 
 @cache
-def own_python() -> str:
+def this_python() -> str:
     """Path of the interpreter whose library this process runs; workers of this Python are started
     with it.
 
@@ -65,11 +65,11 @@ def find_training_python(preferred: str = "") -> str:
     if missing:
         version = sys.version.split()[0]
         raise StgaError(
-            f"{own_python()} (Python {version}) lacks {', '.join(missing)}. Install the complete "
+            f"{this_python()} (Python {version}) lacks {', '.join(missing)}. Install the complete "
             "edition of the add-on, or choose a Python that has them in its preferences or by "
             f"{PYTHON_VARIABLE}"
         )
-    return own_python()
+    return this_python()
 
 
 def missing_packages() -> list[str]:

@@ -28,7 +28,7 @@ from stga_addon.avatar.strain import (
     RANGE_MARGIN,
     deformation,
     edge_neighbors,
-    seen_range,
+    observed_range,
     smoothed_strain,
     strain_basis,
     trained_range,
@@ -94,7 +94,7 @@ def test_deformation_stays_within_what_was_seen():
     posed.append(0.7 * NEUTRAL)
     basis = strain_basis(NEUTRAL, FACES, allowed)
     every = np.stack([deformation(basis, mesh) for mesh in posed])
-    limits = seen_range(basis, posed)
+    limits = observed_range(basis, posed)
     rest = np.array([-MIN_COMPRESSION, -MIN_COMPRESSION, 0, 0, 0, 0])
     lowest = rest + RANGE_MARGIN * np.minimum((every - rest).min(0), 0)
     highest = rest + RANGE_MARGIN * np.maximum((every - rest).max(0), 0)

@@ -15,7 +15,7 @@ import bpy
 
 RESULT, WAIT, BUDGET = sys.argv[sys.argv.index("--") + 1 :]
 module = next(name for name in bpy.context.preferences.addons.keys() if name.endswith(".stga"))  # noqa: SIM118
-own_python = sys.modules[f"{module}.stga_addon.worker.training_python"].own_python
+this_python = sys.modules[f"{module}.stga_addon.worker.training_python"].this_python
 seen = {"version": bpy.app.version_string, "python": sys.version.split()[0]}
 
 
@@ -41,7 +41,7 @@ if WAIT == "0":
     sys.modules[f"{module}.operators.request"].start_worker = lambda *given: leave(
         start(*given).pid
     )
-bpy.ops.stga.train(directory=str(run), python=own_python(), **budget)
+bpy.ops.stga.train(directory=str(run), python=this_python(), **budget)
 bpy.ops.stga.show_avatar(filepath=settings.avatar)
 seen["splats"] = len(settings.splats.data.vertices)
 write()

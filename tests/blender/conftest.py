@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from capture.factory import write_flame_capture, write_mesh_capture
 
-from stga_addon.capture.open import OWN_MODELS
+from stga_addon.capture.open import CAPTURE_MODELS
 from stga_addon.development.package import build_zip, fetch_wheels
 from stga_addon.errors import StgaError
 from stga_addon.jobs.table import Kind
@@ -135,5 +135,5 @@ def zip_file(tmp_path_factory):
 def demo(tmp_path_factory):
     """A capture with its FLAME file, in place of the demo of the complete edition."""
     folder, model = write_flame_capture(tmp_path_factory.mktemp("demo") / "capture")
-    model.rename(folder / OWN_MODELS[0])
+    model.rename(folder / CAPTURE_MODELS[0])
     return folder

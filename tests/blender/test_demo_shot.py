@@ -11,7 +11,7 @@ from stga_addon.avatar.file import UNSEEN_REGION, read_avatar, write_avatar
 from stga_addon.capture.open import open_capture
 from stga_addon.development.demo.capture import unpack_capture
 from stga_addon.scene.display import splat_nodes
-from stga_addon.scene.display.splat_object import get_input, is_partly_filmed
+from stga_addon.scene.display.splat_object import get_input, is_partly_observed
 from stga_addon.scene.render.film_set import shows_set
 from stga_addon.scene.render.viewport_display import ENGINE
 
@@ -53,7 +53,7 @@ def test_open_demo_shot(tmp_path):
     assert scene.render.engine == ENGINE
     assert scene.camera.name == "Shot"
     assert shows_set(scene)
-    assert is_partly_filmed(panel().splats)
+    assert is_partly_observed(panel().splats)
     assert not get_input(panel().splats, splat_nodes.SHOW_UNSEEN)
     head = panel().head
     assert head.parent.parent_bone == "chest"

@@ -109,7 +109,7 @@ def test_a_hidden_performer_is_sampled(extension, tmp_path):
     """Catches a performer in an unchecked collection whose motion is all zero."""
     import_flame(tmp_path / "capture")
     head = panel().head
-    own = extension.operators.common.own_motion(head)
+    own = extension.operators.common.recorded_motion(head)
     before = sample_motion(head, own, range(4))
     uncheck(head.users_collection[0])
     warned = []

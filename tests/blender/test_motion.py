@@ -13,7 +13,7 @@ from refusal import refusal
 from stga_addon.flame.forward import flame_forward
 from stga_addon.flame.sequence import PARTS, retimed, sequence_mesh
 from stga_addon.scene import compat
-from stga_addon.scene.arrays import evaluated_vertices, own_vertices, triangle_mesh
+from stga_addon.scene.arrays import evaluated_vertices, head_vertices, triangle_mesh
 from stga_addon.scene.compat import SLOTTED_ACTIONS
 from stga_addon.scene.rig import keyframes
 from stga_addon.scene.rig.head import import_head, rig_of
@@ -245,10 +245,10 @@ def test_sampled_motion_equals_the_keyframes(head, own):
 def test_a_head_with_modifiers_is_sampled(head, own):
     """Catches a traceback, or scattered vertices, where a modifier divides the head's triangles or
     makes others, and a subdivided head that is refused."""
-    plain = own_vertices(head)
+    plain = head_vertices(head)
     divided = head.modifiers.new("divided", "SUBSURF")
     divided.subdivision_type = "SIMPLE"
-    assert_allclose(own_vertices(head), plain, atol=1e-6)
+    assert_allclose(head_vertices(head), plain, atol=1e-6)
     assert len(sample_motion(head, own, (4, 5)).timesteps) == 2
     head.modifiers.remove(divided)
     other = placed("ball", triangle_mesh("ball", *ball()))
@@ -256,11 +256,11 @@ def test_a_head_with_modifiers_is_sampled(head, own):
     for size in (0.003, 0.005, 0.01, 0.02):
         remeshed.voxel_size = size
         with refusal("its modifiers make other triangles"):
-            own_vertices(other)
+            head_vertices(other)
     other.modifiers.remove(remeshed)
     other.modifiers.new("decimated", "DECIMATE").ratio = 0.5
     with refusal("its modifiers make other triangles"):
-        own_vertices(other)
+        head_vertices(other)
 
 
 def test_sampled_motion_includes_edits_by_hand(head, own):

@@ -265,7 +265,7 @@ class RangeExport:
         self._modal = operator.modal
 
         def read():
-            return extension.operators.export.own_vertices(head.get())
+            return extension.operators.export.head_vertices(head.get())
 
         steps = operator.export(self.dialog, view, read, Path(), frames, write)
         self.dialog._steps = extension.operators.common.Steps(steps, 1.0)
@@ -364,7 +364,7 @@ def test_an_export_always_ends(extension, shown, tmp_path, monkeypatch, end):
         assert running.until() == "CANCELLED"
         assert running.said[-1].endswith("head: was removed meanwhile")
     elif end == "bug":
-        monkeypatch.setattr(extension.operators.export, "own_vertices", lambda head: 1 / 0)
+        monkeypatch.setattr(extension.operators.export, "head_vertices", lambda head: 1 / 0)
         assert running.until() == "CANCELLED"
         assert "unexpected error (ZeroDivisionError" in running.said[-1]
     elif end == "new file":  # before which Blender cancels what is running in the window

@@ -104,7 +104,9 @@ def test_what_was_not_filmed_and_the_lens_are_said(extension, trained):
     """Catches a color in the viewport that nothing explains, or that is explained after it was
     turned off, and a guessed focal length that only a file tells."""
     settings = panel()
-    settings.splats[tags.FILMED] = "filmed from 30° on its right to 40° on its left; what is beyond"
+    settings.splats[tags.OBSERVED] = (
+        "filmed from 30° on its right to 40° on its left; what is beyond"
+    )
     settings.head[tags.FOCAL_LENGTH] = "924 px, estimated"
     settings.head[tags.TRACKED] = True
     for is_shown in (True, False):

@@ -34,10 +34,12 @@ def made(take, tmp_path_factory):
     printed = StringIO()
     with pytest.MonkeyPatch.context() as patch:
         # What takes the longest, and tests of tracking look at
-        patch.setattr("stga_addon.tracking.seen.fit_dense", lambda *_, **__: None)
-        patch.setattr("stga_addon.tracking.seen.fit_surface", lambda head, fit, *_, **__: fit)
+        patch.setattr("stga_addon.tracking.fitted_head.fit_dense", lambda *_, **__: None)
+        patch.setattr(
+            "stga_addon.tracking.fitted_head.fit_surface", lambda head, fit, *_, **__: fit
+        )
         follow = lambda fit, own, *_: FollowedTorso(fit, own)  # noqa: E731
-        patch.setattr("stga_addon.tracking.seen.follow_torso", follow)
+        patch.setattr("stga_addon.tracking.fitted_head.follow_torso", follow)
         with patch.context() as first:
             first.setattr(write_capture, "write_json", interrupt)
             assert make(take, out) == 130

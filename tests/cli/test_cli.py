@@ -29,7 +29,7 @@ from pxr import Usd
 
 from stga_addon.avatar.embedding import to_world
 from stga_addon.avatar.file import read_avatar, write_avatar
-from stga_addon.avatar.filmed import filmed_avatar
+from stga_addon.avatar.observed import observed_part
 from stga_addon.capture.open import open_capture
 from stga_addon.cli import commands
 from stga_addon.cli.commands import COMMANDS
@@ -443,7 +443,7 @@ def test_what_no_camera_saw_is_left_out(tmp_path, capsys):
     base = np.column_stack([whole.splats.sh[:, 0], logits])
     along = np.tile(np.float32([0, 0, -1]), (len(unseen), 1))
     marked = replace(whole, regions={"unseen": unseen}, linear_base=base)
-    assert filmed_avatar(path, replace(marked, filmed_along=along)).splats.sh_degree == 0
+    assert observed_part(path, replace(marked, filmed_along=along)).splats.sh_degree == 0
     write_avatar(path, marked)
     count = int(kept.sum())
 

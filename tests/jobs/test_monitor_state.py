@@ -10,6 +10,7 @@ from stga_addon.jobs.monitor_state import (
     SLICE_INTERVAL_S,
     CancelAsked,
     Dismissed,
+    Displayed,
     Failed,
     KillWorker,
     LoadAvatar,
@@ -22,7 +23,6 @@ from stga_addon.jobs.monitor_state import (
     SceneFree,
     SceneRead,
     Show,
-    Shown,
     SliceBuilt,
     Started,
     StatusRead,
@@ -95,7 +95,7 @@ def test_any_end_of_any_kind_stops_the_timer(kind, end):
     if state.loading is not None:
         assert state.interval_s == CHECK_INTERVAL_S
         assert after(SceneFree(), state=state) == (state, [Show(state.loading)])
-        state, _ = after(Shown(), state=state)
+        state, _ = after(Displayed(), state=state)
     assert (state.interval_s, state.is_running, state.loading) == (None, False, None)
     assert after(SceneFree(), state=state) == (state, [])
     assert state.can_be_dismissed == (kind in DISMISSIBLE)
@@ -162,11 +162,11 @@ def test_each_preview_is_loaded_once():
     assert loads(effects) == [PREVIEW]
     state, effects = after(status(WorkerState.WORKING, preview=2), state=state)
     assert not loads(effects), "the preview before is still being read"
-    state, effects = after(Shown(undoable=True), state=state)
+    state, effects = after(Displayed(undoable=True), state=state)
     assert effects == [PushUndo(), Redraw()]
     state, effects = after(status(WorkerState.WORKING, preview=2), state=state)
     assert loads(effects) == [PREVIEW]
-    state, effects = after(Shown(), status(WorkerState.WORKING, preview=2), state=state)
+    state, effects = after(Displayed(), status(WorkerState.WORKING, preview=2), state=state)
     assert effects == []
     assert state.interval_s == CHECK_INTERVAL_S
     state, effects = after(
@@ -178,7 +178,9 @@ def test_each_preview_is_loaded_once():
     assert not loads(effects)
     assert state.interval_s == SLICE_INTERVAL_S
     assert after(SceneFree(), state=state)[1] == [Show(PREVIEW)]
-    _, effects = after(Shown(undoable=True), status(WorkerState.FINISHED, preview=1), state=state)
+    _, effects = after(
+        Displayed(undoable=True), status(WorkerState.FINISHED, preview=1), state=state
+    )
     assert loads(effects) == [AVATAR]
 
 
@@ -192,7 +194,7 @@ def test_result_is_shown_once(end):
     state, effects = after(START, status(end))
     assert StoreAvatar(AVATAR) in effects
     assert loads(effects) == [AVATAR]
-    state, effects = after(Shown(), state=state)
+    state, effects = after(Displayed(), state=state)
     assert effects == [Store(RUN, True), PushUndo(), Redraw()]
     assert state.interval_s is None
     assert after(status(end), state=state) == (state, [])
@@ -209,12 +211,12 @@ def test_undo():
     state, _ = after(START, status(WorkerState.WORKING))
     assert after(SceneRead(None, False), state=state) == (state, [Store(RUN, False)])
     assert after(SceneRead(RUN, False), state=state) == (state, [])
-    state, _ = after(status(WorkerState.FINISHED), Shown(undoable=True), state=state)
+    state, _ = after(status(WorkerState.FINISHED), Displayed(undoable=True), state=state)
     assert after(SceneRead(RUN, False), state=state) == (state, [Store(RUN, True)])
     assert after(status(WorkerState.FINISHED), state=state) == (state, [])
     _, effects = after(Dismissed(), SceneRead(RUN, True), state=state)
     assert effects == [Store(None, False)]
-    events = START, status(WorkerState.FINISHED), Shown(undoable=True)
+    events = START, status(WorkerState.FINISHED), Displayed(undoable=True)
     _, effects = after(*events, state=RequestState(Kind.PERFORMANCE))
     assert effects == [PushUndo(), RemoveFiles(JOB), Redraw()]
 
@@ -265,7 +267,7 @@ def test_head_previews_and_avatar_appear_once_each():
     assert state.loading is None
     state, effects = after(made(WorkerState.WORKING, capture=1, preview=1), state=state)
     assert (state.loading, loads(effects)) == (RUN / "capture", [])
-    again = Shown(), made(WorkerState.WORKING, capture=1, preview=1)
+    again = Displayed(), made(WorkerState.WORKING, capture=1, preview=1)
     state, effects = after(*again, state=state)
     assert loads(effects) == [PREVIEW]
     state, effects = after(*again, state=state)
@@ -274,7 +276,7 @@ def test_head_previews_and_avatar_appear_once_each():
     state, effects = after(last, state=state)
     assert loads(effects) == [RUN / "run" / "avatar.npz"]
     assert StoreAvatar(RUN / "run" / "avatar.npz") in effects
-    state, effects = after(Shown(), state=state)
+    state, effects = after(Displayed(), state=state)
     assert {PushUndo(), Store(RUN, True)} <= set(effects)
     assert state.interval_s is None
     assert after(last, state=state)[0].loading is None

@@ -14,4 +14,6 @@ def head():
 @pytest.fixture
 def without_surface(monkeypatch):
     """Images are not searched for the surface, which takes the longest."""
-    monkeypatch.setattr("stga_addon.tracking.seen.fit_surface", lambda head, fit, *_, **__: fit)
+    monkeypatch.setattr(
+        "stga_addon.tracking.fitted_head.fit_surface", lambda head, fit, *_, **__: fit
+    )

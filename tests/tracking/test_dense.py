@@ -23,9 +23,9 @@ from stga_addon.tracking.correspondence import shaded_image
 from stga_addon.tracking.dense import fit_dense
 from stga_addon.tracking.dense_head import REGIONS, in_single_precision
 from stga_addon.tracking.fit import RecordedTake, fit_head
+from stga_addon.tracking.fitted_head import by_images
 from stga_addon.tracking.head_model import HeadModel
 from stga_addon.tracking.posed_points import PosedPoints
-from stga_addon.tracking.seen import by_images
 from stga_addon.tracking.solve import (
     Observation,
     acceleration_precision,
@@ -304,8 +304,10 @@ def test_a_surface_that_is_not_found_is_not_refined(monkeypatch):
         rounds.append(settled)
         return dense.DenseFit(fit, {}, {0: np.arange(len(REGIONS))})
 
-    monkeypatch.setattr("stga_addon.tracking.seen.fit_dense", fit_once)
-    monkeypatch.setattr("stga_addon.tracking.seen.fit_surface", lambda _, fit, *__, **___: fit)
+    monkeypatch.setattr("stga_addon.tracking.fitted_head.fit_dense", fit_once)
+    monkeypatch.setattr(
+        "stga_addon.tracking.fitted_head.fit_surface", lambda _, fit, *__, **___: fit
+    )
     take = RecordedTake(None, None, {}, no_image)
     found, misfit = by_images(None, fit, take, Workers(Helpers(1)))
     assert found is fit

@@ -29,11 +29,11 @@ from stga_addon.tracking.fit import (
     triangulate,
     triangulated,
 )
+from stga_addon.tracking.fitted_head import interpolated
 from stga_addon.tracking.head_model import HeadModel, read_head_model
 from stga_addon.tracking.landmarks import read_places
 from stga_addon.tracking.posed_points import PosedPoints, SurfacePoints, split
 from stga_addon.tracking.recorded import BUNDLED_PLACES
-from stga_addon.tracking.seen import interpolated
 from stga_addon.tracking.solve import (
     LID_SHAPES,
     WEIGHT_EXCESS_SIGMA,
@@ -140,7 +140,7 @@ def test_triangulation_outvotes_a_wrong_camera():
     found = triangulate(rig, landmarks.points, landmarks.confidence)
     assert np.abs(found.position - points).max() < 2e-4
     landmarks.confidence[:, 4] = 0
-    assert not triangulate(rig, landmarks.points, landmarks.confidence).seen[4]
+    assert not triangulate(rig, landmarks.points, landmarks.confidence).observed[4]
 
 
 def test_a_take_is_found_in_a_world_of_any_scale_and_orientation(head):
@@ -292,7 +292,7 @@ def test_landmarks_of_no_weight_stay_unknown(head, count):
         fit = fit_head(head, RecordedTake(places, reliable, take))
     for values in (found.position, found.information, found.residual, *fit.parameters.values()):
         assert np.isfinite(values).all()
-    assert not found.seen[::7].any()
+    assert not found.observed[::7].any()
     for timestep, mesh in enumerate(meshes):
         errors = pixel_errors(head, fit, timestep, own[0], rig[0].project(mesh)[0])
         assert np.median(errors) < 2  # of a face of 300 pixels

@@ -15,8 +15,7 @@ from stga_addon.capture.mesh_geometry import facing, rasterize
 from stga_addon.flame.forward import flame_forward
 from stga_addon.tracking.correspondence import nearest_points, shaded_image
 from stga_addon.tracking.fit import HeadFit, RecordedTake, fit_head
-from stga_addon.tracking.posed_points import SurfacePoints
-from stga_addon.tracking.seen_surface import (
+from stga_addon.tracking.observed_surface import (
     PosedSurface,
     SurfaceSearch,
     Sweep,
@@ -28,6 +27,7 @@ from stga_addon.tracking.seen_surface import (
     surface_offsets,
     surface_points,
 )
+from stga_addon.tracking.posed_points import SurfacePoints
 from stga_addon.tracking.solve import person
 from stga_addon.tracking.stages import Workers
 from stga_addon.tracking.surface import fit_surface, smooth_offsets

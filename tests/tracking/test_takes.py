@@ -65,7 +65,7 @@ def test_a_calibrated_rig_is_one_take(tmp_path, head):
 def test_a_misread_face_does_not_refuse_a_walk(tmp_path, head, without_surface, monkeypatch):
     """Catches a walk around a head that is refused for one image whose landmarks are wrong, or
     whose head is bent by it; of calibrated cameras, one that does not fit is still refused."""
-    monkeypatch.setattr("stga_addon.tracking.seen.fit_dense", lambda *_, **__: None)
+    monkeypatch.setattr("stga_addon.tracking.fitted_head.fit_dense", lambda *_, **__: None)
     record(tmp_path, head)
     options = TrackingOptions(landmarks=tmp_path / "points", mattes=False)
     footage = open_footage(tmp_path / "footage")
@@ -154,7 +154,7 @@ def test_options_of_one_take(tmp_path, more, says):
 
 def test_a_talk_has_the_head_of_the_capture(tmp_path, head, without_surface, monkeypatch):
     """Catches a take that makes a head of its own, so that the takes do not train together."""
-    monkeypatch.setattr("stga_addon.tracking.seen.fit_dense", lambda *_, **__: None)
+    monkeypatch.setattr("stga_addon.tracking.fitted_head.fit_dense", lambda *_, **__: None)
     meshes = record(tmp_path, head)
     given = {"footage": tmp_path / "footage", "landmarks": tmp_path / "points", "mattes": "none"}
     rig, again = (tmp_path / name for name in ("rig", "again"))

@@ -463,7 +463,7 @@ def test_two_trackings_of_one_capture(recorded, capsys, monkeypatch):
         codes.append(command(folder))
         return fit
 
-    monkeypatch.setattr("stga_addon.tracking.seen.fit_surface", meanwhile)
+    monkeypatch.setattr("stga_addon.tracking.fitted_head.fit_surface", meanwhile)
     assert command(folder) == 0
     assert codes == [2]
     own = f"out: another tracking is writing this capture (process {os.getpid()})"

@@ -22,7 +22,7 @@ from stga_addon.flame.sequence import FlameSequence, sequence_mesh
 from stga_addon.tracking.folder import TorsoPoints, write_torso_points
 from stga_addon.training.optimize.initial_splats import (
     MIN_MESH_DISTANCE_M,
-    SEEN_COPIES,
+    POINT_COPIES,
     VOXEL_SIZE_M,
     flat_points,
     visual_hull_points,
@@ -254,7 +254,7 @@ def test_few_cameras_take_the_torso_from_where_it_was_seen(tmp_path):
     at = np.array([0.0, -0.16, 0.09]) + np.random.default_rng(0).uniform(-0.01, 0.01, (200, 3))
     write_torso_points(tmp_path, TorsoPoints(TIMESTEP + 1, at))
     few = visual_hull_points(capture, views[:3], "stga", 0, torso=True)
-    seen = few.rows(slice(-SEEN_COPIES * len(at), None))
+    seen = few.rows(slice(-POINT_COPIES * len(at), None))
     assert len(few) - len(seen) < 0.2 * len(hull)  # above the neck
     assert torso_faces(model)[seen.face].all()
     assert_allclose(seen.sh[:, 0] * SH_C0 + 0.5, np.tile(red / 255, (len(seen), 1)), atol=1e-6)

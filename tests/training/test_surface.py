@@ -12,8 +12,8 @@ from scipy.spatial import cKDTree
 
 from stga_addon.avatar.embedding import face_frames, to_world
 from stga_addon.avatar.file import UNSEEN_REGION, Avatar
-from stga_addon.avatar.filmed import filmed_sides
 from stga_addon.avatar.lattice import NORMAL_AXIS, lattice_splats
+from stga_addon.avatar.observed import observed_sides
 from stga_addon.avatar.splats import SH_C0, joined
 from stga_addon.capture.camera import look_at
 from stga_addon.capture.mesh_geometry import rasterize, silhouette
@@ -34,7 +34,7 @@ from stga_addon.training.optimize.state import new_state
 from stga_addon.training.optimize.surface import GRAZING_COSINE, Surface
 from stga_addon.training.optimize.surface_prior import (
     BEHIND_COSINE,
-    WELL_SEEN_COSINE,
+    WELL_OBSERVED_COSINE,
     flattened,
     thickness,
     width,
@@ -306,7 +306,7 @@ def test_what_hardly_shows_hardly_moves(frontal):
     for moments in (state.second.xyz, state.second.rotation, state.second.log_scale):
         step = gradient[:, None] / np.sqrt(moments)
         assert step[behind].max() < 1e-3
-        assert_array_equal(step[facing > WELL_SEEN_COSINE], 1)
+        assert_array_equal(step[facing > WELL_OBSERVED_COSINE], 1)
 
 
 @pytest.mark.parametrize("axis", [1, 2])
@@ -353,7 +353,7 @@ def test_what_views_tell_is_kept(filmed, frames):
     grazing = surface.outside & (surface.facing < GRAZING_COSINE) & (surface.facing > 0)
     of_grazing = grazing[state.face] & ~state.unbound & outer
     kept = of_grazing & told & ~frames.sides.triangles[state.face]
-    shown = of_grazing & frames.sides.shown[state.face] & ~frames.sides.triangles[state.face]
+    shown = of_grazing & frames.sides.visible[state.face] & ~frames.sides.triangles[state.face]
     assert shown.sum() > 50
     assert_array_equal(state.parameters.sh[shown], before["sh"][shown])
     away = (GRAZING_COSINE - surface.facing[state.face]) / (GRAZING_COSINE + 0.1)
@@ -363,7 +363,7 @@ def test_what_views_tell_is_kept(filmed, frames):
     )
     rows = of_grazing & ~told & ~frames.sides.triangles[state.face]
     assert rows.sum() > 100
-    share = ~frames.sides.shown[state.face[rows], None]
+    share = ~frames.sides.visible[state.face[rows], None]
     plausible = (frames.sides.color[state.face[rows]] - 0.5) / SH_C0
     own = before["sh"][rows, 0]
     assert_allclose(state.parameters.sh[rows, 0], own + share * (plausible - own), atol=1e-3)
@@ -442,7 +442,7 @@ def test_lids_that_stay_folded_are_skin(filmed, tmp_path):
     sides = frames.sides
     folded = lids & ~is_left
     assert_array_equal(frames.surface.folded_lids, folded)
-    assert not sides.shown[folded].any()
+    assert not sides.visible[folded].any()
     assert_allclose(sides.color[folded] * 255, np.tile([150, 100, 80], (folded.sum(), 1)), atol=4)
     state = state_in(frames, quick_settings(sh_degree=0, sh_steps=(), lattice=1))
     state.parameters.sh[:] = -1
@@ -453,7 +453,7 @@ def test_lids_that_stay_folded_are_skin(filmed, tmp_path):
     at = bound & folded[state.face]
     plausible = (sides.color[state.face[at]] - 0.5) / SH_C0
     assert_allclose(state.parameters.sh[at, 0], plausible, atol=1e-4)
-    shown = bound & (lids & is_left & sides.shown & ~frames.surface.hidden)[state.face]
+    shown = bound & (lids & is_left & sides.visible & ~frames.surface.hidden)[state.face]
     assert (state.parameters.sh[shown, 0] == -1).all(1).mean() > 0.6
 
 
@@ -477,7 +477,7 @@ def test_lids_close_over_eyes(moving):
         settle(frames, state)
         height = state.parameters.xyz[bound, axis] * meters
         of_eyes = eyeballs[state.face[bound]]
-        facing = (frames.sides.shown & (frames.surface.facing > 0.9))[state.face[bound]]
+        facing = (frames.sides.visible & (frames.surface.facing > 0.9))[state.face[bound]]
         expected = np.minimum(before * meters, -5e-4)
         assert_allclose(height[of_eyes & facing], expected[of_eyes & facing], atol=1e-6)
         assert (height[facing & ~of_eyes] > 0).mean() > 0.3
@@ -523,7 +523,7 @@ def test_the_sides_that_were_filmed(filmed, frames):
         hidden = Surface(replace(filmed, views={"train": views})).hidden
         regions = {**filmed.regions, UNSEEN_REGION: hidden}
         neutral = (filmed.neutral @ turn.T).astype(np.float32)
-        return filmed_sides(Avatar(empty, "stga", neutral, filmed.faces, regions=regions))
+        return observed_sides(Avatar(empty, "stga", neutral, filmed.faces, regions=regions))
 
     def filmed_from(right, left):
         return (

@@ -19,7 +19,7 @@ from stga_addon.training.optimize.frames import (
     UNSEEN_LIMIT_FRACTION,
     FrameStore,
 )
-from stga_addon.training.optimize.initial_splats import initial_splats, unseen_share
+from stga_addon.training.optimize.initial_splats import initial_splats, unseen_fraction
 from stga_addon.training.optimize.surface import GRAZING_COSINE, UNSEEN_COSINE
 from stga_addon.training.optimize.trainer import Trainer
 
@@ -203,7 +203,7 @@ def test_unseen_fraction(toy):
     splats = initial_splats(toy, quick_settings(lattice=0))
     splats.unbound[::2] = True
     splats.xyz[:] += default_rng(0).normal(0, 0.1, splats.xyz.shape).astype(np.float32)
-    found = unseen_share(toy, "stga", splats)
+    found = unseen_fraction(toy, "stga", splats)
     first = toy.views["train"][0].timestep
     frames = face_frames(toy.mesh(first), toy.faces, toy.neutral, "stga")
     world = to_world(splats, frames).xyz.astype(np.float64)

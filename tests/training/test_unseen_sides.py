@@ -487,7 +487,7 @@ def test_what_lips_and_lids_hide(bundled, turning, outside):
         assert rows.sum() > 20
         assert sides.color[rows].max(1).mean() < 0.3
     sockets = (part == part[0]) & ~outside & (away < 0.09) & (level > -0.3)
-    sockets &= ~sides.shown & (np.abs(centers[:, 0]) < 0.06)
+    sockets &= ~sides.visible & (np.abs(centers[:, 0]) < 0.06)
     assert sockets.sum() > 20
     assert (sides.color[sockets].max(1) > 0.3).mean() > 0.95
     lips = np.argsort(np.where(inside & (part == part[0]), away, np.inf))[:10]
@@ -504,13 +504,13 @@ def test_splats_behind_closed_lips_stay_small(frontal):
     sides = frontal.sides
     outside = frontal.surface.outside
     lips = capture.regions["mouth"] & (outside | ~sides.triangles)
-    inner = lips & ~outside & ~sides.shown
+    inner = lips & ~outside & ~sides.visible
     of_inner = inner[state.face] & ~state.unbound
     assert of_inner.sum() > 20
     side = np.sqrt(2 * face_areas(capture.neutral, capture.faces)) / frontal.unit_lengths
     width = np.exp(state.parameters.log_scale).max(1)
     assert (width[of_inner] < 0.4 * side[state.face[of_inner]]).all()
-    of_outer = (lips & outside & sides.shown)[state.face] & ~state.unbound
+    of_outer = (lips & outside & sides.visible)[state.face] & ~state.unbound
     assert (state.parameters.log_scale[of_outer] == before[of_outer]).any(1).mean() > 0.9
 
 
@@ -561,7 +561,7 @@ def test_a_chest_below_the_images(bundled, tmp_path):
     trainer = Trainer(capture, quick_settings(iterations=1), {})
     frames = trainer.frames
     row = view.camera.project(middles(capture)[0])[0][:, 1]
-    seen, cosine = frames.surface.seen_from(np.array([0.0, 0.0, 1.0]))
+    seen, cosine = frames.surface.visible_from(np.array([0.0, 0.0, 1.0]))
     faces_camera = seen & (cosine > 0.5)
     below = faces_camera & (row > end + 5)
     assert below.sum() > 100
@@ -597,7 +597,7 @@ def test_a_mirrored_cheek(bundled, tmp_path):
     hair = turned & temple & (centers[:, 2] > 0.03) & (level < 0.9)
     for rows in (cheek & (facing < GRAZING_COSINE), cheek, hair):
         assert rows.sum() > 20
-        assert sides.shown[rows].mean() < 0.1
+        assert sides.visible[rows].mean() < 0.1
         away = abs(255 * sides.color[rows] - color[rows])
         assert (away < 0.1 * color[rows] + 4).mean() > 0.9
 
@@ -652,7 +652,7 @@ def test_hair_behind_a_cheek_is_no_streak_on_it():
     none = np.zeros(4, bool)
     sides = UnseenSides(
         triangles=none,
-        shown=~none,
+        visible=~none,
         color=np.tile(skin, (4, 1)),
         is_hair=np.array([False, False, False, True]),
         view_dependence=np.array([0.5, 0.2, 0.0, 1.0]),
@@ -863,7 +863,7 @@ def test_a_torso_has_a_back(bundled, tmp_path):
 
 def test_a_torso_is_whole_beyond_the_images(bundled, tmp_path):
     """Catches blurred, half transparent cloth where a torso leaves the images, as no view splits
-    splats there; and what *Filmed Only* would show of it."""
+    splats there; and what *CaptureCoverage Only* would show of it."""
     torso = with_torso(bundled)
     capture = filmed(torso, painted(torso), (-20, 0, 20), 0.0, tmp_path)
     trainer = Trainer(capture, quick_settings(iterations=1), {})

@@ -107,10 +107,10 @@ def test_plates_without_the_person(walled):
     """Catches a person who remains, a blurred wall, and holes without a color."""
     for plate in clean_plates(open_capture(walled)):
         stripes = np.broadcast_to(STRIPES, plate.image.shape) / 255
-        assert 0.3 < plate.seen.mean() < 1
-        assert not plate.seen[factory.silhouette()].any()
-        np.testing.assert_allclose(plate.image[plate.seen], stripes[plate.seen], atol=1e-6)
-        hidden = plate.image[~plate.seen]
+        assert 0.3 < plate.observed.mean() < 1
+        assert not plate.observed[factory.silhouette()].any()
+        np.testing.assert_allclose(plate.image[plate.observed], stripes[plate.observed], atol=1e-6)
+        hidden = plate.image[~plate.observed]
         assert (hidden >= stripes.min((0, 1)) - 1e-6).all()
         assert (hidden <= stripes.max((0, 1)) + 1e-6).all()
 

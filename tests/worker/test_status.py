@@ -27,7 +27,7 @@ from stga_addon.worker.launch import (
     worker_environment,
 )
 from stga_addon.worker.status import WorkerState, WorkerStatus, inspect_worker
-from stga_addon.worker.training_python import own_python
+from stga_addon.worker.training_python import this_python
 
 ROOT = Path(__file__).resolve().parents[2]
 # A worker that reports progress until it is cancelled, or does what its argument says.
@@ -302,12 +302,12 @@ def test_worker_environment(monkeypatch, tmp_path):
     program.touch()
     monkeypatch.setattr(sys, "prefix", str(tmp_path))
     monkeypatch.setattr(sys, "executable", "/elsewhere/shims/python3")
-    own_python.cache_clear()
+    this_python.cache_clear()
     try:
-        assert own_python() == (str(program) if os.name == "posix" else sys.executable)
+        assert this_python() == (str(program) if os.name == "posix" else sys.executable)
         assert worker_environment({"PYTHONPATH": "/other"}, str(program))["PYTHONNOUSERSITE"] == "1"
     finally:
-        own_python.cache_clear()
+        this_python.cache_clear()
 
 
 def test_a_worker_of_the_own_interpreter(monkeypatch, tmp_path):

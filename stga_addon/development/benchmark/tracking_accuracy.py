@@ -32,8 +32,8 @@ from ...tracking.footage.open import open_footage
 from ...tracking.footage.sequences import FrameRange
 from ...tracking.head_model import read_head_model
 from ...tracking.landmarks import read_places
+from ...tracking.observed_surface import in_sight
 from ...tracking.opened import TrackingOptions
-from ...tracking.seen_surface import in_sight
 from ...tracking.track import track
 
 SHAPES = {"brows": "brow", "lids": "eyeBlink", "lips": "mouth", "jaw": "jaw"}

@@ -73,8 +73,8 @@ def evaluated_splats(splat_object: Any) -> tuple[np.ndarray, ...]:
     depsgraph = bpy.context.evaluated_depsgraph_get()
     for instance in depsgraph.object_instances:
         owner = instance.parent if instance.is_instance else instance.object
-        is_own = owner is not None and owner.original == splat_object
-        if is_own and instance.object.type == "POINTCLOUD":
+        is_of_object = owner is not None and owner.original == splat_object
+        if is_of_object and instance.object.type == "POINTCLOUD":
             names = "position", stored.WORLD_ROTATION, stored.WORLD_SCALE
             return tuple(stored.read_attribute(instance.object.data, name) for name in names)
     raise StgaError(f"{splat_object.name}: shows quads or nothing, expected points")

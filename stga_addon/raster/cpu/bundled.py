@@ -16,7 +16,7 @@ from llvmlite.binding import get_host_cpu_features
 from numba.core import config
 from numba.core.caching import UserProvidedCacheLocator
 
-from ..kernel_cache import OWN_KERNELS, has_kernels
+from ..kernel_cache import NATIVE_KERNELS, has_kernels
 
 PACKAGE = "stga_addon"
 """Name under which workers import the package. A compiled kernel refers to its modules by name;
@@ -43,7 +43,7 @@ def kernel_folder(native: Path, beside: Path) -> tuple[Path, bool]:
     if not BUNDLE.is_dir() or not runs or not __name__.startswith(f"{PACKAGE}."):
         return native, False
     faster = features.get(FASTER_FEATURE)
-    if faster and (OWN_KERNELS in os.environ or has_kernels(native)):
+    if faster and (NATIVE_KERNELS in os.environ or has_kernels(native)):
         return native, False
     folder = beside if faster else native
     with suppress(OSError):  # they are compiled then

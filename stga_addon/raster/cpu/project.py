@@ -221,11 +221,11 @@ def _tan_limits(intrinsics, size):
 def _bound(b, column, q):
     """One of the block's bounds in tiles; 0 of a splat that is not visible, whose bounds may be no
     number."""
-    return np.int64(b[column + q] if b[block.SEEN + q] > ZERO else ZERO)
+    return np.int64(b[column + q] if b[block.VISIBLE + q] > ZERO else ZERO)
 
 
 @part_jit
-def _list_seen(rows, covered, rect, b, visible):
+def _list_visible(rows, covered, rect, b, visible):
     """List the places of the block's visible splats in `visible`, their bounds shrunk to the
     rendered tiles, and write `rect` of all as of splats that are not. Returns how many are visible.
 
@@ -234,7 +234,7 @@ def _list_seen(rows, covered, rect, b, visible):
     count = np.uint64(0)
     for q in range(np.uint64(len(rows))):
         i = np.uint64(rows[q])
-        outside = np.int32(min(ZERO, b[block.SEEN + q]))
+        outside = np.int32(min(ZERO, b[block.VISIBLE + q]))
         x0 = _bound(b, block.X0, q)
         y0 = _bound(b, block.Y0, q)
         x1 = _bound(b, block.X1, q)
@@ -330,7 +330,7 @@ def project_forward(
             if antialiased:
                 block.compensate_low_pass(b)
             block.project_bounds(b, np.float32(tiles_x), np.float32(tiles_y))
-            count = _list_seen(some, covered, projection.rect, b, visible)
+            count = _list_visible(some, covered, projection.rect, b, visible)
             if count == 0:
                 continue
             block.compute_harmonics(b, frames.to_world)

@@ -35,10 +35,10 @@ TWO_COLUMNS = np.uint64(2 * BLOCK_SPLATS)
  LOCAL_Z, RAW_0, RAW_1, RAW_2, RAW_3, LOG_0, LOG_1, LOG_2, LOGIT) = (
     np.uint64(n * BLOCK_SPLATS) for n in range(23))  # fmt: skip
 # On the screen: the geometry of `layout.Projection`; the covariance, its determinant, and that of
-# the splat without LOW_PASS_PX2; bounds in tiles; SEEN: 1 where the splat may be visible, −1 where
-# it is not finite, else 0.
+# the splat without LOW_PASS_PX2; bounds in tiles; VISIBLE: 1 where the splat may be visible, −1
+# where it is not finite, else 0.
 (MEAN_X, MEAN_Y, PRECISION_X, SHEAR, PRECISION_Y, OPACITY, EXTENT_Y, XX, XY, YY, DETERMINANT, SHARP,
- X0, Y0, X1, Y1, SEEN) = (np.uint64(n * BLOCK_SPLATS) for n in range(23, 40))  # fmt: skip
+ X0, Y0, X1, Y1, VISIBLE) = (np.uint64(n * BLOCK_SPLATS) for n in range(23, 40))  # fmt: skip
 # In camera space; the unit vector from the camera in world space, 1 / distance; and the harmonics
 # of the vector.
 (CAMERA_X, CAMERA_Y, CAMERA_Z, TOWARD_X, TOWARD_Y, TOWARD_Z, PER_DISTANCE) = (
@@ -258,7 +258,7 @@ def compensate_low_pass(b):
 
 @inline_jit
 def project_bounds(b, tiles_x, tiles_y):
-    """Write PRECISION_X, SHEAR, PRECISION_Y, EXTENT_Y, X0 to Y1 and SEEN; tiles_x, tiles_y
+    """Write PRECISION_X, SHEAR, PRECISION_Y, EXTENT_Y, X0 to Y1 and VISIBLE; tiles_x, tiles_y
     float32."""
     size = np.float32(TILE)
     for q in range(np.uint64(BLOCK_SPLATS)):
@@ -282,7 +282,7 @@ def project_bounds(b, tiles_x, tiles_y):
         finite = (opacity >= ZERO) & (det < infinite)
         finite = finite & (abs(mean_x) < infinite) & (abs(mean_y) < infinite)
         visible = (ONE if reach > ZERO else ZERO) if finite else -ONE
-        b[SEEN + q] = ZERO if b[CAMERA_Z + q] < NEAR_M else visible
+        b[VISIBLE + q] = ZERO if b[CAMERA_Z + q] < NEAR_M else visible
 
 
 @inline_jit

@@ -30,11 +30,11 @@ from .elementary import acquire, exchange, fetch_add, latest, pause, release, yi
 NEXT, UNITS, PIECE, FAILED, STAGES = range(5)
 """Indices in a kernel's `work` int64 of its next unit, the number of units, the size of a piece,
 whether a worker has failed; from STAGES on, each stage's next unit and number of finished units."""
-SEEN = STAGES + 2 * 14
+WORKER_WORDS = STAGES + 2 * 14
 """Number of words of `work` that workers see: those above, for up to 14 stages."""
 # The caller sees all of the words. Those that many threads write lie apart, because a
 # processor's core takes over 64 or 128 bytes at a time.
-LIMIT, ENTRY = range(SEEN, SEEN + 2)
+LIMIT, ENTRY = range(WORKER_WORDS, WORKER_WORDS + 2)
 """Words that hold the number of useful helpers, and the function that calls the kernel with the
 arguments in CALL."""
 JOB = 48
@@ -131,7 +131,7 @@ class ThreadPool:
                 self._busy.release()
             except RuntimeError:  # it is another's, or nobody's
                 pass
-        work = np.zeros(SEEN, np.int64)
+        work = np.zeros(WORKER_WORDS, np.int64)
         work[UNITS] = units
         work[PIECE] = piece
         kernel(work, *arguments)
@@ -143,7 +143,7 @@ class ThreadPool:
         if not self._threads:
             self.start()
         words = self._words
-        words[:SEEN] = 0
+        words[:WORKER_WORDS] = 0
         words[UNITS], words[PIECE], words[LIMIT] = sizes
         try:
             kernel(words, *arguments)
@@ -195,12 +195,13 @@ def _help(words: np.ndarray, slot: int, patience: int, errors: list[BaseExceptio
 @intrinsic
 def _keep_call(typing: Any, words: Any) -> Any:
     """Keep the arguments of the kernel that this is a part of, which has no other way to be called
-    than by its machine code, and a function that calls it with them; of `work`, SEEN words."""
+    than by its machine code, and a function that calls it with them; of `work`, WORKER_WORDS
+    words."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         kernel = builder.function
         values = list(kernel.args[2:])  # after where it returns a value and an error
-        values[2] = values[5] = ir.IntType(64)(SEEN)  # length and shape of the first array
+        values[2] = values[5] = ir.IntType(64)(WORKER_WORDS)  # length and shape of the first array
         # An array begins with two pointers, the first to its count of references. The caller holds
         # the arrays: helpers count none, or the processor's cores would take it from each other.
         for n, (value, following) in enumerate(pairwise(values)):
@@ -328,7 +329,7 @@ def _open(words):
 @inline_jit
 def call_helpers(work):
     """Call the helpers to the kernel that begins with this."""
-    if len(work) > SEEN:
+    if len(work) > WORKER_WORDS:
         _keep_call(work)
         _open(work)
 
@@ -341,7 +342,7 @@ def pieces(work):
     while begin < work[UNITS]:
         yield begin, min(begin + work[PIECE], work[UNITS])
         begin = fetch_add(work, NEXT, work[PIECE])
-    if len(work) > SEEN:
+    if len(work) > WORKER_WORDS:
         join(work)
 
 
@@ -369,7 +370,7 @@ def stage(work, number, units):
 @inline_jit
 def end_stages(work):
     """Wait, in the caller, until no helper is in the kernel."""
-    if len(work) > SEEN:
+    if len(work) > WORKER_WORDS:
         join(work)
 
 

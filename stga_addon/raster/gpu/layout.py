@@ -120,7 +120,7 @@ UNIFORMS = {
 """Structs of the kernels: of an image (camera, sizes, options), a mesh, a target, some columns of a
 table, and a step."""
 
-_OWN = (
+_LOCAL = (
     "WORKGROUP HIDDEN WANTED MAX_GROUPS SORT_BLOCK SEGMENT_PAIRS SORT_GROUPS PAIR_GROUPS PAIRS"
     " NEEDED OVERFLOWED XYZ ROTATION LOG_SCALE OPACITY_LOGIT SH FRAME_ORIGIN FRAME_MATRIX"
     " FRAME_COLOR FRAME_STRIDE"
@@ -136,7 +136,7 @@ _CPU = {
     optimizer: "MAX_GRADIENT",
 }
 CONSTANTS: dict[str, int | float] = {
-    **{name: globals()[name] for name in _OWN.split()},
+    **{name: globals()[name] for name in _LOCAL.split()},
     **{name: getattr(module, name) for module, names in _CPU.items() for name in names.split()},
     **{f"WINDOW_{k}": float(getattr(image_loss, f"W{5 - k}")) for k in range(6)},
     "DIGITS": 1 << DIGIT_BITS,

@@ -9,7 +9,7 @@ import bpy
 import numpy as np
 
 from ...avatar.file import UNSEEN_REGION, Avatar, AvatarLight
-from ...avatar.filmed import FROM_ALL_SIDES, filmed_sides
+from ...avatar.observed import FROM_ALL_SIDES, observed_sides
 from ...avatar.offsets import OFFSETS
 from ...avatar.splats import Splats
 from ...errors import StgaError
@@ -17,7 +17,7 @@ from .. import compat, tags
 from ..arrays import has_triangles, mesh_triangles, mesh_vertices, triangle_mesh
 from ..compat import animation_curves, modifier_input, set_modifier_input
 from ..layers import DisplaySettings
-from ..objects import lock, own_collections, remove
+from ..objects import collections_of, lock, remove
 from . import splat_attributes as stored
 from . import splat_nodes
 from .frame_nodes import SIGNALS
@@ -68,7 +68,7 @@ def show_avatar(
     splat_object = replaced
     if splat_object is None:
         scene = scene or bpy.context.scene
-        local = [each for each in own_collections(head) if each.library is None]
+        local = [each for each in collections_of(head) if each.library is None]
         splat_object = _splat_object(title, [*local, scene.collection][0], _tree_options(avatar))
         # A sibling of the head: both have the same object space.
         splat_object.parent = head.parent
@@ -79,7 +79,7 @@ def show_avatar(
         _exchange_tree(splat_object, splat_nodes.splat_tree(_tree_options(avatar)))
     splat_object[tags.CONVENTION] = avatar.convention
     splat_object[tags.ANTIALIASED] = avatar.antialiased
-    splat_object[tags.FILMED] = filmed_sides(avatar)
+    splat_object[tags.OBSERVED] = observed_sides(avatar)
     set_input(splat_object, splat_nodes.HEAD, head)
     before = get_input(splat_object, splat_nodes.NEUTRAL)
     # In no collection: it is never displayed, and exists as long as the splats that point to it.
@@ -89,8 +89,8 @@ def show_avatar(
     set_input(splat_object, splat_nodes.NEUTRAL, neutral)
     if before is not None and before.users == 0:
         remove([before])
-    for shown_in in splat_object.users_scene:
-        use_transparent_bounces(shown_in)
+    for using_scene in splat_object.users_scene:
+        use_transparent_bounces(using_scene)
     splat_object.data.clear_geometry()  # also of attributes that only the avatar before has
     update_splats(splat_object, prepared)
     return splat_object
@@ -123,7 +123,7 @@ def splats_of(head: Any, scene: Any, linked: bool = False) -> list[Any]:
     return [each for each in wanted if followed_head(each) == head]
 
 
-def check_own_data(splat_object: Any) -> None:
+def check_editable_data(splat_object: Any) -> None:
     """Raise StgaError where a splat object's splats are in another file: others would be gone after
     reopening."""
     data = splat_object.data
@@ -159,7 +159,7 @@ def _stored_neutral(splat_object: Any) -> Any:
     return None if neutral is None else neutral.data
 
 
-def _own_neutral(splat_object: Any) -> Any:
+def _unshared_neutral(splat_object: Any) -> Any:
     """The neutral mesh to write into: a new one where other splats, as those of a duplicate that
     is kept, have the same."""
     neutral = get_input(splat_object, splat_nodes.NEUTRAL)
@@ -177,7 +177,7 @@ def _own_neutral(splat_object: Any) -> Any:
 def update_splats(splat_object: Any, prepared: SplatAttributes) -> None:
     """Show other splats in the same object. prepared: `avatar_attributes` where `can_update` is
     true."""
-    neutral = _own_neutral(splat_object)
+    neutral = _unshared_neutral(splat_object)
     stored.write_attributes(neutral, prepared.neutral, "FACE")
     stored.write_light(neutral, prepared.light)
     neutral.update()
@@ -190,7 +190,7 @@ def store_light(splat_object: Any, avatar: Avatar) -> bool:
     count = len(splat_object.data.vertices)
     if neutral is None or not has_triangles(neutral, avatar.faces) or count != len(avatar.splats):
         return False
-    stored.write_light(_own_neutral(splat_object), avatar.light)
+    stored.write_light(_unshared_neutral(splat_object), avatar.light)
     stored.write_attributes(splat_object.data, stored.albedo_attribute(avatar), "POINT")
     splat_object.data.update()
     splat_object.data[tags.REVISION] = uuid4().hex  # what was read of it before is out of date
@@ -271,9 +271,9 @@ def later_modifiers(splat_object: Any) -> list[Any]:
     return [each for each in splat_object.modifiers[last + 1 :] if each.show_viewport]
 
 
-def is_partly_filmed(splat_object: Any) -> bool:
+def is_partly_observed(splat_object: Any) -> bool:
     """Whether some of its splats are on sides of the head that no camera saw."""
-    return splat_object.get(tags.FILMED, "") not in ("", FROM_ALL_SIDES)
+    return splat_object.get(tags.OBSERVED, "") not in ("", FROM_ALL_SIDES)
 
 
 def triangles_hint(splat_object: Any, depsgraph: Any) -> str | None:

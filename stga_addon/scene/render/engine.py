@@ -237,7 +237,7 @@ class SplatsEngine(bpy.types.RenderEngine):  # type: ignore[misc]
         evaluated = camera.evaluated_get(depsgraph) if camera is not None else None
         size = self.resolution_x, self.resolution_y
         view = camera_view(render_camera(evaluated, depsgraph, *size, border, eye), evaluated)
-        return lens.seen_from(view, evaluated, sample.point)
+        return lens.view_from(view, evaluated, sample.point)
 
     def _image(
         self,

@@ -61,7 +61,7 @@ def samples(scene: Any, camera: Any) -> list[Sample]:
     return [Sample(float(offset), point) for offset, point in zip(offsets, points, strict=True)]
 
 
-def seen_from(view: View, camera: Any, point: np.ndarray) -> View:
+def view_from(view: View, camera: Any, point: np.ndarray) -> View:
     """The view from a point (2,) of the aperture of an evaluated camera object, in radii: what is
     in focus stays where it is in the image."""
     if not point.any():

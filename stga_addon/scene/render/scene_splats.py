@@ -159,7 +159,7 @@ def visible_layers(
     for owner, each, matrix in _visible_objects(depsgraph, view, _may_show_splats):
         if not tags.is_splats(each) or not is_wanted(each):
             continue
-        if view is None and not _is_seen(owner, each, depsgraph):
+        if view is None and not _is_camera_visible(owner, each, depsgraph):
             continue
         stored = cache.get(each)
         to_world = np.array(matrix, np.float64)
@@ -207,28 +207,26 @@ def native_layers(
     those that it has, too."""
     layers = []
     for instance in depsgraph.object_instances if compat.NATIVE_SPLATS else ():
-        evaluated_object = instance.object
-        owner = instance.parent if instance.is_instance else evaluated_object
+        candidate = instance.object
+        owner = instance.parent if instance.is_instance else candidate
         # the data are there until the next instance only
-        original = evaluated_object.original
-        if evaluated_object.type != "POINTCLOUD":
+        original = candidate.original
+        if candidate.type != "POINTCLOUD":
             continue
-        if _is_own(owner.original, original) and not is_wanted(original):
+        if _in_visible_layers(owner.original, original) and not is_wanted(original):
             continue
-        is_hidden = owner.hide_render or not (
-            owner.visible_camera and evaluated_object.visible_camera
-        )
+        is_hidden = owner.hide_render or not (owner.visible_camera and candidate.visible_camera)
         if view is None and is_hidden:
             continue
-        splats = cache.native(evaluated_object)
+        splats = cache.native(candidate)
         if splats is not None:
             to_world = np.array(instance.matrix_world, np.float64)
-            holdout = view is None and (owner.is_holdout or evaluated_object.is_holdout)
+            holdout = view is None and (owner.is_holdout or candidate.is_holdout)
             layers.append(SceneLayer(splats, WORLD, to_world, holdout=holdout))
     return layers
 
 
-def _is_own(owner: Any, pointcloud: Any) -> bool:
+def _in_visible_layers(owner: Any, pointcloud: Any) -> bool:
     """Whether `visible_layers` has these splats."""
     is_known = owner == pointcloud or owner.instance_type == "COLLECTION"
     return is_known and tags.is_splats(pointcloud)
@@ -245,14 +243,10 @@ def evaluated_splats(depsgraph: Any, cache: SplatCache, to_file: np.ndarray) -> 
     highest degree among them, by a matrix (4, 4) from Blender's axes; native ones as modifiers
     after ours leave them. Raises StgaError as `visible_layers`, and where there are none."""
 
-    def is_changed(splat_object: Any) -> bool:
-        return (
-            bool(later_modifiers(splat_object)) and display_mode(splat_object) == splat_nodes.NATIVE
-        )
+    def is_changed(candidate: Any) -> bool:
+        return bool(later_modifiers(candidate)) and display_mode(candidate) == splat_nodes.NATIVE
 
-    layers = visible_layers(
-        depsgraph, cache, is_wanted=lambda splat_object: not is_changed(splat_object)
-    )
+    layers = visible_layers(depsgraph, cache, is_wanted=lambda candidate: not is_changed(candidate))
     layers += native_layers(depsgraph, cache, is_wanted=is_changed)
     camera = depsgraph.scene.camera
     eye = None if camera is None else np.array(camera.evaluated_get(depsgraph).matrix_world)[:3, 3]
@@ -273,9 +267,7 @@ def evaluated_splats(depsgraph: Any, cache: SplatCache, to_file: np.ndarray) -> 
 def with_heads(scene: Any) -> list[Any]:
     """The splat objects of the scene and its background, and the heads that they follow, for
     `kept_evaluated`."""
-    objects = [
-        each for each_scene in (scene, *_background_scenes(scene)) for each in each_scene.objects
-    ]
+    objects = [each for source in (scene, *_background_scenes(scene)) for each in source.objects]
     splats = list(filter(tags.is_splats, objects))
     return [*splats, *map(followed_head, splats)]
 
@@ -311,7 +303,7 @@ def _visible_objects(
     that are visible. is_asked: asked first, because all else takes longer. view: as of
     `visible_layers`."""
     visible = list[Any]()
-    for layer in shown_view_layers(depsgraph):
+    for layer in rendered_view_layers(depsgraph):
         if view is None:
             visible += _rendered_objects(layer.layer_collection, depsgraph, is_asked)
         elif layer == depsgraph.view_layer or view.local_view is None:
@@ -324,7 +316,7 @@ def _visible_objects(
     ]
 
 
-def shown_view_layers(depsgraph: Any) -> list[Any]:
+def rendered_view_layers(depsgraph: Any) -> list[Any]:
     """The depsgraph's view layer, and that which Blender shows of each background scene."""
     layers = [depsgraph.view_layer]
     for scene in _background_scenes(depsgraph.scene):
@@ -361,9 +353,9 @@ def _with_instances(
                 yield from _with_instances(member, depsgraph, inside, is_asked)
 
 
-def _is_seen(owner: Any, instance: Any, depsgraph: Any) -> bool:
+def _is_camera_visible(owner: Any, instance: Any, depsgraph: Any) -> bool:
     """Whether the camera sees an object of a final image, which is an instance of `owner`."""
-    layers = shown_view_layers(depsgraph)
+    layers = rendered_view_layers(depsgraph)
     is_indirect = any(owner.indirect_only_get(view_layer=layer) for layer in layers)
     visible = (each.evaluated_get(depsgraph).visible_camera for each in (owner, instance))
     return not is_indirect and all(visible)
@@ -371,7 +363,7 @@ def _is_seen(owner: Any, instance: Any, depsgraph: Any) -> bool:
 
 def _is_holdout(owner: Any, instance: Any, depsgraph: Any) -> bool:
     """Whether an object of a final image hides what it covers, by its collections or its own."""
-    layers = shown_view_layers(depsgraph)
+    layers = rendered_view_layers(depsgraph)
     is_masked = any(owner.holdout_get(view_layer=layer) for layer in layers)
     holdouts = (each.evaluated_get(depsgraph).is_holdout for each in (owner, instance))
     return is_masked or any(holdouts)

@@ -48,7 +48,7 @@ class InverseView:
 
     def __init__(self, axis: np.ndarray, displayed: np.ndarray) -> None:
         self._axis = axis
-        self._shown = displayed
+        self._displayed = displayed
         nodes = np.linspace(0, 1, INVERSE_GRID) ** 2  # denser in the dark
         target = np.stack(np.meshgrid(nodes, nodes, nodes, indexing="ij"), -1).reshape(-1, 3)
         # Places in samples that show `target` best, by damped Gauss-Newton steps.
@@ -71,7 +71,7 @@ class InverseView:
     def show(self, linear: np.ndarray) -> np.ndarray:
         """sRGB (…, 3) that the view transform shows of scene-linear colors."""
         place = np.interp(linear, self._axis, np.arange(len(self._axis)))
-        return interpolate(self._shown, place.reshape(-1, 3)).reshape(linear.shape)
+        return interpolate(self._displayed, place.reshape(-1, 3)).reshape(linear.shape)
 
     def to_linear(self, srgb: np.ndarray) -> np.ndarray:
         """Scene-linear colors (…, 3) float32 that are shown as `srgb`, or most nearly so."""
@@ -167,7 +167,7 @@ def _scalars(data: Any) -> list[Any]:
 def _inverse(scene: Any) -> InverseView:
     axis = _axis(scene)
     grid = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), -1)
-    displayed = _shown(scene, grid.reshape(GRID**2, GRID, 3))
+    displayed = _displayed(scene, grid.reshape(GRID**2, GRID, 3))
     return InverseView(axis, displayed.reshape(grid.shape))
 
 
@@ -176,7 +176,7 @@ def _axis(scene: Any) -> np.ndarray:
     more, as just above the black level of curves."""
     stops = np.linspace(DARKEST, BRIGHTEST, RAMP - 1) - scene.view_settings.exposure
     ramp = np.append(0, 2**stops)
-    displayed = _shown(scene, np.repeat(ramp[None, :, None], 3, axis=2))[0]
+    displayed = _displayed(scene, np.repeat(ramp[None, :, None], 3, axis=2))[0]
     steps = np.abs(np.diff(displayed, axis=0)).max(axis=1)
     even = np.full(len(steps), 1 / len(steps))
     total = np.cumsum(even + STEP_WEIGHT * steps / max(steps.sum(), 1e-12))
@@ -184,7 +184,7 @@ def _axis(scene: Any) -> np.ndarray:
     return np.interp(place, np.arange(RAMP), ramp)
 
 
-def _shown(scene: Any, linear: np.ndarray) -> np.ndarray:
+def _displayed(scene: Any, linear: np.ndarray) -> np.ndarray:
     """(H, W, 3) sRGB 0…1 that an sRGB display shows of scene-linear colors (H, W, 3)."""
     height, width, _ = linear.shape
     pixels = np.ones((height, width, 4), np.float32)
@@ -217,7 +217,7 @@ def _shown(scene: Any, linear: np.ndarray) -> np.ndarray:
         bpy.data.scenes.remove(copy)
 
 
-MIN_SEEN = 1e-6
+MIN_VISIBLE = 1e-6
 """Fraction of a pixel below which its color does not matter."""
 
 
@@ -249,7 +249,7 @@ def combined(
         image[...] = *background, 1
         color = np.clip(color + (1 - fraction) * behind, 0, 1)
         image[..., 3] = 1 - held_out
-    image[covered, :3] = to_linear(color / np.maximum(visible, MIN_SEEN)) * visible
+    image[covered, :3] = to_linear(color / np.maximum(visible, MIN_VISIBLE)) * visible
     return image
 
 

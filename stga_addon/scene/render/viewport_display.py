@@ -106,7 +106,7 @@ class GpuDisplay:
             layers += native_layers(context.evaluated_depsgraph_get(), self.cache, space)
         if not layers:
             if self._renderer is not None and not any(
-                is_shown_as_trained(candidate) for candidate in bpy.data.objects
+                is_displayed_as_trained(candidate) for candidate in bpy.data.objects
             ):
                 self._renderer = None  # frees its textures
             return
@@ -138,7 +138,7 @@ class GpuDisplay:
 display = GpuDisplay()
 
 
-def is_shown_as_trained(candidate: Any) -> bool:
+def is_displayed_as_trained(candidate: Any) -> bool:
     """Whether the object is one of splats that are displayed as trained."""
     return tags.is_splats(candidate) and display_mode(candidate) == AS_TRAINED
 
@@ -152,7 +152,7 @@ def show_points() -> float | None:
             if area.type == "VIEW_3D" and area.spaces.active.shading.type == "RENDERED":
                 area.spaces.active.shading.type = "MATERIAL"
     for candidate in bpy.data.objects:
-        if candidate.library is None and is_shown_as_trained(candidate):
+        if candidate.library is None and is_displayed_as_trained(candidate):
             set_input(candidate, splat_nodes.DISPLAY, POINTS)
     return POINTS_INTERVAL_S if display.failed else None
 

@@ -63,7 +63,7 @@ def import_head(capture: Capture, warn: Warn = log_warning, correctives: str = "
         meshes = [flat_floats(capture.mesh(timestep)) for timestep in capture.timesteps]
     before = _imported_before(capture)
     if before is not None:
-        check_own(before)
+        check_editable(before)
         _check_parent(before)
         if not arrays.has_triangles(before.data, capture.faces):
             gone = "shape keys, vertex groups and materials of before are gone"
@@ -133,7 +133,7 @@ MAX_DIFFERENCE_M = 1e-4
 
 def _give_back(owner: Any, kept: KeptAnimation) -> None:
     if kept.tracks:
-        keyframes.push_down_own(owner, kept.blend)
+        keyframes.push_down_motion(owner, kept.blend)
     if kept.held:
         keyframes.hold_beside_strips(owner, kept.held)
     give_animation(owner, kept)
@@ -375,7 +375,7 @@ def check_local(head: Any) -> None:
         raise StgaError(f"{head.name}: {LINKED}")
 
 
-def check_own(head: Any) -> None:
+def check_editable(head: Any) -> None:
     """Raise StgaError where a head is linked or overridden: shape keys, vertex groups and
     properties that are added to a library override are gone after reopening."""
     blocks = (head, head.data)
@@ -397,7 +397,9 @@ def usable_rig(head: Any, with_sliders: bool = True) -> Any:
     a library override cannot change. Raises StgaError that says why not."""
     check_local(head)
     if with_sliders and head.data.library is not None:
-        raise StgaError(f"{head.name}: is overridden, but its sliders are in another file: {OWN}")
+        raise StgaError(
+            f"{head.name}: is overridden, but its sliders are in another file: {REMEDY}"
+        )
     rig = rig_of(head)
     override = rig.override_library
     if rig.library is not None or (override is not None and override.is_system_override):
@@ -412,7 +414,7 @@ def usable_rig(head: Any, with_sliders: bool = True) -> Any:
     return rig
 
 
-OWN = "open that file, or make the head's mesh local"
+REMEDY = "open that file, or make the head's mesh local"
 
 
 def _remove_bone_groups(head: Any, rigs: Sequence[Any]) -> None:

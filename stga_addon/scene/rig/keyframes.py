@@ -214,7 +214,7 @@ def check_keyable(owner: Any) -> None:
         raise StgaError(f"{owner.name}: is in tweak mode in the NLA editor; leave tweak mode first")
 
 
-def check_own_action(owner: Any) -> None:
+def check_keyable_action(owner: Any) -> None:
     """Raise StgaError where keyframes cannot be added to the action of `owner`."""
     check_keyable(owner)
     action = owner.animation_data.action if owner.animation_data is not None else None
@@ -236,7 +236,7 @@ class Placement(NamedTuple):
     blend: float = 0.0
 
 
-def push_down_own(owner: Any, blend: float = 0.0) -> None:
+def push_down_motion(owner: Any, blend: float = 0.0) -> None:
     """Turn the action of rig or shape keys into a strip with effect only where it lasts: beside it
     the face is neutral, and the head stays where it was. blend: frames in which the strip's ends
     pass into the neutral face. Those of a performance are within it, as `Placement` has them; the
@@ -312,7 +312,7 @@ def new_actions(
     for owner in owners:
         title = f"{owner.name} {placement.name}"
         if placement.as_strip:
-            push_down_own(owner, placement.blend)
+            push_down_motion(owner, placement.blend)
             animation = owner.animation_data_create()
             animation.action = bpy.data.actions.new(title)
             continue

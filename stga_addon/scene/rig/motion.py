@@ -16,7 +16,7 @@ from ...flame.forward import FlameFrame, flame_forward
 from ...flame.model import JOINTS, FlameModel
 from ...flame.quaternions import from_axis_angle, multiply, to_axis_angle
 from ...flame.sequence import FlameSequence
-from ..arrays import key_points, own_vertices, read_values, write_curves
+from ..arrays import head_vertices, key_points, read_values, write_curves
 from ..evaluation import evaluated, kept_evaluated
 from ..objects import Identity, Warn, iterate_frames, log_warning
 from . import keyframes
@@ -106,7 +106,7 @@ def sample_motion(
                 if component < sequence.model.n_identity:
                     shape[component] += _key_value(head, name)
         vertices = flame_forward(sequence.model, shape, frame, sequence.static_offset)
-        largest_error = max(largest_error, float(np.abs(vertices - own_vertices(head)).max()))
+        largest_error = max(largest_error, float(np.abs(vertices - head_vertices(head)).max()))
         frames.append(frame)
     if largest_error > MESH_TOLERANCE:
         warn(

@@ -252,8 +252,8 @@ def first_frames(path: Path) -> Video:
         first = next(frames, None)
         if first is None:
             raise ValueError("none of its frames can be decoded")
-        stored = _shown_size(first, Fraction(1))
-        size = _shown_size(first, aspect)
+        stored = _display_size(first, Fraction(1))
+        size = _display_size(first, aspect)
         rest = (frame.pts for frame in itertools.islice(frames, CHECKED_FRAMES - 1))
         times = (first.pts, *rest)
         problems = _unheard(path, first)
@@ -265,7 +265,7 @@ def first_frames(path: Path) -> Video:
     return Video(path, times, (), 0.0, size, stored, aspect, warnings=warnings)
 
 
-def _shown_size(frame: Any, aspect: Fraction) -> tuple[int, int]:
+def _display_size(frame: Any, aspect: Fraction) -> tuple[int, int]:
     """(width, height) as displayed, of pixels of that aspect."""
     size = _square_width(frame, aspect), frame.height
     turn = _turn(frame)

@@ -45,8 +45,8 @@ from ...render.render import render_avatar, to_uint8
 from ...tracking import appearance, solve
 from ...tracking.appearance import NOISE_LEVELS, POINT_FRACTION
 from ...tracking.head_model import HeadModel
+from ...tracking.observed_surface import in_sight, surface_points
 from ...tracking.posed_points import PosedPoints
-from ...tracking.seen_surface import in_sight, surface_points
 from ..schedule import sh_degree
 from ..settings import TrainingSettings
 from .backend import RenderOptions

@@ -70,9 +70,9 @@ CONTINUED_FRACTION = 0.4
 image's width."""
 CONTINUED_OPACITY = 3.0
 """Logit of these splats' opacity, which may never be trained."""
-SEEN_COPIES = 3
+POINT_COPIES = 3
 """Splats for each of the observed points."""
-SEEN_SPREAD = 0.5
+POINT_SPREAD = 0.5
 """Standard deviation in voxels of these splats from their point."""
 
 
@@ -103,7 +103,7 @@ def initial_splats(
     return joined(parts)
 
 
-def unseen_share(capture: Capture, convention: str, splats: Splats) -> np.ndarray:
+def unseen_fraction(capture: Capture, convention: str, splats: Splats) -> np.ndarray:
     """Fraction (N,) of the first training timestep's cameras in whose image an unbound splat does
     not lie.
 
@@ -237,7 +237,7 @@ def visual_hull_points(
     mesh = capture.mesh(torso_points.timestep)
     voxel = voxel_size(capture.mesh(torso_points.timestep))
     spread = np.random.default_rng(0).normal(
-        0, SEEN_SPREAD * voxel, (SEEN_COPIES, *torso_points.at.shape)
+        0, POINT_SPREAD * voxel, (POINT_COPIES, *torso_points.at.shape)
     )
     points = (torso_points.at + spread).reshape(-1, 3)
     _, among = _nearest_triangle(points, mesh, capture.faces[triangles])

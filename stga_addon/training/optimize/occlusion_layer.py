@@ -167,7 +167,7 @@ def _open_front(surface: Surface, at: HeadCoordinates) -> np.ndarray:
     across, _, ahead = at.axes
     front = np.zeros(len(surface.outside), bool)
     for angle in np.radians(BEHIND_DEG):
-        visible, cosine = surface.seen_from(np.sin(angle) * across - np.cos(angle) * ahead)
+        visible, cosine = surface.visible_from(np.sin(angle) * across - np.cos(angle) * ahead)
         front |= visible & (cosine < 0)
     front &= (at.level < CHIN_LEVEL) & ~surface.sticks_out
     height = np.ptp(at.level[front]) if front.any() else 0.0

@@ -155,10 +155,10 @@ class Surface:
         for number in range(OUTSIDE_CAMERAS):
             angle = 2 * np.pi * number / OUTSIDE_CAMERAS
             height = (-0.5, 0.2, 0.9)[number % 3]
-            visible |= self.seen_from(np.array([np.sin(angle), height, np.cos(angle)]))[0]
+            visible |= self.visible_from(np.array([np.sin(angle), height, np.cos(angle)]))[0]
         return visible & ~teeth_of(self.capture)
 
-    def seen_from(self, direction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def visible_from(self, direction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """(F,) bool: triangles of the neutral mesh that a camera in this direction (3,) from its
         middle sees; (F,) cosine of the angle at which they face it."""
         neutral = self.neutral

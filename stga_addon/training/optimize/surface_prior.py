@@ -19,7 +19,7 @@ from .state import parameters_and_average
 from .step_hook import Schedule
 from .unseen_hair import UnseenHair
 
-WELL_SEEN_COSINE = 0.8
+WELL_OBSERVED_COSINE = 0.8
 """Cosine between a triangle and the camera that it faces most above which its splats are well
 observed: others' gradients are compared with theirs."""
 BEHIND_COSINE = -0.5
@@ -116,7 +116,7 @@ class SurfacePrior:
         """(F,) bool: triangles with splats that priors may pull; few with many cameras."""
         surface = self._surface
         sides = self._frames.sides
-        may_be = sides.triangles | ~sides.shown | surface.lids | surface.is_flat
+        may_be = sides.triangles | ~sides.visible | surface.lids | surface.is_flat
         may_be |= self._frames.occlusion_layer.triangles | eyeballs_of(self._frames.capture)
         return np.asarray(may_be | (surface.turned_away > 0))
 
@@ -129,8 +129,8 @@ class SurfacePrior:
         rows = np.flatnonzero(is_bound & self.may_be_pulled[where["face"]])
         if not len(rows):
             return
-        well_seen = is_bound & (self._surface.facing > WELL_SEEN_COSINE)[where["face"]]
-        reference = np.flatnonzero(well_seen if well_seen.any() else is_bound)
+        well_observed = is_bound & (self._surface.facing > WELL_OBSERVED_COSINE)[where["face"]]
+        reference = np.flatnonzero(well_observed if well_observed.any() else is_bound)
         moments = backend.columns(MOMENTS, reference)
         columns = backend.columns(PULLED_COLUMNS, rows)
         splats = BoundSplats(backend, rows, columns, moments, self._is_occluding(columns))
@@ -193,10 +193,10 @@ class PlausibleColor:
         face = splats.face
         moments = splats.columns["second/color"]
         is_occluding = splats.is_occluding
-        fraction = doubt(moments, splats.reference["second/color"]) * ~sides.shown[face]
+        fraction = doubt(moments, splats.reference["second/color"]) * ~sides.visible[face]
         # the avatar is made of averages, which only steps move
-        is_untouched = ~sides.shown[face] & ~moments.any(1)
-        is_folded = known.surface.folded_lids[face] & ~sides.shown[face]
+        is_untouched = ~sides.visible[face] & ~moments.any(1)
+        is_folded = known.surface.folded_lids[face] & ~sides.visible[face]
         is_pinned = sides.triangles[face] | is_occluding | is_untouched | is_folded
         colors = sides.color[face]
         hair = np.flatnonzero(sides.is_hair[face])
@@ -232,7 +232,7 @@ class OpaqueSurface:
         turned_away = np.where(surface.sticks_out, 0, surface.turned_away)
         fraction = (fraction * turned_away[face]) ** 2  # little of what outlines show
         # no view has stepped these: beyond images' edges also lies what faces cameras
-        beyond = surface.outside & ~surface.sticks_out & ~known.sides.shown
+        beyond = surface.outside & ~surface.sticks_out & ~known.sides.visible
         fraction[beyond[face] & ~moments.astype(bool)] = 1
         rows = np.flatnonzero(fraction > MIN_PULL)
         fraction = fraction[rows]
@@ -346,7 +346,7 @@ class SmallLining:
     def __init__(self, known: _Known) -> None:
         capture = known.frames.capture
         sides = known.sides
-        lining = lining_of(capture) & ~known.surface.outside & ~sides.shown & ~sides.triangles
+        lining = lining_of(capture) & ~known.surface.outside & ~sides.visible & ~sides.triangles
         lining &= known.surface.has_few_cameras
         single = lattice_splats(
             capture.neutral, capture.faces, 0, 0, convention=known.frames.convention

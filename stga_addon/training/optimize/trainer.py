@@ -18,7 +18,7 @@ from .density import DensityControl
 from .floaters import FloaterPruning
 from .frames import FrameStore
 from .hidden_layers import above_unseen_hair, hidden_splats, splats_behind
-from .initial_splats import initial_splats, unseen_share
+from .initial_splats import initial_splats, unseen_fraction
 from .make_backend import make_backend
 from .outliers import OutlierReset
 from .outlines import OutlinePruning
@@ -261,6 +261,6 @@ def _placed_splats(frames: FrameStore, settings: TrainingSettings) -> tuple[Trai
     lattice = int((~splats.unbound).sum())
     splats = joined([splats, layer, splats_behind(frames, settings.sh_degree)])
     splats = splats.rows(np.argsort(splats.face, kind="stable"))
-    state = new_state(splats, unseen_share(capture, settings.convention, splats))
+    state = new_state(splats, unseen_fraction(capture, settings.convention, splats))
     state = with_offsets(state, settings.driven_offsets, triangles)
     return state, len(state) + lattice * whole // first - lattice

@@ -34,13 +34,13 @@ teeth count as hidden."""
 SOURCE_COSINE = 0.25
 """Cosine between a triangle and the camera that it faces most above which others take its color:
 hair at the temples and a beard beside the jaw are seen at 60 to 75° at least."""
-WELL_SHOWN_COSINE = 0.5
+WELL_VISIBLE_COSINE = 0.5
 """The same above which a view shows a face better than its mirror image does."""
 FRINGE_COSINE = 0.2
 """The same for the scalp, which takes the color of a fringe where it is not visible itself."""
 FRINGE_FRACTION = 0.2
 """Highest fraction of the visible triangles above the brows; they show hair if there is any."""
-MIN_SHOWN_FRACTION = 0.1
+MIN_VISIBLE_FRACTION = 0.1
 """Fraction of the median of the pixels that show as much of the surface, below which it is not
 visible: a folded eyelid has less."""
 NEAREST = 24
@@ -53,7 +53,7 @@ LEVEL_WEIGHT = 8.0
 """Factor by which visible triangles of neck and shoulders count as farther where they are above or
 below a hidden triangle, along the normal of the collar's plane, instead of beside it: only a neck's
 front has a chin's shadow."""
-SHOWN_COSINE = 0.6
+VIEW_INDEPENDENT_COSINE = 0.6
 """Cosine between a triangle and the camera that it faces most above which its color depends on no
 view; up to SOURCE_COSINE, it depends wholly on the view."""
 OFF_AXIS_WEIGHT = 0.75
@@ -70,7 +70,7 @@ class UnseenSides:
     """Prior of a head where views determine little.
 
     triangles   (F,) bool: no view shows them
-    shown       (F,) bool: the views whose colors were looked at show them well; not those that
+    visible     (F,) bool: the views whose colors were looked at show them well; not those that
                 look as their mirror images
     color       (F, 3) in 0…1 that a triangle plausibly has
     is_hair     (F,) bool: hair's triangles, where any is shown
@@ -80,7 +80,7 @@ class UnseenSides:
     """
 
     triangles: np.ndarray
-    shown: np.ndarray
+    visible: np.ndarray
     color: np.ndarray
     is_hair: np.ndarray
     view_dependence: np.ndarray
@@ -97,23 +97,23 @@ def unseen_sides(surface: Surface) -> UnseenSides:
     is_outside = surface.outside
     color, pixels = mean_colors(capture, _color_views(capture))
     density = pixels / np.maximum(face_areas(capture.neutral, capture.faces), MIN_DIVISOR)
-    facing = density[cosine > WELL_SHOWN_COSINE]
+    facing = density[cosine > WELL_VISIBLE_COSINE]
     median = np.median(facing[facing > 0]) if facing.any() else 0.0
-    visible = density > MIN_SHOWN_FRACTION * median
-    visible |= _around_shown_teeth(surface, visible)
+    visible = density > MIN_VISIBLE_FRACTION * median
+    visible |= _around_visible_teeth(surface, visible)
     is_source = (pixels > 0) & is_outside & (cosine > SOURCE_COSINE) & ~surface.lids
     if not is_source.any():
         none = np.zeros_like(visible)
         return UnseenSides(none, visible, color, none, none.astype(float), color)
     unseen = is_outside & (cosine < SOURCE_COSINE)
-    well_shown = is_source & (cosine > WELL_SHOWN_COSINE)
+    well_visible = is_source & (cosine > WELL_VISIBLE_COSINE)
     hair = _hair(surface, color, pixels > 0, is_source)
     sides = _Sides(surface, color)
     hidden = unseen | ~visible | surface.lids
     found = color.copy()
     ears = surface.regions.within(Region.EAR)
     found[hidden] = sides.nearest(is_source & ~ears, hidden)
-    turned = np.where(is_outside, surface.turned_from(SHOWN_COSINE, SOURCE_COSINE), 0.0)
+    turned = np.where(is_outside, surface.turned_from(VIEW_INDEPENDENT_COSINE, SOURCE_COSINE), 0.0)
     off_axis = color.copy()
     is_hair = np.zeros_like(visible)
     may_be_mirrored = unseen.copy()
@@ -125,7 +125,7 @@ def unseen_sides(surface: Surface) -> UnseenSides:
             if (like & is_source).any() and (kind & hidden).any():
                 found[kind & hidden] = sides.nearest(like & is_source, kind & hidden, is_level)
         if surface.has_few_cameras:
-            turns_away = sides.of_face & is_outside & (cosine < WELL_SHOWN_COSINE)
+            turns_away = sides.of_face & is_outside & (cosine < WELL_VISIBLE_COSINE)
             off_axis[turns_away] = sides.nearest(is_source & ~ears, turns_away)
             may_be_mirrored |= turns_away
         scalp = surface.kinds["scalp"]
@@ -134,18 +134,16 @@ def unseen_sides(surface: Surface) -> UnseenSides:
             off_axis[scalp] = np.median(color[hair[near]], axis=1)
             is_hair = scalp.copy()
             found[scalp & unseen] = np.median(color[hair], axis=0)
-    rows, mirrored = sides.mirrored(may_be_mirrored, well_shown)
+    rows, mirrored = sides.mirrored(may_be_mirrored, well_visible)
     found[rows] = mirrored
     visible[rows] = False
-    inside = _unseen_inside(capture, pixels > 0, is_outside) | _unseen_teeth(
-        capture, pixels, visible
-    )
-    within = inside | (~is_outside & (~visible | (pixels == 0)))
+    inner = _unseen_inner(capture, pixels > 0, is_outside) | _unseen_teeth(capture, pixels, visible)
+    within = inner | (~is_outside & (~visible | (pixels == 0)))
     found[within] = inside_colors(capture, color, visible, within)
-    lids, of_skin = _lid_colors(surface, well_shown, color)
+    lids, of_skin = _lid_colors(surface, well_visible, color)
     found[lids] = of_skin
     visible[lids] = False
-    triangles = (is_outside & (cosine < UNSEEN_COSINE)) | inside
+    triangles = (is_outside & (cosine < UNSEEN_COSINE)) | inner
     off_axis = np.where((unseen | ~(visible | is_hair))[:, None], found, off_axis)
     return UnseenSides(triangles, visible, found, is_hair, np.where(is_hair, 1.0, turned), off_axis)
 
@@ -172,9 +170,7 @@ def plausible_off_axis(
         steepness[beside] = ALSO_BEHIND_STEEPNESS
     if sides.is_hair.any():
         hair = np.median(sides.off_axis[sides.is_hair], axis=0)
-        from_hair, from_skin = (
-            np.linalg.norm(color - prior, axis=1) for prior in (hair, plausible)
-        )
+        from_hair, from_skin = (np.linalg.norm(color - each, axis=1) for each in (hair, plausible))
         is_behind = (fraction > 0) & ~sides.is_hair[face] & (from_hair < from_skin)
         is_behind[beside] = False
         fraction[is_behind] = 1
@@ -241,8 +237,8 @@ class _Sides:
     def mirrored(self, hidden: np.ndarray, visible: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Which of the triangles `hidden` (F,) bool have mirror images that are `visible`, and
         their colors (N, 3)."""
-        are_shown = hidden[self._partner] & visible[self._image]
-        return self._partner[are_shown], self._color[self._image[are_shown]]
+        are_visible = hidden[self._partner] & visible[self._image]
+        return self._partner[are_visible], self._color[self._image[are_visible]]
 
 
 def _lid_colors(
@@ -288,7 +284,7 @@ def _color_views(capture: Capture) -> list[View]:
     return [*spread, *(part[len(part) // 2] for part in opened)]
 
 
-def _unseen_inside(capture: Capture, visible: np.ndarray, is_outside: np.ndarray) -> np.ndarray:
+def _unseen_inner(capture: Capture, visible: np.ndarray, is_outside: np.ndarray) -> np.ndarray:
     """(F,) bool: triangles inside of mouth and eyes that neither a view nor a view of a neighbor
     shows. Folds of ears are left out, because other views show them. None in a long recording whose
     meshes are files, because not all open mouths were looked for."""
@@ -300,7 +296,7 @@ def _unseen_inside(capture: Capture, visible: np.ndarray, is_outside: np.ndarray
     return np.asarray(may_line & ~is_outside & ~touched[capture.faces].any(1))
 
 
-def _around_shown_teeth(surface: Surface, visible: np.ndarray) -> np.ndarray:
+def _around_visible_teeth(surface: Surface, visible: np.ndarray) -> np.ndarray:
     """(F,) bool: teeth near those that are shown: they may be smaller than the pixels, between
     whose centers they lie."""
     teeth = np.flatnonzero(teeth_of(surface.capture))

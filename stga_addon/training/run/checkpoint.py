@@ -15,7 +15,7 @@ from ...avatar.splats import ARRAYS
 from ...avatar.strain import (
     STRAIN_COMPONENTS,
     TRAINED_RANGE,
-    seen_range,
+    observed_range,
     strain_basis,
     trained_range,
 )
@@ -209,7 +209,7 @@ def trained_strain_range(
     limits = trained_range(len(capture.faces))
     basis = strain_basis(capture.neutral, capture.faces, limits)
     timesteps = sorted({view.timestep for view in capture.views["train"]})
-    strain_range = seen_range(basis, (mesh(timestep) for timestep in timesteps))
+    strain_range = observed_range(basis, (mesh(timestep) for timestep in timesteps))
     parent = None if continuation is None else read_avatar(continuation.parent / AVATAR)
     if parent is None or not parent.follows_strain:
         return strain_range  # it follows strain only from here on

@@ -243,8 +243,8 @@ def _light(avatar: Avatar, settings: TrainingSettings, capture: Capture) -> Ligh
     for chosen, pixels in _colors_by_camera(avatar, settings, capture):
         drawn, observed, normals = (np.concatenate(side, 1) for side in zip(*pixels, strict=True))
         overall = fit_exposure(drawn, observed)
-        for view, (own_drawn, own_seen, _) in zip(chosen, pixels, strict=True):
-            exposure = fit_exposure(own_drawn, own_seen, overall, CAMERA_WEIGHT)
+        for view, (camera_drawn, camera_observed, _) in zip(chosen, pixels, strict=True):
+            exposure = fit_exposure(camera_drawn, camera_observed, overall, CAMERA_WEIGHT)
             scaled = exposure * np.array([[1.0], [255.0]])
             rows.append((float(view.camera_index), *scaled.ravel().tolist(), float(view.timestep)))
         lit.append((drawn, (observed - overall[1][:, None]) / overall[0][:, None], normals))

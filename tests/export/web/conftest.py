@@ -10,7 +10,7 @@ from flame.small_head import small_head
 from export.web.browser import Browser, find_browser
 from stga_addon.avatar.file import Avatar
 from stga_addon.avatar.offsets import OFFSETS
-from stga_addon.avatar.strain import seen_range, strain_basis
+from stga_addon.avatar.strain import observed_range, strain_basis
 from stga_addon.capture.camera import Camera, look_at
 from stga_addon.export.playback import Playback
 from stga_addon.export.rig import RiggedAvatar, flame_rig
@@ -99,7 +99,7 @@ def make_head(convention="stga", sh_degree=3, antialiased=True, offsets=tuple(OF
     )
     neutral = neutral_mesh(sequence).astype(np.float32)
     meshes = np.stack([sequence_mesh(sequence, timestep) for timestep in sequence.timesteps])
-    limits = seen_range(strain_basis(neutral, model.faces), 0.5 * (meshes[:1] + neutral))
+    limits = observed_range(strain_basis(neutral, model.faces), 0.5 * (meshes[:1] + neutral))
     sizes = {"strain_position": 0.3 * unit, "strain_scale": 0.1, "strain_color": 0.1}
     sizes |= {"normal_color": 0.5}
     driven = {

@@ -71,7 +71,7 @@ class FittedHead:
 
 
 @dataclass(frozen=True)
-class SeenHead:
+class TrackedHead:
     """All data from which a capture is written.
 
     footage   with its mattes
@@ -133,7 +133,7 @@ def fit_expressions(fitted: FittedHead, person: HeadFit, workers: Workers) -> Fi
     return _in_world(replace(fitted, fit=fit, misfits=_misfits(dense)))
 
 
-def with_torso(fitted: FittedHead, workers: Workers, bends: bool) -> SeenHead:
+def with_torso(fitted: FittedHead, workers: Workers, bends: bool) -> TrackedHead:
     """The head on its torso, whose cloth may bend, in footage with mattes."""
     errors = fitted.errors
     fitted.show(workers, errors)
@@ -151,7 +151,7 @@ def with_torso(fitted: FittedHead, workers: Workers, bends: bool) -> SeenHead:
         mesh = posed_mesh(fitted.fit, parameters[footage.timesteps[0]])
         warnings += cut_to_visual_hull(footage, fitted.fit.to_capture.camera, mesh)
     torso = follow_torso(fitted.fit, parameters, footage, workers, bends)
-    return SeenHead(fitted, errors, footage, torso, warnings)
+    return TrackedHead(fitted, errors, footage, torso, warnings)
 
 
 def by_images(

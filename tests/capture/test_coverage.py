@@ -5,12 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from stga_addon.capture.filmed import (
+from stga_addon.capture.coverage import (
     ONE_EXPRESSION,
-    Filmed,
+    CaptureCoverage,
+    capture_coverage,
     directions_picture,
-    filmed,
-    filmed_directions,
+    observed_directions,
 )
 from stga_addon.capture.open import open_capture
 from stga_addon.development.demo.capture import unpack_capture
@@ -25,11 +25,11 @@ def test_directions_and_expressions(tmp_path):
     head's, and expressions that are not named, or named of a take that has but one."""
     unpack_capture(tmp_path)
     capture = open_capture(tmp_path)
-    across, up = filmed_directions(capture, [0]).T
+    across, up = observed_directions(capture, [0]).T
     order = np.argsort(across)
     np.testing.assert_allclose(across[order], AZIMUTHS_DEG, atol=4)
     np.testing.assert_allclose(up[order], ELEVATIONS_DEG, atol=6)
-    described = filmed(capture).text
+    described = capture_coverage(capture).text
     assert " on its right to " in described
     assert "mouthSmile" in described
 
@@ -47,7 +47,7 @@ def test_what_to_film_next(across, up, text, expected):
     """Catches a side that is said to be missing and was filmed, or the other one; and a picture
     whose left is the head's right, or whose front looks up."""
     degrees = np.arange(across[0], across[1] + 1, 15.0)
-    seen = Filmed(np.stack([degrees, np.full(len(degrees), up)], 1), text)
+    seen = CaptureCoverage(np.stack([degrees, np.full(len(degrees), up)], 1), text)
     assert expected in seen.next_take
     assert bool(seen.next_take) == bool(expected)
     picture = directions_picture(tuple(seen.cells))
@@ -69,4 +69,6 @@ def test_shoulders_are_no_expression(tmp_path):
         away = np.where(lowest, shift[timestep], 0)[:, None] * [0, 1, 0]
         return capture.neutral + away
 
-    assert filmed(replace(capture, expression_mesh=shrugged)).text.endswith("one expression")
+    assert capture_coverage(replace(capture, expression_mesh=shrugged)).text.endswith(
+        "one expression"
+    )

@@ -14,12 +14,12 @@ SECTOR_DEG = 10
 """Width of a sector of directions around the head, which is filmed or not as a whole."""
 MAX_SLOPE = 0.5
 """Largest slope, up or down, of surfaces that count: steeper ones face no side."""
-SEEN_TO_DEG = 90
+VISIBLE_TO_DEG = 90
 """Largest angle from a camera's direction at which it sees a surface."""
 FROM_ALL_SIDES = "filmed from all sides"
 
 
-def filmed_sides(avatar: Avatar) -> str:
+def observed_sides(avatar: Avatar) -> str:
     """What training views looked at, as in "filmed from 50° on its right to 50° on its left; what
     is beyond is plausible"; "" where the avatar does not know it, or where its eyes and mouth
     are."""
@@ -46,15 +46,15 @@ def filmed_sides(avatar: Avatar) -> str:
             for weights in (area, area * unseen)
         )
         dark = np.flatnonzero(hidden > total / 2)
-        reach.append(dark[0] * SECTOR_DEG - SEEN_TO_DEG if len(dark) else None)
+        reach.append(dark[0] * SECTOR_DEG - VISIBLE_TO_DEG if len(dark) else None)
     if reach == [None, None]:
         return FROM_ALL_SIDES
-    right_deg, left_deg = (SEEN_TO_DEG if end is None else max(0, int(end)) for end in reach)
+    right_deg, left_deg = (VISIBLE_TO_DEG if end is None else max(0, int(end)) for end in reach)
     reached = f"{right_deg}° on its right to {left_deg}° on its left"
     return f"filmed from {reached}; what is beyond is plausible"
 
 
-def filmed_avatar(path: Path, avatar: Avatar) -> Avatar:
+def observed_part(path: Path, avatar: Avatar) -> Avatar:
     """Without the splats on triangles that no camera saw, and colors as cameras saw them. Raises
     StgaError naming `path` where the avatar does not know them, or all are."""
     unseen = avatar.regions.get(UNSEEN_REGION)

@@ -37,14 +37,14 @@ PICTURE_PX = 160
 HEAD_RADIUS = 0.3
 """Radius of the head in that picture, as a fraction of half of its side; cells reach from there to
 its border."""
-FILMED_COLOR = (0.16, 0.62, 0.34, 1.0)
-UNFILMED_COLOR = (0.3, 0.3, 0.3, 1.0)
+OBSERVED_COLOR = (0.16, 0.62, 0.34, 1.0)
+UNOBSERVED_COLOR = (0.3, 0.3, 0.3, 1.0)
 HEAD_COLOR = (0.75, 0.6, 0.5, 1.0)
 
 
 @dataclass(frozen=True)
-class Filmed:
-    """What a capture filmed. directions: (N, 2) of `filmed_directions`; expressions: in words."""
+class CaptureCoverage:
+    """What a capture filmed. directions: (N, 2) of `observed_directions`; expressions: in words."""
 
     directions: np.ndarray
     expressions: str
@@ -84,11 +84,11 @@ class Filmed:
         return ""
 
 
-def filmed(capture: Capture) -> Filmed:
+def capture_coverage(capture: Capture) -> CaptureCoverage:
     """Directions and expressions of a capture, of evenly spread timesteps."""
     timesteps = evenly_spread(capture.timesteps, MAX_TIMESTEPS)
-    directions = filmed_directions(capture, timesteps)
-    return Filmed(directions, _expressions(capture, timesteps))
+    directions = observed_directions(capture, timesteps)
+    return CaptureCoverage(directions, _expressions(capture, timesteps))
 
 
 @lru_cache(maxsize=8)
@@ -101,8 +101,8 @@ def directions_picture(cells: tuple[int, ...]) -> np.ndarray:
     bands = len(BANDS_DEG) - 1
     inwards = (1 - radius) / (1 - HEAD_RADIUS) * bands
     band = np.clip(np.floor(inwards).astype(int), 0, bands - 1)
-    is_filmed = np.isin(SECTORS * band + sector, cells)
-    picture = np.where(is_filmed[..., None], FILMED_COLOR, UNFILMED_COLOR)
+    is_observed = np.isin(SECTORS * band + sector, cells)
+    picture = np.where(is_observed[..., None], OBSERVED_COLOR, UNOBSERVED_COLOR)
     is_gap = np.abs(inwards - np.round(inwards)) < 0.04
     picture[(radius > 1) | is_gap] = 0
     nose = np.hypot(across / 0.6, up + HEAD_RADIUS - 0.04) < 0.11
@@ -111,7 +111,7 @@ def directions_picture(cells: tuple[int, ...]) -> np.ndarray:
     return picture.astype(np.float32)
 
 
-def filmed_directions(capture: Capture, timesteps: Sequence[int]) -> np.ndarray:
+def observed_directions(capture: Capture, timesteps: Sequence[int]) -> np.ndarray:
     """(N, 2) degrees to the head's left and up, from which cameras see it in all views of some
     timesteps. Empty where the mesh does not show where eyes and mouth are."""
     neutral = np.asarray(capture.neutral, np.float64)

@@ -202,7 +202,7 @@ VisiblePoints = dict[tuple[int, ...], np.ndarray]
 
 
 @dataclass(frozen=True)
-class SeenSurface:
+class ObservedSurface:
     """N visible points of a surface: positions (N, 3) in meters, unit normals (N, 3) and weights
     (N,)."""
 
@@ -231,14 +231,14 @@ def large_parts(model: FlameModel) -> np.ndarray:
     return large[part[faces[:, 0]]]
 
 
-def seen_surface(
+def observed_surface(
     fit: HeadFit,
     timestep: int,
     sought: SurfaceSearch,
     images: Pictures,
     masks: Pictures,
     visible: VisiblePoints,
-) -> SeenSurface:
+) -> ObservedSurface:
     """Where images show the surface near the fitted head, along its normals, and masks its outline;
     weight 0 for what they do not show.
 
@@ -270,7 +270,7 @@ def seen_surface(
         weight[near] += POINT_FRACTION * known
         moved[near] += POINT_FRACTION * offset
     mean = moved / np.maximum(weight, 1e-9)
-    return SeenSurface(at + mean[:, None] * normals, normals, weight)
+    return ObservedSurface(at + mean[:, None] * normals, normals, weight)
 
 
 def rounded_direction(direction: np.ndarray, steps: int) -> tuple[int, ...]:
