@@ -99,7 +99,7 @@ def in_world(
     log_scale: np.ndarray,
     opacity: np.ndarray,
     sh: np.ndarray,
-    is_unbound: bool = False,
+    is_free: bool = False,
 ) -> Splats:
     """World-space splats of values before activation. Infinite opacities and scales of
     minus infinity, as other programs write 0 and 1, get numbers that show no difference."""
@@ -112,7 +112,7 @@ def in_world(
         opacity=np.asarray(opacity, np.float32),
         sh=np.asarray(sh, np.float32),
         face=np.zeros(len(xyz), np.int32),
-        unbound=np.full(len(xyz), is_unbound),
+        unbound=np.full(len(xyz), is_free),
     )
 
 

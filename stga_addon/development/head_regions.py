@@ -101,8 +101,8 @@ def regions_of(head: Capture) -> np.ndarray:
         Region.MOUTH: mouth | lining,
     }
     region = np.full(len(centers), Region.OTHER, np.uint8)
-    for name, inside in lies_in.items():
-        region[inside] = name
+    for name, own in lies_in.items():
+        region[own] = name
     return region
 
 

@@ -267,7 +267,7 @@ def first_splats(plates: Sequence[CleanPlate], center: np.ndarray) -> Splats:
             sh[:, 0] = (colors[new] - 0.5) / SH_C0
             rotation = np.repeat(turn, count, axis=0)
             opacity = np.full(count, START_OPACITY)
-            parts.append(in_world(points, rotation, log_scale, opacity, sh, is_unbound=True))
+            parts.append(in_world(points, rotation, log_scale, opacity, sh, is_free=True))
         found = joined(parts)
         if len(found) <= MAX_FIRST_SPLATS or levels >= 255:
             return found

@@ -111,14 +111,14 @@ def unseen_fraction(capture: Capture, convention: str, splats: Splats) -> np.nda
     often in the air.
     """
     fraction = np.zeros(len(splats), np.float32)
-    unbound = np.flatnonzero(splats.unbound)
-    if not len(unbound):
+    free = np.flatnonzero(splats.unbound)
+    if not len(free):
         return fraction
     first = capture.views["train"][0].timestep
     views = [view for view in capture.views["train"] if view.timestep == first]
     frames = face_frames(capture.mesh(first), capture.faces, capture.neutral, convention)
-    points = to_world(splats.rows(unbound), frames).xyz.astype(np.float64)
-    fraction[unbound] = 1 - np.mean([pixels_of(points, view.camera)[2] for view in views], axis=0)
+    points = to_world(splats.rows(free), frames).xyz.astype(np.float64)
+    fraction[free] = 1 - np.mean([pixels_of(points, view.camera)[2] for view in views], axis=0)
     return fraction
 
 
@@ -460,4 +460,4 @@ def _new_splats(points: np.ndarray, voxel: float, sh_degree: int) -> Splats:
     rotation = np.eye(1, 4).repeat(n, axis=0)
     log_scale = np.full((n, 3), np.log(voxel / 2))
     sh = np.zeros((n, (sh_degree + 1) ** 2, 3))
-    return in_world(points, rotation, log_scale, np.zeros(n), sh, is_unbound=True)
+    return in_world(points, rotation, log_scale, np.zeros(n), sh, is_free=True)
