@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from ..capture.camera import Camera
 from ..capture.mesh_geometry import Similarity
 from ..capture.model import evenly_spread
 from ..flame.forward import RIGID_SIZE, TRANSLATION_SIZE
@@ -13,6 +14,7 @@ from ..worker.helpers import Step
 from . import fit as head_fit
 from .fit import HeadFit, RecordedTake, TimestepLandmarks
 from .head_model import HeadModel
+from .landmark_bias import LandmarkBias, bias_in
 from .posed_points import PosedPoints, SurfacePoints, head_rotation, split
 from .solve import LANDMARK_SIGMA_M, Observation, person, residuals, solve_identity
 
@@ -22,7 +24,7 @@ TIMESTEPS = 12
 """Timesteps whose landmarks are compared."""
 LANDMARKS = 80
 """Landmarks that are compared, spread over the reliable ones."""
-OWN_SIGMA_M = 0.002
+PLACE_SIGMA_M = 0.002
 """Standard deviation of what a person's landmark misses the head by in all timesteps alike."""
 NOISE_SIGMA_M = 0.0006
 """Standard deviation of what a landmark misses the head by beyond that in one timestep."""
@@ -32,21 +34,33 @@ FINE_RATIOS = np.geomspace(0.5, 6.0, 400)
 """Focal lengths between which the posterior is read."""
 ROUNDS = 2
 """Fits of the head for each focal length, as its depth is that of the fit before."""
+MAX_OFF_AXIS_DEG = 40.0
+"""Largest angle between the direction that a face looks in and the camera, at which its landmarks
+are compared: the networks' bias beyond it differs from person to person."""
 CAMERA_ASPECTS = (16 / 9, 4 / 3, 3 / 2)
 """Longer over shorter side of images as cameras record them; others were cropped."""
 ASPECT_TOLERANCE = 0.005
 """Relative difference up to which an image has one of these."""
-CAMERA_SIGMA = 0.35
-"""Standard deviation of the logarithm of a camera's focal length about a phone's."""
+PHONE_WEIGHT = 0.3
+"""Prior probability that a phone recorded whole images that do not name their lens; phones write it
+into their files."""
+PHONE_SIGMA = 0.35
+"""Standard deviation of the logarithm of a phone's focal length."""
+PORTRAIT_RATIO = 4.0
+"""Median focal length of other cameras that people are filmed with, relative to a phone's: some
+105 mm on 24 x 36 mm."""
+PORTRAIT_SIGMA = 0.5
+"""Standard deviation of its logarithm."""
 CROPPED_SIGMA = 1.2
-"""The same where images were cropped, which makes them narrower."""
+"""Standard deviation of the logarithm of a focal length, about a phone's, where images were
+cropped, which makes them narrower."""
 DISTANCE_M = 1.2
 """Median distance of a camera from a face, unless a phone is held in the hand."""
-DISTANCE_SIGMA = 0.4
+DISTANCE_SIGMA = 0.6
 """Standard deviation of the distance's logarithm."""
 DATA_WEIGHT = 0.5
 """Weight of the landmarks' likelihood: their errors are not independent."""
-CHOSEN_QUANTILE = 0.6
+CHOSEN_QUANTILE = 0.7
 """Quantile of the posterior. A focal length that is too long by half costs little in views from the
 side; one that is too short by half makes another person."""
 INTERVAL = (0.05, 0.95)
@@ -83,6 +97,25 @@ class FocalEstimate:
     turn_deg: float
 
 
+@dataclass(frozen=True)
+class _View:
+    """Landmarks of a timestep in the only camera, which is taken for a phone's, and their bias;
+    None for those of another detector."""
+
+    landmarks: TimestepLandmarks
+    bias: LandmarkBias | None
+
+    def at_ratio(self, ratio: float) -> TimestepLandmarks:
+        """The same for a camera whose focal length is so many times as long: it is that much
+        farther away."""
+        (camera,) = self.landmarks.cameras
+        longer = replace(camera, fl_x=camera.fl_x * ratio, fl_y=camera.fl_y * ratio)
+        points = self.landmarks.points
+        if self.bias is not None:
+            points = points - self.bias.beyond_offset(self.bias.distance * ratio)
+        return replace(self.landmarks, cameras=(longer,), points=points)
+
+
 def estimated_focal(
     head: HeadModel, take: RecordedTake, step: Step = lambda: None
 ) -> FocalEstimate:
@@ -91,45 +124,76 @@ def estimated_focal(
 
     A quantile of its posterior. The likelihood is that of landmarks of the most differently turned
     timesteps, under the best fit of the head for each focal length; the prior knows the angle of
-    view of phones and the distance at which people are filmed. step: follows each of RATIOS.
+    view of cameras and the distance at which people are filmed. Where the face is never within
+    MAX_OFF_AXIS_DEG, the prior decides. step: follows each of RATIOS.
     """
     from scipy.interpolate import CubicSpline
 
     rows = np.array(evenly_spread(np.flatnonzero(take.reliable).tolist(), LANDMARKS))
-    whole = [(own.confidence[:, rows] > 0).sum() for own in take.landmarks.values()]
+    whole = [(landmarks.confidence[:, rows] > 0).sum() for landmarks in take.landmarks.values()]
     enough = max(whole) / 2
-    seen = {
-        t: replace(own, points=own.points[:, rows], confidence=own.confidence[:, rows])
-        for (t, own), count in zip(take.landmarks.items(), whole, strict=True)
+    compared = {
+        t: replace(
+            landmarks,
+            points=landmarks.points[:, rows],
+            confidence=landmarks.confidence[:, rows],
+        )
+        for (t, landmarks), count in zip(take.landmarks.items(), whole, strict=True)
         if count >= enough
     }
-    own_head, own_places = _with_own_places(head, take.places[rows])
-    timesteps, turn_deg = _turned(own_head, own_places, seen)
-    views = [seen[t] for t in timesteps]
-    camera = views[0].cameras[0]
-    slopes, distances = _fits(own_head, own_places, views, step)
+    free_head, free_places = _with_free_places(head, take.places[rows])
+    chosen = _turned(free_head, free_places, compared)
+    neutral = take.places.on(head.model.v_template, head.model.faces)
+    views = [_View(compared[t], _bias(take, t, neutral, rows)) for t in chosen.timesteps]
+    slopes, distances = _fits(free_head, free_places, views, step)
     tried = np.log(RATIOS)
     fine = np.log(FINE_RATIOS)
-    cost = DATA_WEIGHT * CubicSpline(tried, slopes).antiderivative()(fine)
-    sides = max(camera.width, camera.height), min(camera.width, camera.height)
-    aspect = sides[0] / sides[1]
-    is_whole = any(abs(aspect / known - 1) < ASPECT_TOLERANCE for known in CAMERA_ASPECTS)
-    cost += (fine / (CAMERA_SIGMA if is_whole else CROPPED_SIGMA)) ** 2 / 2
-    distance = np.interp(fine, tried, np.log(distances))
-    cost += ((distance - np.log(DISTANCE_M)) / DISTANCE_SIGMA) ** 2 / 2
+    (camera,) = views[0].landmarks.cameras
+    cost = _prior_cost(camera, fine, np.interp(fine, tried, np.log(distances)))
+    if chosen.are_frontal:
+        cost += DATA_WEIGHT * CubicSpline(tried, slopes).antiderivative()(fine)
     density = np.exp(cost.min() - cost)
     below = np.cumsum(density) / density.sum()
     quantiles = np.interp((CHOSEN_QUANTILE, *INTERVAL), below, fine)
-    chosen, low, high = (camera.fl_x * np.exp(quantiles)).tolist()
-    return FocalEstimate(chosen, low, high, turn_deg)
+    pixels, low, high = (camera.fl_x * np.exp(quantiles)).tolist()
+    return FocalEstimate(pixels, low, high, chosen.turn_deg)
 
 
-def _with_own_places(head: HeadModel, places: SurfacePoints) -> tuple[HeadModel, SurfacePoints]:
-    """The head at its landmarks alone, and an identity that moves each by OWN_SIGMA_M."""
+def _prior_cost(camera: Camera, ratio: np.ndarray, distance: np.ndarray) -> np.ndarray:
+    """Negative logarithm of the prior (K,), but for a constant, of logarithms of the focal length
+    relative to a phone's and of the head's distance in meters."""
+    sides = max(camera.width, camera.height), min(camera.width, camera.height)
+    aspect = sides[0] / sides[1]
+    if any(abs(aspect / known - 1) < ASPECT_TOLERANCE for known in CAMERA_ASPECTS):
+        phone = PHONE_WEIGHT * _normal(ratio, 0.0, PHONE_SIGMA)
+        portrait = (1 - PHONE_WEIGHT) * _normal(ratio, np.log(PORTRAIT_RATIO), PORTRAIT_SIGMA)
+        lens = phone + portrait
+    else:
+        lens = _normal(ratio, 0.0, CROPPED_SIGMA)
+    return np.asarray(-np.log(lens * _normal(distance, np.log(DISTANCE_M), DISTANCE_SIGMA)))
+
+
+def _normal(values: np.ndarray, mean: float, sigma: float) -> np.ndarray:
+    """The normal density, times the root of 2π."""
+    return np.asarray(np.exp(-(((values - mean) / sigma) ** 2) / 2) / sigma)
+
+
+def _bias(
+    take: RecordedTake, timestep: int, neutral: np.ndarray, rows: np.ndarray
+) -> LandmarkBias | None:
+    """Bias of a timestep's landmarks of these rows."""
+    landmarks = take.landmarks[timestep]
+    reliable = take.reliable & (landmarks.confidence[0] > 0)
+    bias = bias_in(landmarks.points[0], landmarks.cameras[0], neutral, reliable)
+    return None if bias is None else bias.of_rows(rows)
+
+
+def _with_free_places(head: HeadModel, places: SurfacePoints) -> tuple[HeadModel, SurfacePoints]:
+    """The head at its landmarks alone, and an identity that moves each by PLACE_SIGMA_M."""
     model = head.model
     count = len(places)
     corners = model.faces[places.face].ravel()
-    own = OWN_SIGMA_M * np.eye(3 * count).reshape(count, 1, 3, 3 * count).repeat(3, axis=1)
+    own = PLACE_SIGMA_M * np.eye(3 * count).reshape(count, 1, 3, 3 * count).repeat(3, axis=1)
     template = model.v_template[corners]
     known = model.n_identity
     dirs = np.split(model.shapedirs[corners], [known], axis=2)
@@ -146,20 +210,39 @@ def _with_own_places(head: HeadModel, places: SurfacePoints) -> tuple[HeadModel,
     return replace(head, model=small), SurfacePoints(np.arange(count), places.barycentric)
 
 
+@dataclass(frozen=True)
+class _Turned:
+    """Timesteps at which the head is turned most differently.
+
+    are_frontal  whether the face is within MAX_OFF_AXIS_DEG at these; else it never is
+    turn_deg     largest angle between two poses of the take
+    """
+
+    timesteps: list[int]
+    are_frontal: bool
+    turn_deg: float
+
+
 def _turned(
     head: HeadModel, places: SurfacePoints, take: Mapping[int, TimestepLandmarks]
-) -> tuple[list[int], float]:
-    """Timesteps at which the head is turned most differently, and the largest angle between two of
-    them in degrees."""
+) -> _Turned:
+    """Those of a take whose face is within MAX_OFF_AXIS_DEG, or of all where none is."""
     timesteps = evenly_spread(sorted(take), CANDIDATES)
     starts = _observed(head, places, [take[t] for t in timesteps])[1]
     turns = np.stack([head_rotation(start) for start in starts])
+    eye = take[timesteps[0]].cameras[0].position
+    away = eye - starts[:, -TRANSLATION_SIZE:]
+    ahead = np.einsum("ti,ti->t", turns[:, :, 2], away) / np.linalg.norm(away, axis=1)
+    frontal = np.flatnonzero(ahead > np.cos(np.radians(MAX_OFF_AXIS_DEG)))
+    rows = frontal if len(frontal) else np.arange(len(timesteps))
     cosine = (np.einsum("aij,bij->ab", turns, turns) - 1) / 2
     apart = np.degrees(np.arccos(np.clip(cosine, -1, 1)))
-    chosen = [int(apart.max(axis=0).argmax())]
-    while len(chosen) < min(TIMESTEPS, len(timesteps)):
-        chosen.append(int(apart[chosen].min(axis=0).argmax()))
-    return sorted({timesteps[number] for number in chosen}), float(apart.max())
+    among = apart[np.ix_(rows, rows)]
+    chosen = [int(among.max(axis=0).argmax())]
+    while len(chosen) < min(TIMESTEPS, len(rows)):
+        chosen.append(int(among[chosen].min(axis=0).argmax()))
+    found = sorted({timesteps[rows[number]] for number in chosen})
+    return _Turned(found, len(frontal) > 0, float(apart.max()))
 
 
 def _observed(
@@ -175,19 +258,17 @@ def _observed(
 
 
 def _fits(
-    head: HeadModel, places: SurfacePoints, views: Sequence[TimestepLandmarks], step: Step
+    head: HeadModel, places: SurfacePoints, views: Sequence[_View], step: Step
 ) -> tuple[np.ndarray, np.ndarray]:
     """For each of RATIOS the derivative of the negative log-likelihood by the logarithm of the
     focal length, and the head's median distance in meters."""
-    camera = views[0].cameras[0]
     shape = np.zeros(head.model.n_identity)
     frames = np.zeros(0)
     slopes = []
     distances = []
     before = 1.0
     for ratio in RATIOS:
-        trial = replace(camera, fl_x=camera.fl_x * ratio, fl_y=camera.fl_y * ratio)
-        trials = [replace(view, cameras=(trial,)) for view in views]
+        trials = [view.at_ratio(ratio) for view in views]
         if len(frames):  # as large in the image as before
             frames[:, -TRANSLATION_SIZE:] *= ratio / before
         before = ratio

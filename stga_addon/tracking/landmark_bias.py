@@ -1,5 +1,6 @@
-"""Bias of the networks' landmarks on a head, by the direction from which a camera sees it."""
+"""Bias of the networks' landmarks on a head, by the direction and distance of the camera."""
 
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -13,24 +14,62 @@ from ..flame.quaternions import unit
 from .fit import pose_from_one_camera
 
 BIAS_FILE = Path(__file__).parent / "networks/landmark_bias.npz"
-"""Azimuths (A,) and elevations (E,) in degrees, and the networks' offsets (A, E, N, 2) in meters at
-the head's distance, to the right and down in an image whose camera is upright before the head; made
-by `development/landmark_bias.py`."""
+"""Azimuths (A,) and elevations (E,) in degrees; `offset_m`, the networks' offsets (A, E, N, 2) in
+meters at the head's distance, to the right and down in an image whose camera is upright at
+DISTANCE_M before the head; `nearness_m2`, by how much they grow for each 1/m by which the camera is
+nearer. Made by `development/landmark_bias.py`."""
+DISTANCE_M = 1.2
+"""Distance of the cameras of `offset_m`. From farther away, offsets are the same."""
+MIN_DISTANCE_M = 0.3
+"""Smallest distance for which offsets are known."""
 UP = np.array([0.0, 1.0, 0.0])  # In the head's axes; its face looks along +z
+
+
+@dataclass(frozen=True)
+class LandmarkBias:
+    """Bias of the landmarks of one image, in pixels.
+
+    offset    (N, 2) from a camera at DISTANCE_M
+    nearness  (N, 2) by how much it grows for each 1/m by which the camera is nearer
+    distance  of the camera in meters, as its focal length says
+    """
+
+    offset: np.ndarray
+    nearness: np.ndarray
+    distance: float
+
+    def beyond_offset(self, distance: float) -> np.ndarray:
+        """(N, 2): the bias from a camera at this distance in meters, less `offset`."""
+        near = min(max(distance, MIN_DISTANCE_M), DISTANCE_M)
+        return np.asarray(self.nearness * (1 / near - 1 / DISTANCE_M))
+
+    def of_rows(self, rows: np.ndarray) -> "LandmarkBias":
+        """Bias of these landmarks alone."""
+        return replace(self, offset=self.offset[rows], nearness=self.nearness[rows])
 
 
 def without_bias(
     points: np.ndarray, camera: Camera, neutral: np.ndarray, reliable: np.ndarray
 ) -> np.ndarray:
-    """Landmarks (N, 2) of the networks, in pixels of `camera`, moved to where they belong.
+    """Landmarks (N, 2) of the networks, in pixels of `camera`, moved to where they belong if it is
+    at DISTANCE_M. neutral, reliable: as of `bias_in`. Landmarks of another detector stay."""
+    bias = bias_in(points, camera, neutral, reliable)
+    return points if bias is None else points - bias.offset
+
+
+def bias_in(
+    points: np.ndarray, camera: Camera, neutral: np.ndarray, reliable: np.ndarray
+) -> LandmarkBias | None:
+    """Bias of landmarks (N, 2) of the networks, in pixels of `camera`; None for landmarks of
+    another number, which are another detector's.
 
     neutral (N, 3) meters: their places on the neutral head; reliable (N,) bool: by which the
     direction is found that the camera sees the head from. Beyond the file's directions the nearest
-    one counts. Landmarks of another number are another detector's, and stay.
+    one counts.
     """
     table = _table()
-    if table.values.shape[2] != len(points):  # of another detector
-        return points
+    if table.values.shape[2] != len(points):
+        return None
     turn, center = _pose(points, camera, neutral, reliable)
     away = camera.position - center
     distance = float(np.linalg.norm(away))
@@ -44,18 +83,20 @@ def without_bias(
     left, _, other = np.linalg.svd(in_image)
     limits = [(axis[0], axis[-1]) for axis in table.grid]
     at = [np.clip(value, *limit) for value, limit in zip((azimuth, elevation), limits, strict=True)]
-    offset = table(at)[0] @ (left @ other).T
-    return points - offset * [camera.fl_x, camera.fl_y] / distance
+    px_per_m = np.array([camera.fl_x, camera.fl_y]) / distance
+    in_pixels = table(at)[0].reshape(-1, 2, 2) @ (left @ other).T * px_per_m  # (N, 2, 2)
+    return LandmarkBias(in_pixels[:, 0], in_pixels[:, 1], distance)
 
 
 @cache
 def _table() -> Any:
-    """The file's offsets, to be interpolated: (azimuth, elevation) -> (1, N, 2)."""
+    """The file's arrays, to be interpolated: (azimuth, elevation) -> (1, N, 4)."""
     from scipy.interpolate import RegularGridInterpolator
 
     arrays = read_npz(BIAS_FILE)
     grid = arrays["azimuth_deg"].astype(np.float64), arrays["elevation_deg"].astype(np.float64)
-    return RegularGridInterpolator(grid, arrays["offset_m"].astype(np.float64))
+    values = np.concatenate([arrays["offset_m"], arrays["nearness_m2"]], axis=-1)
+    return RegularGridInterpolator(grid, values.astype(np.float64))
 
 
 def _pose(

@@ -1,5 +1,6 @@
 """The face networks without MediaPipe, against what MediaPipe finds in the same pictures."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -26,7 +27,7 @@ from stga_addon.tracking.fit import HeadFit
 from stga_addon.tracking.footage.open import open_footage
 from stga_addon.tracking.head_model import read_head_model
 from stga_addon.tracking.known_person import KnownPerson
-from stga_addon.tracking.landmark_bias import without_bias
+from stga_addon.tracking.landmark_bias import bias_in, without_bias
 from stga_addon.tracking.landmarks import read_places
 from stga_addon.tracking.opened import TrackingOptions
 from stga_addon.tracking.recorded import BUNDLED_PLACES
@@ -148,6 +149,31 @@ def test_landmarks_are_moved_to_where_they_belong(azimuth_deg, roll_deg):
     before = norm(found[used] - truth)
     after = norm(without_bias(found, camera, neutral, used)[used] - truth)
     assert after < 0.85 * before
+
+
+@pytest.mark.parametrize("azimuth_deg", [-25, 10])
+def test_landmarks_of_a_near_face_are_moved_further(azimuth_deg):
+    """Catches the bias of a near camera that is added instead of taken away: a selfie's focal
+    length was estimated twice as long as it is."""
+    model = flame_model(None)
+    places, used = read_places(BUNDLED_PLACES, len(model.faces))
+    shape = np.random.default_rng(77).normal(0, 0.5, model.n_identity)
+    mesh = flame_forward(model, shape, neutral_frame(model))
+    at = places.on(mesh, model.faces)
+    center = at[used].mean(0)
+    turn = np.radians(azimuth_deg)
+    eye = center + 0.4 * np.array([np.sin(turn), 0.1, np.cos(turn)])
+    camera = look_at(eye, center, 512, 512, 440)
+    (found,) = FaceNetworks().detect(shaded_image(mesh, model.faces, camera, head_colors(model)))
+    neutral = places.on(model.v_template, model.faces)
+    bias = bias_in(found, camera, neutral, used)
+    assert bias.distance == pytest.approx(0.4, rel=0.1)
+    truth = camera.project(at)[0]
+    far = found - bias.offset - truth
+    near = far - bias.beyond_offset(bias.distance)
+    assert norm(near[used]) < 0.97 * norm(far[used])
+    longer = replace(camera, fl_x=1320, fl_y=1320)  # which is as far away as the file's camera
+    assert not bias_in(found, longer, neutral, used).beyond_offset(1.2).any()
 
 
 def test_landmarks_of_lips_and_lids_lie_on_what_moves_them():

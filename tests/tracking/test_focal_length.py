@@ -1,6 +1,7 @@
 """Focal lengths of a single camera: stated by files, and estimated from landmarks."""
 
 import struct
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -146,8 +147,9 @@ def few_landmarks(monkeypatch):
     monkeypatch.setattr(focal_length, "LANDMARKS", 40)
 
 
-def turning(head, focal, turn_deg, size=(1080, 1920), count=30):
-    """Places, and landmarks of a head that turns that far to either side 0.6 m before a camera.
+def turning(head, focal, turn_deg, size=(1080, 1920), count=30, ahead_deg=0.0):
+    """Places, and landmarks of a head that turns that far to either side of where it looks, 0.6 m
+    before a camera.
 
     Each landmark lies 2 mm beside its place on the model, in all frames alike, as a detector's do.
     """
@@ -162,7 +164,7 @@ def turning(head, focal, turn_deg, size=(1080, 1920), count=30):
     )
     take = {}
     for timestep, share in enumerate(np.sin(np.linspace(0, 7, count))):
-        angle = np.radians(turn_deg) * share
+        angle = np.radians(ahead_deg + turn_deg * share)
         expression = np.zeros(head.model.n_expression)
         expression[timestep % 3] = 0.5
         zero = np.zeros(3)
@@ -189,8 +191,26 @@ def test_focal_length_of_a_head_that_turns(head, factor, turn_deg):
     if turn_deg == 30:
         assert found.pixels == pytest.approx(truth, rel=0.15)
     else:
-        assert 0.75 * truth < found.pixels < 1.5 * truth
+        assert 0.75 * truth < found.pixels < 2 * truth
         assert found.high > 1.5 * found.low
+
+
+def test_faces_far_aside_have_no_vote(head):
+    """Catches a focal length by landmarks of profiles, where networks err: 0.35 of a real one."""
+    places, take = turning(head, 1.6 * typical_focal(1080, 1920), 15, count=8)
+    aside = turning(head, 1.6 * typical_focal(1080, 1920), 15, count=8, ahead_deg=60)[1]
+    middle = np.array([540, 960])
+    for timestep, landmarks in aside.items():
+        beside = (landmarks.points - middle) * [1.3, 1] + middle
+        take[8 + timestep] = replace(landmarks, points=beside)
+    every = np.ones(300, bool)
+    expected = estimated_focal(head, RecordedTake(places, every, {t: take[t] for t in range(8)}))
+    found = estimated_focal(head, RecordedTake(places, every, take))
+    assert found.turn_deg > 50 > expected.turn_deg
+    assert replace(found, turn_deg=0) == replace(expected, turn_deg=0)
+    alone = {t: take[t] for t in range(8, 16)}
+    prior = estimated_focal(head, RecordedTake(places, every, alone))
+    assert prior.low < 1.6 * typical_focal(1080, 1920) < prior.high > 4 * prior.low
 
 
 SIZE = (108, 192)
@@ -246,7 +266,8 @@ def test_a_phones_video_is_decoded_once_and_its_lens_is_told(tmp_path, head, mon
     )
     assert decoded == list(range(COUNT))
     assert found.focal_length.source == "estimated"
-    assert found.focal_length.pixels == pytest.approx(1.6 * typical_focal(*SIZE), rel=0.1)
+    (low, high) = found.focal_length.interval_px
+    assert low < 1.6 * typical_focal(*SIZE) < found.focal_length.pixels < high
     report = read_json(tmp_path / "out/tracking.json")
     assert report["focal_length_px"] == found.focal_length.pixels
     assert report["focal_length_from"] == "estimated"
