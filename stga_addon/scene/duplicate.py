@@ -37,7 +37,7 @@ def duplicate_avatar(head: Any, linked: bool) -> Any:
     before = set(_blocks())
     copies = _written_and_read(family)
     for original, copy in zip(family, copies, strict=True):
-        _fraction(original, copy, linked)
+        _reuse_data(original, copy, linked)
     _collect(family, copies)
     unused = {block for block in set(_blocks()) - before if not block.users}
     while unused:
@@ -75,7 +75,7 @@ def _written_and_read(family: list[Any]) -> list[Any]:
     return list(wanted.objects)
 
 
-def _fraction(original: Any, copy: Any, linked: bool) -> None:
+def _reuse_data(original: Any, copy: Any, linked: bool) -> None:
     """Let a copy have the original's node tree, materials and bones' shapes; and its actions."""
     with suppress(StgaError):  # no splats
         splat_modifier(copy).node_group = splat_modifier(original).node_group

@@ -55,12 +55,15 @@ CROPPED_SIGMA = 1.2
 """Standard deviation of the logarithm of a focal length, about a phone's, where images were
 cropped, which makes them narrower."""
 DISTANCE_M = 1.2
-"""Median distance of a camera from a face, unless a phone is held in the hand."""
-DISTANCE_SIGMA = 0.6
-"""Standard deviation of the distance's logarithm."""
+"""Median distance of a camera from a face."""
+DISTANCE_SIGMA = 0.5
+"""Standard deviation of the distance's logarithm: a phone in the hand is nearer, portraits are
+taken from farther away."""
+CROPPED_DISTANCE_SIGMA = 0.4
+"""The same where images were cropped, as those of interviews are."""
 DATA_WEIGHT = 0.5
 """Weight of the landmarks' likelihood: their errors are not independent."""
-CHOSEN_QUANTILE = 0.7
+CHOSEN_QUANTILE = 0.65
 """Quantile of the posterior. A focal length that is too long by half costs little in views from the
 side; one that is too short by half makes another person."""
 INTERVAL = (0.05, 0.95)
@@ -168,9 +171,11 @@ def _prior_cost(camera: Camera, ratio: np.ndarray, distance: np.ndarray) -> np.n
         phone = PHONE_WEIGHT * _normal(ratio, 0.0, PHONE_SIGMA)
         portrait = (1 - PHONE_WEIGHT) * _normal(ratio, np.log(PORTRAIT_RATIO), PORTRAIT_SIGMA)
         lens = phone + portrait
+        distance_sigma = DISTANCE_SIGMA
     else:
         lens = _normal(ratio, 0.0, CROPPED_SIGMA)
-    return np.asarray(-np.log(lens * _normal(distance, np.log(DISTANCE_M), DISTANCE_SIGMA)))
+        distance_sigma = CROPPED_DISTANCE_SIGMA
+    return np.asarray(-np.log(lens * _normal(distance, np.log(DISTANCE_M), distance_sigma)))
 
 
 def _normal(values: np.ndarray, mean: float, sigma: float) -> np.ndarray:

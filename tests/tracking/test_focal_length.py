@@ -209,8 +209,9 @@ def test_faces_far_aside_have_no_vote(head):
     assert found.turn_deg > 50 > expected.turn_deg
     assert replace(found, turn_deg=0) == replace(expected, turn_deg=0)
     alone = {t: take[t] for t in range(8, 16)}
+    phone = typical_focal(1080, 1920)
     prior = estimated_focal(head, RecordedTake(places, every, alone))
-    assert prior.low < 1.6 * typical_focal(1080, 1920) < prior.high > 4 * prior.low
+    assert prior.low < 2 * phone < 5 * phone < prior.high
 
 
 SIZE = (108, 192)
