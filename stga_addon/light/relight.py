@@ -72,6 +72,8 @@ def _unit(vectors: np.ndarray) -> np.ndarray:
 
 REFLECTANCE = 0.04
 """Reflectance of skin, eyes and teeth seen straight on: a refractive index of 1.5."""
+COVERED_WEIGHT = 1e-3
+"""Weight of covered vertices where the turn of the head is found; open ones have 1 more."""
 MIN_IRRADIANCE = 0.15
 """Least irradiance that color is divided by, as a fraction of its mean: noise."""
 HIGHLIGHT_FRACTION = 0.034
@@ -187,7 +189,7 @@ class Relighter:
         lamps = [distant_light(light, center) for light in lighting.lights]
         distant = lighting.world + sum(lamps, np.zeros((9, 3)))
         # Open vertices, which the jaw moves least, say how the head is turned.
-        weights = self.light.occlusion + np.float64(1e-3)
+        weights = self.light.occlusion + np.float64(COVERED_WEIGHT)
         mesh = np.asarray(mesh, np.float64)
         turn, _ = weighted_procrustes(mesh, self.avatar.neutral, weights)
         # Both at once: turning them into the head's axes takes longer than the rest.

@@ -1,6 +1,7 @@
 """Constants of Python as text of WGSL, GLSL and JavaScript."""
 
 from collections.abc import Callable, Mapping
+from typing import Any
 
 import numpy as np
 
@@ -11,20 +12,22 @@ def _wgsl(name: str, value: float) -> str:
     return f"const {name}: f32 = {float(np.float32(value)).hex()}f;"
 
 
-def _javascript(name: str, value: float) -> str:
-    text = int(value) if float(value).is_integer() else float(value)
-    return f"export const {name} = {text!r};"
+def _javascript(name: str, value: Any) -> str:
+    numbers = np.asarray(value, float)
+    texts = [repr(int(number) if number.is_integer() else number) for number in numbers.flat]
+    text = f"[{', '.join(texts)}]" if numbers.ndim else texts[0]
+    return f"export const {name} = {text};"
 
 
-LANGUAGES: dict[str, Callable[[str, float], str]] = {
+LANGUAGES: dict[str, Callable[[str, Any], str]] = {
     "wgsl": _wgsl,
     "glsl": lambda name, value: f"#define {name} {value!r}",
     "javascript": _javascript,
 }
-"""A name and a number -> the line that declares it."""
+"""A name and a number -> the line that declares it; in JavaScript, also of a list of numbers."""
 
 
-def printed_constants(values: Mapping[str, float], language: str) -> str:
-    """A line for each of the numbers, in one of LANGUAGES; whole numbers are counts in WGSL."""
+def printed_constants(values: Mapping[str, Any], language: str) -> str:
+    """A line for each of the values, in one of LANGUAGES; whole numbers are counts in WGSL."""
     line = LANGUAGES[language]
     return "".join(f"{line(name, value)}\n" for name, value in values.items())

@@ -4,7 +4,7 @@ python -m stga_addon.export.web.shared_constants writes that file.
 """
 
 from ...avatar import embedding, strain
-from ...light import lamps
+from ...light import harmonics, lamps, relight, surface, values
 from ...raster.shader_constants import printed_constants
 from .page import PLAYER
 
@@ -18,6 +18,16 @@ CONSTANTS = {
     "UPRIGHT_COSINE": embedding.UPRIGHT_COSINE,
     "MAP_SIZE": lamps.MAP_SIZE,
     "LIFT_M": lamps.LIFT_M,
+    "CELL_M": surface.CELL_M,
+    "MAX_CELLS": surface.MAX_CELLS,
+    "SKIN": surface.SKIN,
+    "MIN_OPEN": surface.MIN_OPEN,
+    "LAMBERT": harmonics.LAMBERT,
+    "GLOSSY": harmonics.GLOSSY,
+    "UNLIKE_LIGHT": relight.UNLIKE_LIGHT,
+    "COVERED_WEIGHT": relight.COVERED_WEIGHT,
+    "MIN_IRRADIANCE": relight.MIN_IRRADIANCE,
+    "HAIR_ROUGHNESS": values.HAIR_ROUGHNESS,
 }
 
 

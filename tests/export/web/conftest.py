@@ -68,10 +68,16 @@ class Head:
         return [faces % (number + 2) == 0 for number in range(len(self.meshes))]
 
 
-def make_head(convention="stga", sh_degree=3, antialiased=True, offsets=tuple(OFFSETS)):
+def make_head(convention="stga", sh_degree=3, antialiased=True, offsets=tuple(OFFSETS), size=1.0):
     """offsets: names of driven offsets, which the ranges of most triangles cut off; splats move as
-    far as they spread."""
+    far as they spread. size: of the head, in heads."""
     model = small_head(0)
+    model = replace(
+        model,
+        v_template=size * model.v_template,
+        shapedirs=size * model.shapedirs,
+        posedirs=size * model.posedirs,
+    )
     rng = np.random.default_rng(3)
     frames = [
         FlameFrame(
@@ -79,7 +85,7 @@ def make_head(convention="stga", sh_degree=3, antialiased=True, offsets=tuple(OF
             rotation=rng.normal(0, 0.1, 3),
             neck_pose=rng.normal(0, 0.1, 3),
             jaw_pose=np.array([0.2, 0.02, 0.0]),
-            translation=rng.normal(0, 0.01, 3),
+            translation=size * rng.normal(0, 0.01, 3),
             eyes_pose=rng.normal(0, 0.2, 6),
             dynamic_offset=rng.normal(0, 2e-4, model.v_template.shape) if number == 1 else None,
         )
@@ -88,29 +94,28 @@ def make_head(convention="stga", sh_degree=3, antialiased=True, offsets=tuple(OF
     shape = rng.normal(0, 0.5, model.n_identity)
     offset = rng.normal(0, 1e-4, model.v_template.shape)
     sequence = FlameSequence(model, shape, offset, (0, 1, 2), frames.__getitem__)
-    unit = 1.0 if convention == "gaussian_avatars" else 0.005
+    unit = 1.0 if convention == "gaussian_avatars" else 0.005 * size
     splats = random_splats(5, SPLATS, len(model.faces), sh_degree)
-    size = np.float32(0.3 * unit), np.float32(np.log(0.8 * unit) + 1.2)
     splats = replace(
         splats,
-        xyz=splats.xyz * size[0],
-        log_scale=splats.log_scale * np.float32(0.3) + size[1],
+        xyz=splats.xyz * np.float32(0.3 * unit),
+        log_scale=splats.log_scale * np.float32(0.3) + np.float32(np.log(0.8 * unit) + 1.2),
         sh=splats.sh * np.float32(0.3),
     )
     neutral = neutral_mesh(sequence).astype(np.float32)
     meshes = np.stack([sequence_mesh(sequence, timestep) for timestep in sequence.timesteps])
     limits = observed_range(strain_basis(neutral, model.faces), 0.5 * (meshes[:1] + neutral))
-    sizes = {"strain_position": 0.3 * unit, "strain_scale": 0.1, "strain_color": 0.1}
-    sizes |= {"normal_color": 0.5}
+    spreads = {"strain_position": 0.3 * unit, "strain_scale": 0.1, "strain_color": 0.1}
+    spreads |= {"normal_color": 0.5}
     driven = {
-        name: rng.normal(0, size, (len(model.faces), 3, 3)).astype(np.float32)
-        for name, size in sizes.items()
+        name: rng.normal(0, spread, (len(model.faces), 3, 3)).astype(np.float32)
+        for name, spread in spreads.items()
     }
     avatar = Avatar(splats, convention, neutral, model.faces, antialiased=antialiased)
     if offsets:
         kept = {name: driven[name] for name in offsets}
         avatar = replace(avatar, strain_range=limits, driven_offsets=kept)
-    camera = look_at((0.15, 0.05, 1.0), (0, 0, 0), SIZE, SIZE, 3.0 * SIZE)
+    camera = look_at((0.15 * size, 0.05 * size, size), (0, 0, 0), SIZE, SIZE, 3.0 * SIZE)
     return Head(avatar, sequence, meshes, camera)
 
 

@@ -138,6 +138,21 @@ def test_colors_are_the_relighters(options, exact, browser, tmp_path):
     assert browser.requests == [(tmp_path / "a.html").as_uri()]
 
 
+def test_light_between_skin_of_a_mesh_in_other_units(browser, tmp_path):
+    """Catches cells of 2 cm on a mesh that is larger than they are meant for, as one in
+    centimeters: millions of them, and no neighbor in the next one."""
+    head = lit_head(size=20.0)
+    show(browser, tmp_path, head.data(exact=True))
+    world = harmonics()
+    set_lighting(browser, {"harmonics": world.ravel().tolist()})
+    relighter = Relighter(head.avatar)
+    order = np.lexsort((relighter.face, head.avatar.splats.face))
+    colors = relighter.colors(head.meshes[0], head.camera.position, Lighting(world, ()))
+    picture(browser, 0)
+    found = np.reshape(browser.evaluate(COLORS), (-1, 4))[:, :3]
+    assert np.quantile(np.abs(found - colors[order]).max(1), 0.95) < 0.002
+
+
 def test_as_recorded_is_what_a_page_without_light_shows(browser, tmp_path):
     """Catches a pixel that changes because the light is known, or because it was on before; and
     data of light in a page of an avatar that has none."""

@@ -7,7 +7,9 @@
 /** @import { Sun, Uniforms, Values, Vector } from './types.js' */
 
 import { bounds, rotatedAbout } from './camera.js';
-import { LIFT_M, MAP_SIZE } from './constants.js';
+import { CELL_M, COVERED_WEIGHT, GLOSSY, HAIR_ROUGHNESS, LAMBERT } from './constants.js';
+import { LIFT_M, MAP_SIZE, MAX_CELLS, MIN_IRRADIANCE } from './constants.js';
+import { MIN_OPEN, SKIN, UNLIKE_LIGHT } from './constants.js';
 import { FaceFrames } from './face_frames.js';
 import { bindTexture, deleteTarget, floatTexture, makeTarget, paddedLength } from './renderer.js';
 import { program, updateTexture } from './renderer.js';
@@ -68,7 +70,7 @@ export function litBy({ even = [0, 0, 0], environment, ...lighting }, up) {
       rotatedAbout(rotatedAbout(v, about, Math.atan2(sine, top[1])), top, turn);
     everywhere = vector(k => even[k] + found.even[k]);
     for (const { toward, color } of lobes)
-      addPoint(world, turned(unit(toward)), color, COSINE_LOBE);
+      addPoint(world, turned(unit(toward)), color, LAMBERT);
     if (own) sun ??= { toward: turned(own.toward), color: own.color };
   }
   if (harmonics) {
@@ -96,9 +98,6 @@ const DEGREE_0 = 0.28209479177387814;
 const DEGREE_1 = 0.4886025119029199;
 const DEGREE_2 = 1.0925484305920792; // xy, yz, xz; half of it: x² − y²
 const UPRIGHT = 0.31539156525252005; // 3z² − 1
-// Of each coefficient in a lobe max(0, cosine), over its value in the lobe's direction (Ramamoorthi
-// and Hanrahan).
-const COSINE_LOBE = [1, 2 / 3, 2 / 3, 2 / 3, 0.25, 0.25, 0.25, 0.25, 0.25].map(k => k * Math.PI);
 
 // Basis functions of a unit vector, orthonormal on the sphere: 1, y, z, x, xy, yz, 3z² − 1, xz, x²
 // − y².
@@ -109,7 +108,7 @@ function harmonicsOf([x, y, z]) {
   return [...linear, xy, yz, UPRIGHT * (3 * z * z - 1), xz, sides];
 }
 
-// Add light of an irradiance from one direction; COSINE_LOBE as `lobe`: radiance that falls with
+// Add light of an irradiance from one direction; LAMBERT as `lobe`: radiance that falls with
 // the cosine around it.
 /** @type {(light: Float64Array, toward: Vector, color: Vector, lobe?: number[]) => void} */
 function addPoint(light, toward, color, lobe) {
@@ -196,10 +195,6 @@ function received(transfer, light) {
   return found;
 }
 
-const CELL_M = 0.02;
-const SKIN = [0.5, 0.33, 0.25];
-const MIN_OPEN = 0.3; // share of the sky that a vertex must see to count as lit skin
-
 // What adds the irradiance that vertices get from skin around them to `out`, by what arrives at
 // them (both three numbers a vertex). Neutral vertices (3·V); triangles (3·F) with their areas;
 // share of the sky that vertices see (V).
@@ -211,8 +206,9 @@ function bounceOf(neutral, faces, areas, occlusion) {
     if (occlusion[faces[c]] > MIN_OPEN) weight[faces[c]] += areas[Math.floor(c / 3)];
   }
   const [low, high] = box(neutral);
+  const side = Math.max(CELL_M, Math.max(...difference(high, low)) / MAX_CELLS);
   const place = (/** @type {number} */ value, /** @type {number} */ axis) =>
-    Math.floor((value - low[axis]) / CELL_M) + 1;
+    Math.floor((value - low[axis]) / side) + 1;
   const [nx, ny, nz] = high.map((value, axis) => place(value, axis) + 2);
   const strides = [ny * nz, nz, 1]; // to the next cell along x, y, z; the outermost are empty
   const cell = Int32Array.from(occlusion, (_, v) => {
@@ -247,14 +243,11 @@ function bounceOf(neutral, faces, areas, occlusion) {
   };
 }
 
-// Difference between two lights from which on nothing is kept, as a share of the capture's light.
-const UNLIKE_LIGHT = 0.2;
-
 // Gain of red, green and blue, and share, by the light of the capture and the one that is shown (27
 // harmonics each, in the same axes; lamps as if they were far away).
 /** @type {(recorded: ArrayLike<number>, shown: ArrayLike<number>) => number[]} */
 function keptColors(recorded, shown) {
-  const weight = (/** @type {number} */ k) => COSINE_LOBE[Math.floor(k / 3)] ** 2;
+  const weight = (/** @type {number} */ k) => LAMBERT[Math.floor(k / 3)] ** 2;
   const [product, square] = [new Float64Array(3), new Float64Array(3).fill(1e-12)];
   for (let k = 0; k < 3 * HARMONICS; k++) {
     product[k % 3] += weight(k) * recorded[k] * shown[k];
@@ -274,13 +267,6 @@ function keptColors(recorded, shown) {
 // Colors of the splats under the light of a scene: a texel a splat, computed again where pose,
 // light or eye have changed. What depends on the avatar alone is in the data file.
 
-// Of each harmonic in the mean radiance around the direction that skin mirrors (light/harmonics.py,
-// GLOSSY).
-const GLOSSY = [1, 0.85, 0.85, 0.85, 0.62, 0.62, 0.62, 0.62, 0.62];
-const MIN_RIGID = 1e-3; // weight of covered vertices where the turn of the head is found
-const HAIR_ROUGHNESS = 1; // which does not shine as skin does
-const MIN_IRRADIANCE = 0.15; // of the capture, as a share of its mean
-
 export class LightPass {
   // For data of an avatar whose light is known.
   /** @param {GL} gl @param {Data} data */
@@ -290,7 +276,7 @@ export class LightPass {
     this.faces = arrays.faces.values;
     this.transfer = light('transfer');
     const neutral = arrays.neutral.values;
-    const weights = Float64Array.from(light('occlusion'), share => share + MIN_RIGID);
+    const weights = Float64Array.from(light('occlusion'), open => open + COVERED_WEIGHT);
     this.arms = weightedArms(neutral, weights);
     this.count = arrays.xyz.shape[0];
     const framesOf = (/** @type {DataArray} */ faces) =>
