@@ -57,7 +57,7 @@ lint: .venv/ready
 # Node.js: format and types of the web page's player
 PLAYER := stga_addon/export/web/player
 lint-web:
-	npx --yes prettier@3.6.2 --check '$(PLAYER)/*.js' '$(PLAYER)/*.ts' '$(PLAYER)/jsconfig.json'
+	npx --yes prettier@3.6.2 --check '$(PLAYER)/*.js' '!$(PLAYER)/constants.js' '$(PLAYER)/*.ts' '$(PLAYER)/jsconfig.json'
 	npx --yes -p typescript@5.9.3 tsc --noEmit --project $(PLAYER)/jsconfig.json
 
 fuzz: .venv/ready

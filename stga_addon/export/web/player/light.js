@@ -69,8 +69,7 @@ export function litBy({ even = [0, 0, 0], environment, ...lighting }, up) {
     const turned = (/** @type {Vector} */ v) =>
       rotatedAbout(rotatedAbout(v, about, Math.atan2(sine, top[1])), top, turn);
     everywhere = vector(k => even[k] + found.even[k]);
-    for (const { toward, color } of lobes)
-      addPoint(world, turned(unit(toward)), color, LAMBERT);
+    for (const { toward, color } of lobes) addPoint(world, turned(unit(toward)), color, LAMBERT);
     if (own) sun ??= { toward: turned(own.toward), color: own.color };
   }
   if (harmonics) {

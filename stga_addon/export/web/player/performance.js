@@ -161,7 +161,8 @@ function baseOf(fields) {
     bases = bases.filter((_, k) => spreads[k] <= most);
   }
   const base = bases.includes(TYPICAL_BASE) ? TYPICAL_BASE : bases[0];
-  const isDetermined = bases.length === 1 || fields.every(({ frames }) => frames === fields[0].frames);
+  const isDetermined =
+    bases.length === 1 || fields.every(({ frames }) => frames === fields[0].frames);
   return { base, isDetermined };
 }
 
@@ -171,7 +172,8 @@ function unevenness(times) {
   const frameSteps = steps.filter(step => step > 0 && step < 1);
   if (!frameSteps.length) return 0;
   const middle = median(frameSteps);
-  const mean = frameSteps.reduce((sum, step) => sum + Math.abs(step - middle), 0) / frameSteps.length;
+  const mean =
+    frameSteps.reduce((sum, step) => sum + Math.abs(step - middle), 0) / frameSteps.length;
   return Math.round(1e6 * mean) / 1e6;
 }
 
