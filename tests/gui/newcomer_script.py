@@ -525,7 +525,8 @@ def drop():
 def iterations():
     """Of the run in the panel's folder."""
     metrics = module("stga_addon.training.run.metrics_log")
-    return metrics.read_metrics(Path(chosen().run_folder))[-1]["iteration"]
+    run = Path(bpy.path.abspath(chosen().run_folder))
+    return metrics.read_metrics(run)[-1]["iteration"]
 
 
 def train_more():
