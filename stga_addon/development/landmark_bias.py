@@ -16,7 +16,7 @@ from ..flame.model import FlameModel
 from ..flame.parts import flame_model
 from ..tracking.correspondence import head_colors, shaded_image
 from ..tracking.face_networks import FIRST_IRIS_POINT, FaceNetworks
-from ..tracking.landmark_bias import BIAS_FILE, DISTANCE_M
+from ..tracking.landmark_bias import BIAS_FILE, TABLE_DISTANCE_M
 from ..tracking.landmarks import read_places
 from ..tracking.recorded import BUNDLED_PLACES
 
@@ -27,7 +27,7 @@ ELEVATIONS_DEG = tuple(range(-45, 46, 15))
 PICTURE_SIZE_PX = 512
 """Edge of the square pictures."""
 NEAR_DISTANCES_M = (0.35, 0.6)
-"""Distances of the cameras from the face's center besides DISTANCE_M."""
+"""Distances of the cameras from the face's center besides TABLE_DISTANCE_M."""
 FACE_HEIGHT_M = 0.2
 """Height of a typical face, from which the focal length follows."""
 FACE_RATIO = 0.42
@@ -44,8 +44,8 @@ SEED = 0
 
 def main() -> None:
     """Write the file."""
-    offset = _offsets(DISTANCE_M)
-    nearness = np.array([1 / distance - 1 / DISTANCE_M for distance in NEAR_DISTANCES_M])
+    offset = _offsets(TABLE_DISTANCE_M)
+    nearness = np.array([1 / distance - 1 / TABLE_DISTANCE_M for distance in NEAR_DISTANCES_M])
     grown = np.stack([_offsets(distance) for distance in NEAR_DISTANCES_M]) - offset
     write_npz(
         BIAS_FILE,

@@ -42,13 +42,13 @@ CAMERA_ASPECTS = (16 / 9, 4 / 3, 3 / 2)
 ASPECT_TOLERANCE = 0.005
 """Relative difference up to which an image has one of these."""
 PHONE_WEIGHT = 0.3
-"""Prior probability that a phone recorded whole images that do not name their lens; phones write it
-into their files."""
+"""Prior probability that a phone recorded whole images whose files do not name a lens, as those of
+phones do."""
 PHONE_SIGMA = 0.35
 """Standard deviation of the logarithm of a phone's focal length."""
 PORTRAIT_RATIO = 4.0
-"""Median focal length of other cameras that people are filmed with, relative to a phone's: some
-105 mm on 24 x 36 mm."""
+"""Focal length of a portrait lens relative to a phone's: 135 mm on 24 x 36 mm, about the longest
+that people are filmed with, as too long is better than too short."""
 PORTRAIT_SIGMA = 0.5
 """Standard deviation of its logarithm."""
 CROPPED_SIGMA = 1.2
@@ -231,7 +231,8 @@ class _Turned:
 def _turned(
     head: HeadModel, places: SurfacePoints, take: Mapping[int, TimestepLandmarks]
 ) -> _Turned:
-    """Those of a take whose face is within MAX_OFF_AXIS_DEG, or of all where none is."""
+    """Up to TIMESTEPS of a take's timesteps whose face is within MAX_OFF_AXIS_DEG; of all where no
+    face is."""
     timesteps = evenly_spread(sorted(take), CANDIDATES)
     starts = _observed(head, places, [take[t] for t in timesteps])[1]
     turns = np.stack([head_rotation(start) for start in starts])

@@ -16,9 +16,9 @@ from .fit import pose_from_one_camera
 BIAS_FILE = Path(__file__).parent / "networks/landmark_bias.npz"
 """Azimuths (A,) and elevations (E,) in degrees; `offset_m`, the networks' offsets (A, E, N, 2) in
 meters at the head's distance, to the right and down in an image whose camera is upright at
-DISTANCE_M before the head; `nearness_m2`, by how much they grow for each 1/m by which the camera is
-nearer. Made by `development/landmark_bias.py`."""
-DISTANCE_M = 1.2
+TABLE_DISTANCE_M before the head; `nearness_m2`, by how much they grow for each 1/m by which the
+camera is nearer. Made by `development/landmark_bias.py`."""
+TABLE_DISTANCE_M = 1.2
 """Distance of the cameras of `offset_m`. From farther away, offsets are the same."""
 MIN_DISTANCE_M = 0.3
 """Smallest distance for which offsets are known."""
@@ -29,7 +29,7 @@ UP = np.array([0.0, 1.0, 0.0])  # In the head's axes; its face looks along +z
 class LandmarkBias:
     """Bias of the landmarks of one image, in pixels.
 
-    offset    (N, 2) from a camera at DISTANCE_M
+    offset    (N, 2) from a camera at TABLE_DISTANCE_M
     nearness  (N, 2) by how much it grows for each 1/m by which the camera is nearer
     distance  of the camera in meters, as its focal length says
     """
@@ -40,8 +40,8 @@ class LandmarkBias:
 
     def beyond_offset(self, distance: float) -> np.ndarray:
         """(N, 2): the bias from a camera at this distance in meters, less `offset`."""
-        near = min(max(distance, MIN_DISTANCE_M), DISTANCE_M)
-        return np.asarray(self.nearness * (1 / near - 1 / DISTANCE_M))
+        near = min(max(distance, MIN_DISTANCE_M), TABLE_DISTANCE_M)
+        return np.asarray(self.nearness * (1 / near - 1 / TABLE_DISTANCE_M))
 
     def of_rows(self, rows: np.ndarray) -> "LandmarkBias":
         """Bias of these landmarks alone."""
@@ -52,7 +52,7 @@ def without_bias(
     points: np.ndarray, camera: Camera, neutral: np.ndarray, reliable: np.ndarray
 ) -> np.ndarray:
     """Landmarks (N, 2) of the networks, in pixels of `camera`, moved to where they belong if it is
-    at DISTANCE_M. neutral, reliable: as of `bias_in`. Landmarks of another detector stay."""
+    at TABLE_DISTANCE_M. neutral, reliable: as of `bias_in`. Landmarks of another detector stay."""
     bias = bias_in(points, camera, neutral, reliable)
     return points if bias is None else points - bias.offset
 

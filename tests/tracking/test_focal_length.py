@@ -195,12 +195,12 @@ def test_focal_length_of_a_head_that_turns(head, factor, turn_deg):
         assert found.high > 1.5 * found.low
 
 
-def test_faces_far_aside_have_no_vote(head):
+def test_off_axis_faces_have_no_vote(head):
     """Catches a focal length by landmarks of profiles, where networks err: 0.35 of a real one."""
     places, take = turning(head, 1.6 * typical_focal(1080, 1920), 15, count=8)
-    aside = turning(head, 1.6 * typical_focal(1080, 1920), 15, count=8, ahead_deg=60)[1]
+    off_axis = turning(head, 1.6 * typical_focal(1080, 1920), 15, count=8, ahead_deg=60)[1]
     middle = np.array([540, 960])
-    for timestep, landmarks in aside.items():
+    for timestep, landmarks in off_axis.items():
         beside = (landmarks.points - middle) * [1.3, 1] + middle
         take[8 + timestep] = replace(landmarks, points=beside)
     every = np.ones(300, bool)
