@@ -52,7 +52,8 @@ def test_effect_choices(chosen, extension, tmp_path):
     seconds = json.loads(chosen.preset_timing)
     assert list(seconds) == list(PRESETS)
     chosen.preset = "draft"
-    assert chosen.minutes == pytest.approx(seconds["draft"] / 60)
+    least = 0.01  # which a fast machine needs less than
+    assert chosen.minutes == pytest.approx(max(least, seconds["draft"] / 60))
     out = tmp_path / "run"
     made = {"iterations": 3, "effects": f"{effects} relight=off", "device": "cpu"}
     ops.train(directory=out, preset=chosen.preset, **made)
