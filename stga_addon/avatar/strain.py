@@ -227,10 +227,8 @@ def range_with_margin(rest: np.ndarray, values: Iterable[np.ndarray]) -> np.ndar
     limits = np.stack([rest, rest], axis=1)
     for value in values:
         wider = rest + np.float32(RANGE_MARGIN) * (value - rest)
-        limits[:, 0], limits[:, 1] = (
-            np.minimum(limits[:, 0], wider),
-            np.maximum(limits[:, 1], wider),
-        )
+        limits[:, 0] = np.minimum(limits[:, 0], wider)
+        limits[:, 1] = np.maximum(limits[:, 1], wider)
     return np.asarray(limits)
 
 

@@ -115,7 +115,7 @@ class _View:
         longer = replace(camera, fl_x=camera.fl_x * ratio, fl_y=camera.fl_y * ratio)
         points = self.landmarks.points
         if self.bias is not None:
-            points = points - self.bias.beyond_offset(self.bias.distance * ratio)
+            points = points - self.bias.beyond_offset(self.bias.distance_m * ratio)
         return replace(self.landmarks, cameras=(longer,), points=points)
 
 

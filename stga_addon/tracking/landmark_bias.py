@@ -29,18 +29,18 @@ UP = np.array([0.0, 1.0, 0.0])  # In the head's axes; its face looks along +z
 class LandmarkBias:
     """Bias of the landmarks of one image, in pixels.
 
-    offset    (N, 2) from a camera at TABLE_DISTANCE_M
-    nearness  (N, 2) by how much it grows for each 1/m by which the camera is nearer
-    distance  of the camera in meters, as its focal length says
+    offset      (N, 2) from a camera at TABLE_DISTANCE_M
+    nearness    (N, 2) by how much it grows for each 1/m by which the camera is nearer
+    distance_m  of the camera, as its focal length says
     """
 
     offset: np.ndarray
     nearness: np.ndarray
-    distance: float
+    distance_m: float
 
-    def beyond_offset(self, distance: float) -> np.ndarray:
-        """(N, 2): the bias from a camera at this distance in meters, less `offset`."""
-        near = min(max(distance, MIN_DISTANCE_M), TABLE_DISTANCE_M)
+    def beyond_offset(self, distance_m: float) -> np.ndarray:
+        """(N, 2): the bias from a camera at this distance, less `offset`."""
+        near = min(max(distance_m, MIN_DISTANCE_M), TABLE_DISTANCE_M)
         return np.asarray(self.nearness * (1 / near - 1 / TABLE_DISTANCE_M))
 
     def of_rows(self, rows: np.ndarray) -> "LandmarkBias":

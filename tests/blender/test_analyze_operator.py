@@ -52,7 +52,7 @@ def test_effect_choices(chosen, extension, tmp_path):
     seconds = json.loads(chosen.preset_timing)
     assert list(seconds) == list(PRESETS)
     chosen.preset = "draft"
-    least = 0.01  # which a fast machine needs less than
+    least = 0.01  # minutes that can be chosen; a fast machine needs fewer
     assert chosen.minutes == pytest.approx(max(least, seconds["draft"] / 60))
     out = tmp_path / "run"
     made = {"iterations": 3, "effects": f"{effects} relight=off", "device": "cpu"}

@@ -1,6 +1,5 @@
 """The face networks without MediaPipe, against what MediaPipe finds in the same pictures."""
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -128,52 +127,51 @@ def test_a_face_is_looked_for_in_parts_only_where_the_frame_shows_none(pictures,
     assert looks[1] < 640
 
 
+class Pictured:
+    """Landmarks of a person, whom the file of the bias was not made of, in a picture by a camera at
+    this place from the face's middle: as found, and the true ones."""
+
+    def __init__(self, away, focal, up=(0, 1, 0)):
+        model = flame_model(None)
+        places, self.used = read_places(BUNDLED_PLACES, len(model.faces))
+        shape = np.random.default_rng(77).normal(0, 0.5, model.n_identity)
+        mesh = flame_forward(model, shape, neutral_frame(model))
+        at = places.on(mesh, model.faces)
+        center = at[self.used].mean(0)
+        self.camera = look_at(center + away, center, 512, 512, focal, up=up)
+        image = shaded_image(mesh, model.faces, self.camera, head_colors(model))
+        (self.found,) = FaceNetworks().detect(image)
+        self.truth = self.camera.project(at)[0]
+        self.neutral = places.on(model.v_template, model.faces)
+
+
 @pytest.mark.parametrize("roll_deg", [0, 25])
 @pytest.mark.parametrize("azimuth_deg", [-40, 0, 40])
 def test_landmarks_are_moved_to_where_they_belong(azimuth_deg, roll_deg):
     """Catches a bias that is added instead of taken away, mirrored, or not turned with the image;
     of a person and directions that the file was not made of."""
-    model = flame_model(None)
-    places, used = read_places(BUNDLED_PLACES, len(model.faces))
-    shape = np.random.default_rng(77).normal(0, 0.5, model.n_identity)
-    mesh = flame_forward(model, shape, neutral_frame(model))
-    at = places.on(mesh, model.faces)
-    center = at[used].mean(0)
     turn = np.radians([azimuth_deg, roll_deg])
-    eye = center + np.array([np.sin(turn[0]), 0.6, np.cos(turn[0])])
     up = (np.sin(turn[1]), np.cos(turn[1]), 0)
-    camera = look_at(eye, center, 512, 512, 1100, up=up)
-    (found,) = FaceNetworks().detect(shaded_image(mesh, model.faces, camera, head_colors(model)))
-    neutral = places.on(model.v_template, model.faces)
-    truth = camera.project(at)[0][used]
-    before = norm(found[used] - truth)
-    after = norm(without_bias(found, camera, neutral, used)[used] - truth)
-    assert after < 0.85 * before
+    person = Pictured(np.array([np.sin(turn[0]), 0.6, np.cos(turn[0])]), 1100, up)
+    used = person.used
+    before = norm((person.found - person.truth)[used])
+    moved = without_bias(person.found, person.camera, person.neutral, used)
+    assert norm((moved - person.truth)[used]) < 0.85 * before
 
 
 @pytest.mark.parametrize("azimuth_deg", [-25, 10])
 def test_landmarks_of_a_near_face_are_moved_further(azimuth_deg):
     """Catches the bias of a near camera that is added instead of taken away: a selfie's focal
     length was estimated twice as long as it is."""
-    model = flame_model(None)
-    places, used = read_places(BUNDLED_PLACES, len(model.faces))
-    shape = np.random.default_rng(77).normal(0, 0.5, model.n_identity)
-    mesh = flame_forward(model, shape, neutral_frame(model))
-    at = places.on(mesh, model.faces)
-    center = at[used].mean(0)
     turn = np.radians(azimuth_deg)
-    eye = center + 0.4 * np.array([np.sin(turn), 0.1, np.cos(turn)])
-    camera = look_at(eye, center, 512, 512, 440)
-    (found,) = FaceNetworks().detect(shaded_image(mesh, model.faces, camera, head_colors(model)))
-    neutral = places.on(model.v_template, model.faces)
-    bias = bias_in(found, camera, neutral, used)
-    assert bias.distance == pytest.approx(0.4, rel=0.1)
-    truth = camera.project(at)[0]
-    far = found - bias.offset - truth
-    near = far - bias.beyond_offset(bias.distance)
+    person = Pictured(0.4 * np.array([np.sin(turn), 0.1, np.cos(turn)]), 440)
+    used = person.used
+    bias = bias_in(person.found, person.camera, person.neutral, used)
+    assert bias.distance_m == pytest.approx(0.4, rel=0.1)
+    far = person.found - bias.offset - person.truth
+    near = far - bias.beyond_offset(bias.distance_m)
     assert norm(near[used]) < 0.97 * norm(far[used])
-    longer = replace(camera, fl_x=1320, fl_y=1320)  # which is as far away as the file's camera
-    assert not bias_in(found, longer, neutral, used).beyond_offset(1.2).any()
+    assert not bias.beyond_offset(1.2).any()  # the distance of the file's cameras
 
 
 def test_landmarks_of_lips_and_lids_lie_on_what_moves_them():

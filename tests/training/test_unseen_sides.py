@@ -863,7 +863,7 @@ def test_a_torso_has_a_back(bundled, tmp_path):
 
 def test_a_torso_is_whole_beyond_the_images(bundled, tmp_path):
     """Catches blurred, half transparent cloth where a torso leaves the images, as no view splits
-    splats there; and what *CaptureCoverage Only* would show of it."""
+    splats there; and what *Filmed Only* would show of it."""
     torso = with_torso(bundled)
     capture = filmed(torso, painted(torso), (-20, 0, 20), 0.0, tmp_path)
     trainer = Trainer(capture, quick_settings(iterations=1), {})
