@@ -23,11 +23,11 @@ from ..stga_addon.jobs.monitor_state import RequestState, transition
 from ..stga_addon.jobs.perform import remove_request, request_folder
 from ..stga_addon.jobs.table import STORED, TRANSIENT, Kind
 from ..stga_addon.jobs.track import CAPTURE_FOLDER, RUN_FOLDER
-from ..stga_addon.report import curve_image
 from ..stga_addon.scene.objects import local_scenes
 from ..stga_addon.tracking.folder import SPLIT_FILES
 from ..stga_addon.training.run.folder import AVATAR, TRACKING
 from ..stga_addon.training.run.metrics_log import METRICS, read_metrics
+from ..stga_addon.training.run.report import curve_image
 from ..stga_addon.worker import status
 from ..stga_addon.worker.status import PICTURE, PREVIEW
 from . import timers

@@ -34,7 +34,7 @@ TRAININGS = ("stga_addon/raster/", "stga_addon/training/", "stga_addon/developme
 LAYERS = (
     {"errors", "__version__"}, {"files", "format"}, {"schema"}, {"options", "progress"}, {"worker"},
     {"flame"}, {"capture"}, {"avatar", "selection"}, {"raster"}, {"light"}, {"export"}, {"render"},
-    {"tracking"}, {"driving"}, {"training"}, {"report"}, {"jobs"}, {"api"}, {"scene"}, {"cli"},
+    {"tracking"}, {"driving"}, {"training"}, {"jobs"}, {"api"}, {"scene"}, {"cli"},
     {"development"}, {"__main__", "__init__"},
 )  # fmt: skip
 LIGHT = (

@@ -17,7 +17,6 @@ from ..files import read_json, usable_path, write_json
 from ..format import format_duration
 from ..options import option
 from ..progress import Cancelled, Log, Progress, Report, TimeLeft, Written
-from ..report import CURVE
 from ..tracking.folder import (
     KEPT_FOLDER,
     LOCK_FILE,
@@ -30,6 +29,7 @@ from ..tracking.folder import (
 )
 from ..tracking.stages import Draw, Stage, stage_spans
 from ..training.run.folder import AVATAR, has_run
+from ..training.run.report import CURVE
 from ..worker.helpers import Helpers
 from ..worker.lock import hold_folder
 from .train import AFTER_S, Extend, Train, resumed, train_and_finish

@@ -22,12 +22,12 @@ from ..format import format_table
 from ..options import like, option
 from ..progress import Cancelled, Log, Progress, Report, Written
 from ..render.device import EXPECTED_DEVICE, choose_device, is_device
-from ..report import CurveUpdater, report_run
 from ..schema import setting
 from ..training.effect_catalog import RELIGHT, WORLD
 from ..training.run import folder as run_folder
 from ..training.run.folder import AVATAR, Continuation, Run
 from ..training.run.identity import identity_of
+from ..training.run.report import CurveUpdater, report_run
 from ..training.settings import MAX_ADDED_RATIO, TrainingSettings, with_budget
 
 if TYPE_CHECKING:

@@ -13,10 +13,17 @@ import pytest
 from gui.layouts import filled
 
 from stga_addon.progress import Progress
-from stga_addon.report import CURVE_COLOR, DETAIL_COLOR, FORECAST_COLOR, MARGIN, SIZE, curve_image
 from stga_addon.scene import tags
 from stga_addon.scene.display import splat_nodes
 from stga_addon.scene.display.splat_object import set_input
+from stga_addon.training.run.report import (
+    CURVE_COLOR,
+    DETAIL_COLOR,
+    FORECAST_COLOR,
+    MARGIN,
+    SIZE,
+    curve_image,
+)
 
 from .session import ops, panel
 from .test_operators import write_ball_avatar, write_ball_run

@@ -26,7 +26,6 @@ from stga_addon.flame.sequence import with_identity
 from stga_addon.jobs.finished_run import measure_run
 from stga_addon.progress import Cancelled
 from stga_addon.raster.cpu.layout import Parameters
-from stga_addon.report import report_run
 from stga_addon.tracking.folder import is_in_order
 from stga_addon.tracking.solve import RIGID_SIZE, WEIGHT_EXCESS_SIGMA
 from stga_addon.training.evaluate import evaluator
@@ -44,6 +43,7 @@ from stga_addon.training.run import session
 from stga_addon.training.run.checkpoint import read_checkpoint, write_checkpoint
 from stga_addon.training.run.folder import read_run, with_refined_tracking
 from stga_addon.training.run.metrics_log import read_metrics
+from stga_addon.training.run.report import report_run
 from stga_addon.training.run.session import train_run
 
 from .heads import TIMESTEPS, parameters_of, tracked_as, write_head

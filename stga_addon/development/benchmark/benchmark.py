@@ -13,9 +13,9 @@ from ...errors import StgaError
 from ...files import replacing, write_json
 from ...format import format_duration
 from ...jobs.batch.plan import Plan
-from ...report import evaluation_fraction, finish_axes, psnr_axes
 from ...schema import to_json
 from ...training.evaluate.forecast import FITTED_HEADS
+from ...training.run.report import evaluation_fraction, finish_axes, psnr_axes
 from .statistics import (
     MeanCurve,
     Outcome,

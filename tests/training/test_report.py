@@ -10,16 +10,16 @@ from command_line import stga
 from numpy.testing import assert_array_equal
 from PIL import Image
 
-from stga_addon import report
 from stga_addon.development.benchmark.benchmark import benchmark_chart, report_text
 from stga_addon.development.benchmark.statistics import MeanCurve, Outcome
 from stga_addon.format import MORE_GAIN, describe_figures, describe_quality
 from stga_addon.jobs.analyze import Analyze
 from stga_addon.jobs.perform import perform
-from stga_addon.report import CURVE, report_run, run_chart, summarize_run
 from stga_addon.training import preset_timing
 from stga_addon.training.evaluate.forecast import describe_forecast
+from stga_addon.training.run import report
 from stga_addon.training.run.folder import Run, read_run
+from stga_addon.training.run.report import CURVE, report_run, run_chart, summarize_run
 from stga_addon.training.run.session import train_run
 from stga_addon.training.settings import make_settings
 

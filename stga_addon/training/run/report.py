@@ -10,20 +10,20 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from .errors import StgaError
-from .files import replacing
-from .format import describe_gain, format_duration
-from .training.evaluate import forecast as forecasts
-from .training.evaluate.forecast import (
+from ...errors import StgaError
+from ...files import replacing
+from ...format import describe_gain, format_duration
+from ..evaluate import forecast as forecasts
+from ..evaluate.forecast import (
     DETAIL,
     FITTED_HEADS,
     UNMATCHED,
     curve_of,
     detail_curve,
 )
-from .training.run.folder import read_run
-from .training.run.metrics_log import REGION_PSNR, TRACKING_GAIN, read_metrics
-from .training.settings import TrainingSettings
+from ..settings import TrainingSettings
+from .folder import read_run
+from .metrics_log import REGION_PSNR, TRACKING_GAIN, read_metrics
 
 # imported when a chart is drawn: it takes half a second, and the command line starts without it
 if TYPE_CHECKING:
