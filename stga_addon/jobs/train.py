@@ -1,7 +1,7 @@
 """Training: a new run, one that is resumed, and one that refines or extends a finished run."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import KW_ONLY, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..avatar.file import Avatar, read_avatar
-from ..capture import model as capture_model
 from ..capture.meshes import SELECTED_WEIGHT, find_region, is_region_file
 from ..capture.model import Capture
 from ..capture.open import open_capture, repair_capture
 from ..capture.repairs import REPAIR_OPTION
+from ..capture.takes import further_takes, join_takes
 from ..capture.transforms import DEFAULT_PRINCIPAL_POINT, PRINCIPAL_POINTS
 from ..errors import StgaError
 from ..export.ply import write_ply
@@ -26,7 +26,6 @@ from ..schema import setting
 from ..training.effect_catalog import RELIGHT, WORLD
 from ..training.run import folder as run_folder
 from ..training.run.folder import AVATAR, Continuation, Run
-from ..training.run.identity import identity_of
 from ..training.run.report import CurveUpdater, report_run
 from ..training.settings import MAX_ADDED_RATIO, TrainingSettings, with_budget
 
@@ -357,9 +356,9 @@ def _new_run(request: Train, report: Report, log: Log) -> Prepared:
     opened = open_capture(*source)
     if opened.repair is not None:
         raise StgaError(next(text for text in opened.warnings if REPAIR_OPTION in text))
-    new = _further_takes(request.takes, [opened], request.flame, request.principal_point)
+    new = further_takes(request.takes, [opened], request.flame, request.principal_point)
     every = [opened, *new]
-    capture = capture_model.join_takes(every)
+    capture = join_takes(every)
     expected_s = (request.settings.seconds or math.nan) + AFTER_S
     report(Progress(stage="Analyzing the capture", figures=lambda: {"left_s": expected_s}))
     settings, plan = plan_effects(capture, request.settings, device)
@@ -369,39 +368,8 @@ def _new_run(request: Train, report: Report, log: Log) -> Prepared:
     log(why)
     flame = None if request.flame is None else request.flame.resolve()
     run = Run(capture.root, flame, request.principal_point, settings, plan, device)
-    run = replace(run, takes=_named_takes(every, 1, run))
+    run = replace(run, takes=run_folder.named_takes(every, 1, run))
     return Prepared(request, run, capture, request.selection)
-
-
-def _further_takes(
-    paths: Sequence[Path], before: Sequence[Capture], flame: Path | None, principal_point: str
-) -> list[Capture]:
-    """Captures that join those before them. Raises StgaError where one is of another head or scale,
-    has no training views or is there already."""
-    new = list[Capture]()
-    for path in paths:
-        take = open_capture(path, flame, principal_point)
-        capture_model.require_same_head(before[0], take)
-        if not take.views.get("train"):
-            raise StgaError(
-                f"{take.root}: has no training views, so there is nothing to extend the avatar with"
-            )
-        capture_model.require_same_scale(before[0], take)
-        if any(take.root == old.root for old in before):
-            raise StgaError(f"{take.root}: is a take of this run already")
-        if any(take.root == other.root for other in new):
-            raise StgaError(f"{take.root}: is given twice; expected each take once")
-        new.append(take)
-    return new
-
-
-def _named_takes(every: Sequence[Capture], first: int, run: Run) -> tuple[run_folder.Take, ...]:
-    """As a run keeps them, those of all of its captures from the `first` on."""
-    starts = capture_model.first_timesteps(every)
-    return tuple(
-        run_folder.Take(take.root, start, identity_of(take, run.principal_point, run.settings))
-        for take, start in list(zip(every, starts, strict=True))[first:]
-    )
 
 
 def _refinement(request: Refine, report: Report, log: Log) -> Prepared:
@@ -468,11 +436,11 @@ def _joined_takes(request: Extend) -> tuple[Capture, Run]:
     """
     opened = run_folder.open_run(request.parent, flame=request.flame)
     run = opened.run
-    new = _further_takes(request.captures, opened.takes, run.flame, run.principal_point)
+    new = further_takes(request.captures, opened.takes, run.flame, run.principal_point)
     everything = [*opened.takes, *new]
-    joined = capture_model.join_takes(everything)
+    joined = join_takes(everything)
     capture = run_folder.with_refined_tracking(joined, request.parent, fitted=False)
-    added = _named_takes(everything, len(opened.takes), run)
+    added = run_folder.named_takes(everything, len(opened.takes), run)
     parent = request.parent
     last = max(capture.timesteps)
     continuation = Continuation(

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.testing import assert_array_equal
 from refusal import refusal
 
-from stga_addon.capture.model import first_timesteps, join_takes
+from stga_addon.capture.takes import first_timesteps, join_takes
 
 
 def moved(capture, offset):

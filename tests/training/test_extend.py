@@ -15,8 +15,8 @@ from stga_addon.avatar.file import read_avatar
 from stga_addon.avatar.splats import SH_C0
 from stga_addon.avatar.strain import TRAINED_RANGE
 from stga_addon.capture.meshes import read_mesh
-from stga_addon.capture.model import require_same_scale
 from stga_addon.capture.open import open_capture
+from stga_addon.capture.takes import require_same_scale
 from stga_addon.jobs.train import Extend, Train, prepare
 from stga_addon.progress import ignore
 from stga_addon.training.run import continuation

@@ -13,8 +13,9 @@ from scipy.spatial.transform import Rotation
 
 from stga_addon.avatar.file import write_avatar
 from stga_addon.capture.mesh_geometry import Similarity, rasterize
-from stga_addon.capture.model import cameras_at_once, join_takes
+from stga_addon.capture.model import cameras_at_once
 from stga_addon.capture.open import open_capture
+from stga_addon.capture.takes import join_takes
 from stga_addon.files import read_json, write_json
 from stga_addon.progress import Cancelled
 from stga_addon.render.render import render_avatar

@@ -3,7 +3,7 @@ the capture that it was trained on."""
 
 import os
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from functools import lru_cache, partial
@@ -11,8 +11,9 @@ from pathlib import Path
 
 import numpy as np
 
-from ...capture.model import Capture, join_takes
+from ...capture.model import Capture
 from ...capture.open import open_capture, with_sequence
+from ...capture.takes import first_timesteps, join_takes
 from ...capture.transforms import PRINCIPAL_POINTS
 from ...errors import StgaError
 from ...files import (
@@ -262,6 +263,15 @@ def open_run(
     if run.continuation is not None:  # it was trained on the meshes that the run before has refined
         opened = with_refined_tracking(opened, folder, fitted=False)
     return OpenedRun(run, opened, tuple(takes))
+
+
+def named_takes(every: Sequence[Capture], first: int, run: Run) -> tuple[Take, ...]:
+    """As a run keeps them, those of all of its captures from the `first` on."""
+    starts = first_timesteps(every)
+    return tuple(
+        Take(take.root, start, identity_of(take, run.principal_point, run.settings))
+        for take, start in list(zip(every, starts, strict=True))[first:]
+    )
 
 
 def avatar_version(run: Path) -> list[str]:
