@@ -61,7 +61,7 @@ RECORDING_INTERVAL_S = 0.001
 
 
 def render_device() -> str:
-    """The rendering device in the preferences, as `render.device.Composer` takes it."""
+    """The rendering device in the preferences, as `render.composer.Composer` takes it."""
     stored = preferences(bpy.context)
     return str(stored.render_device) if stored else "auto"
 

@@ -45,7 +45,7 @@ class DemoOptions:
 
 
 def run_demo_command(options: Namespace, head: object) -> None:
-    from ..render.device import choose_device
+    from ..raster.devices import choose_device
     from .demo.run import avatar_from_footage, avatar_from_phone, run_demo
 
     given = DemoOptions(**given_options(options, DemoOptions))

@@ -12,7 +12,7 @@ from ..capture.repairs import REPAIR_OPTION
 from ..format import format_duration
 from ..options import When, like
 from ..progress import Log, Progress, Report
-from ..render.device import choose_device
+from ..raster.devices import choose_device
 from ..selection import SelectionOptions, select_capture
 from ..training.effect_catalog import EffectDecision
 from ..training.run.folder import RUN

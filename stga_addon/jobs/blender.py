@@ -15,7 +15,7 @@ from ..errors import StgaError
 from ..files import naming, temporary_folder
 from ..options import like
 from ..progress import Cancelled, Log, Progress, Report, Written, counted
-from ..render.device import Composer
+from ..render.composer import Composer
 from ..render.video import (
     finished,
     is_video,

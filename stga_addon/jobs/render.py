@@ -25,7 +25,7 @@ from ..light.relight import Relighter
 from ..options import When, like, option
 from ..progress import Log, Report, Written, counted
 from ..raster.posed_splats import PosedSplats
-from ..render.device import Composer
+from ..render.composer import Composer
 from ..render.video import sequence_writer, video_writer
 from ..schema import setting
 from ..tracking.footage.json_cameras import is_gaussian_cameras, read_gaussian_cameras

@@ -21,7 +21,7 @@ from ..files import file_digest
 from ..format import format_table
 from ..options import like, option
 from ..progress import Cancelled, Log, Progress, Report, Written
-from ..render.device import EXPECTED_DEVICE, choose_device, is_device
+from ..raster.devices import EXPECTED_DEVICE, choose_device, is_device
 from ..schema import setting
 from ..training.effect_catalog import RELIGHT, WORLD
 from ..training.run import folder as run_folder

@@ -23,7 +23,7 @@ from ..raster.posed_splats import ComposedImage, PosedSplats
 from ..worker.helpers import claim_stdout
 from ..worker.launch import start_python
 from ..worker.messages import receive, send
-from .device import Composer
+from .composer import Composer
 
 REQUIRED_PACKAGES = ("numba", "platformdirs")
 """Packages that the kernels need beside numpy."""

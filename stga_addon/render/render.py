@@ -15,7 +15,7 @@ from ..capture.camera import Camera
 from ..raster.cpu.layout import Parameters
 from ..raster.cpu.rasterize import frames_in_camera, render_forward
 from ..raster.posed_splats import PosedSplats
-from .device import Composer
+from .composer import Composer
 
 WHITE = (1.0, 1.0, 1.0)
 

@@ -18,7 +18,7 @@ from ..files import NumberedFiles, check_writable, file_address, naming, replaci
 from ..raster.posed_splats import ComposedImage, PosedSplats, with_holdouts
 from ..worker.messages import receive, send
 from .client import pack_camera, pack_layers, unpack_camera, unpack_layers
-from .device import Composer
+from .composer import Composer
 
 CODEC = "libx264"
 """H.264, which browsers, phones and editors play."""

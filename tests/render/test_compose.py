@@ -16,9 +16,9 @@ from stga_addon.errors import DeviceError
 from stga_addon.raster.cpu.compose import compose
 from stga_addon.raster.gpu import compose as gpu
 from stga_addon.render import client as render_client
-from stga_addon.render import device as compose_module
+from stga_addon.render import composer as compose_module
 from stga_addon.render.client import RenderClient
-from stga_addon.render.device import Composer
+from stga_addon.render.composer import Composer
 
 TOLERANCE = 2e-5
 

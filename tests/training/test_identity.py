@@ -16,7 +16,7 @@ from stga_addon.avatar.file import read_avatar
 from stga_addon.capture.open import open_capture
 from stga_addon.jobs.perform import request_folder, write_request
 from stga_addon.jobs.train import Resume
-from stga_addon.render import device as device_choice
+from stga_addon.raster import devices as device_choice
 from stga_addon.training.run import folder as open_run_module
 from stga_addon.training.run.checkpoint import read_checkpoint
 from stga_addon.training.run.folder import device_of, open_run, read_run, write_run

@@ -237,7 +237,7 @@ def test_presets(toy_root, capsys, monkeypatch):
         return 1e-3
 
     monkeypatch.setattr(preset_timing, "seconds_per_iteration", time)
-    for module in ("jobs.analyze", "render.device"):
+    for module in ("jobs.analyze", "raster.devices"):
         name = f"stga_addon.{module}.choose_device"
         monkeypatch.setattr(name, lambda wanted: ("gpu:Card", "why"))
     assert stga("presets", toy_root, "--device gpu") == 0

@@ -47,7 +47,7 @@ from ...raster.cpu.rasterize import (
 )
 from ...raster.cpu.threads import call_helpers, parallel, pieces, threads
 from ...raster.cpu.tiles import sum_tiles
-from ...render.device import choose_device
+from ...raster.devices import choose_device
 from ...training.optimize import adam
 from ...training.optimize.backend import Batch, RenderOptions
 from ...training.optimize.frames import FrameStore

@@ -2,7 +2,7 @@
 
 from ...avatar.offsets import OFFSETS
 from ...errors import StgaError
-from ...render.device import adapter_name
+from ...raster.devices import adapter_name
 from ..settings import TrainingSettings
 from .backend import Backend
 from .cpu_backend import CpuBackend

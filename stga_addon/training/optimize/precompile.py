@@ -20,7 +20,7 @@ from ...raster.cpu.rasterize import (
     render_forward,
 )
 from ...raster.cpu.threads import ThreadPool
-from ...render.device import adapter_name
+from ...raster.devices import adapter_name
 from ...worker.launch import is_preparing
 from . import adam
 from .image_loss import image_gradient, tile_rectangles, whole_image

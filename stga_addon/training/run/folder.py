@@ -26,7 +26,7 @@ from ...files import (
 )
 from ...flame.forward import FlameFrame, frame_of
 from ...flame.sequence import FRAME_FIELDS, SHIFT_SIZE, TORSO_SHIFT, FlameSequence, motion_of
-from ...render.device import EXPECTED_DEVICE, GPU, adapter_names, choose_device, is_device
+from ...raster.devices import EXPECTED_DEVICE, GPU, adapter_names, choose_device, is_device
 from ...schema import from_json, setting, to_json
 from ...worker.lock import hold_folder
 from ..effect_catalog import EffectDecision

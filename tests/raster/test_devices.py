@@ -7,8 +7,8 @@ from types import SimpleNamespace
 import pytest
 from refusal import refusal
 
-from stga_addon.render import device as device_module
-from stga_addon.render.device import adapter_names, choose_device, is_device
+from stga_addon.raster import devices as device_module
+from stga_addon.raster.devices import adapter_names, choose_device, is_device
 
 pytest.importorskip("wgpu")
 
@@ -132,8 +132,8 @@ def test_a_driver_that_fails_leaves_the_cpu(trials, monkeypatch):
 def test_wgpu_is_imported_only_where_it_works():
     """Catches a run on the CPU that needs wgpu, or waits for a driver."""
     script = (
-        "import sys; from stga_addon.render import device; "
+        "import sys; from stga_addon.raster import devices; "
         "from stga_addon.training.run import session; "
-        "device.choose_device('cpu'); sys.exit('wgpu' in sys.modules)"
+        "devices.choose_device('cpu'); sys.exit('wgpu' in sys.modules)"
     )
     assert subprocess.run([sys.executable, "-c", script], timeout=120).returncode == 0

@@ -1,18 +1,14 @@
-"""The device that trains or renders, the GPU where it is right and faster; pictures made there."""
+"""The device that trains or renders: the GPU where it is right and faster."""
 
-import logging
-from collections.abc import Sequence
 from functools import cache
 from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any
 
-from ..capture.camera import Camera
-from ..errors import DeviceError, StgaError, one_line
-from ..raster.posed_splats import ComposedImage, PosedSplats
+from ..errors import StgaError
 from ..worker.machine import address_space_gb
 
 if TYPE_CHECKING:  # without a GPU, choosing needs numpy only
-    from ..raster.gpu.trial import Trial
+    from .gpu.trial import Trial
 
 GPU = "gpu:"
 """Prefix of the adapter's name in a device."""
@@ -65,7 +61,7 @@ def adapter_names(software: bool = True) -> list[str]:
         raise StgaError(
             f"--device gpu: expected {MIN_ADDRESS_SPACE_GB:g} GB or no limit, not {limit}"
         )
-    from ..raster.gpu.adapters import adapters, is_software
+    from .gpu.adapters import adapters, is_software
 
     names = [name for name, adapter in adapters().items() if software or not is_software(adapter)]
     if not names:
@@ -114,8 +110,8 @@ def first_line(error: Exception) -> str:
 
 @cache
 def _trial(adapter: str) -> "Trial":
-    from ..raster.gpu.device import Device
-    from ..raster.gpu.trial import try_device
+    from .gpu.device import Device
+    from .gpu.trial import try_device
 
     return try_device(Device(adapter))
 
@@ -131,44 +127,3 @@ def _comparison(trial: "Trial") -> str:
 
 def _wrong(adapter: str, trial: "Trial") -> str:
     return f"{adapter} computes gradients that differ from the CPU's by {100 * trial.error:.2g} %"
-
-
-class Composer:
-    """Renders layers on a device, which is chosen with the first image.
-
-    requested   see `choose_device`; with "auto", the CPU renders from a GPU's first failure on
-    device   the one that was chosen; "" before
-    failure  why the CPU took over; "" where it did not
-    """
-
-    def __init__(self, requested: str = "auto") -> None:
-        self.requested = requested
-        self.device = ""
-        self.failure = ""
-
-    def choose(self) -> str:
-        """The device of the next image. Raises StgaError where one asked for by name fails."""
-        if not self.device:
-            self.device, _ = choose_device(self.requested, "Rendering")
-        return self.device
-
-    def compose(
-        self, layers: Sequence[PosedSplats], camera: Camera, with_depth: bool = False
-    ) -> ComposedImage:
-        """See `cpu.compose.compose`. Raises StgaError where a device asked for by name fails."""
-        if self.choose() != "cpu":
-            from ..raster.gpu import compose as gpu
-
-            try:
-                return gpu.compose(self.device.removeprefix(GPU), layers, camera, with_depth)
-            except Exception as error:  # a driver raises what it likes
-                if self.requested != "auto":
-                    raise
-                cause = f"{self.device}: {first_line(error)}"
-                cause = error.cause if isinstance(error, DeviceError) else cause
-                self.device = "cpu"
-                self.failure = one_line(f"{cause}; the CPU renders instead")
-                logging.getLogger(__name__).warning(self.failure)
-        from ..raster.cpu import compose as cpu
-
-        return cpu.compose(layers, camera, with_depth)
