@@ -15,6 +15,7 @@ from PIL import Image
 from stga_addon import api
 from stga_addon.avatar import lattice, strain
 from stga_addon.avatar.splats import SH_C0
+from stga_addon.capture import visual_hull
 from stga_addon.cli.main import make_parser
 from stga_addon.export.formats import FORMATS
 from stga_addon.export.ply import write_ply
@@ -232,7 +233,7 @@ def test_figures_of_the_method_are_those_of_the_code():
 def figures_of_training():
     settings = TrainingSettings()
     density = DensityControl(*([0] * 5))
-    grid_mm = 1000 * initial_splats.VOXEL_SIZE_M
+    grid_mm = 1000 * visual_hull.VOXEL_SIZE_M
     yield f"up to {MAX_FINE_TRIANGLES:,} triangles"
     yield f"moved {percent(lattice.INSET)} toward the centroid"
     yield f"Standard deviation: {lattice.SCALE}·ℓ/n"
@@ -273,10 +274,10 @@ def figures_of_training():
 
 
 def figures_of_priors():
-    grid_mm = 1000 * initial_splats.VOXEL_SIZE_M
+    grid_mm = 1000 * visual_hull.VOXEL_SIZE_M
     yield f"Every {surface_prior.SurfacePrior.interval} iterations"
     yield f"halfway at {surface_prior.DOUBT} of the gradient"
-    yield f"up to {initial_splats.FEW_CAMERAS} cameras"
+    yield f"up to {visual_hull.FEW_CAMERAS} cameras"
     yield f"fixed beyond {degrees(surface.UNSEEN_COSINE)}"
     yield f"pulled beyond {degrees(surface.GRAZING_COSINE)}"
     yield f"up to {surface.MAX_HEIGHT_VOXELS * grid_mm / 10:g} cm above"

@@ -206,7 +206,7 @@ def test_takes_that_do_not_fit(takes, parent, change, monkeypatch):
             return replace(capture, neutral=capture.neutral * 1.1)
         return replace(capture, views={}) if change == "images" else capture
 
-    monkeypatch.setattr("stga_addon.jobs.train.open_capture", changed)
+    monkeypatch.setattr("stga_addon.capture.takes.open_capture", changed)
     sentences = {"shape": "must be of the same head", "images": "has no training views"}
     with refusal(sentences[change]):
         prepare_extension(parent, (takes[1],), iterations=1)

@@ -16,6 +16,7 @@ from stga_addon.avatar.embedding import face_frames, to_world
 from stga_addon.avatar.splats import SH_C0
 from stga_addon.capture.camera import look_at
 from stga_addon.capture.model import Capture, View
+from stga_addon.capture.visual_hull import VOXEL_SIZE_M
 from stga_addon.flame.forward import neutral_frame
 from stga_addon.flame.model import torso_faces
 from stga_addon.flame.sequence import FlameSequence, sequence_mesh
@@ -23,7 +24,6 @@ from stga_addon.tracking.folder import TorsoPoints, write_torso_points
 from stga_addon.training.optimize.initial_splats import (
     MIN_MESH_DISTANCE_M,
     POINT_COPIES,
-    VOXEL_SIZE_M,
     flat_points,
     visual_hull_points,
 )
@@ -165,7 +165,7 @@ def test_blocks_leave_nothing_out(beside, tmp_path, monkeypatch, whole, shift):
     capture = replace(beside, views={"train": tuple(views)})
     found = []
     for voxels in (1, 5):
-        monkeypatch.setattr("stga_addon.training.optimize.initial_splats.BLOCK_VOXELS", voxels)
+        monkeypatch.setattr("stga_addon.capture.visual_hull.BLOCK_VOXELS", voxels)
         found.append(visual_hull_points(capture, views, "stga", 0).xyz)
     assert len(found[0]) > 100
     assert np.array_equal(*found)

@@ -8,13 +8,13 @@ import pytest
 from capture import factory
 
 from stga_addon.avatar.embedding import face_frames
+from stga_addon.capture.image_colors import MAX_LATER_TIMESTEPS
 from stga_addon.capture.loader import ViewLoader
 from stga_addon.capture.model import evenly_spread
 from stga_addon.capture.open import open_capture
 from stga_addon.training.evaluate.metrics import Residuals
 from stga_addon.training.optimize import frames
 from stga_addon.training.optimize.frames import FrameStore
-from stga_addon.training.optimize.initial_splats import MAX_LATER_TIMESTEPS
 from stga_addon.training.optimize.surface import Surface
 from stga_addon.training.optimize.surface_prior import SurfacePrior
 from stga_addon.training.optimize.unseen_sides import UnseenSides

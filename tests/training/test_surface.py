@@ -18,6 +18,7 @@ from stga_addon.avatar.splats import SH_C0, joined
 from stga_addon.capture.camera import look_at
 from stga_addon.capture.mesh_geometry import rasterize, silhouette
 from stga_addon.capture.model import Capture, View
+from stga_addon.capture.visual_hull import voxel_size
 from stga_addon.flame.model import faces_within
 from stga_addon.flame.parts import flame_model, key_regions
 from stga_addon.flame.quaternions import to_matrices
@@ -29,7 +30,7 @@ from stga_addon.training.optimize.hidden_layers import (
     hidden_splats,
     splats_behind,
 )
-from stga_addon.training.optimize.initial_splats import visual_hull_points, voxel_size
+from stga_addon.training.optimize.initial_splats import visual_hull_points
 from stga_addon.training.optimize.state import new_state
 from stga_addon.training.optimize.surface import GRAZING_COSINE, Surface
 from stga_addon.training.optimize.surface_prior import (

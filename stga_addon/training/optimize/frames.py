@@ -12,9 +12,9 @@ from ...avatar.lattice import SCALE
 from ...avatar.offsets import SIGNALS
 from ...avatar.strain import strain_basis, trained_range
 from ...capture.model import Capture
+from ...capture.visual_hull import voxel_size
 from ...raster.cpu.rasterize import moved_frames
 from ..settings import TrainingSettings
-from .initial_splats import voxel_size
 from .occlusion_layer import OcclusionLayer, occlusion_layer
 from .surface import Surface
 from .unseen_sides import UnseenSides, unseen_sides

@@ -5,23 +5,23 @@ single camera."""
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.ndimage import binary_dilation, binary_erosion, distance_transform_cdt
 from scipy.spatial import cKDTree
 
 from ...avatar.embedding import face_frames, to_local, to_world
 from ...avatar.lattice import lattice_splats, lattice_weights
 from ...avatar.splats import SH_C0, Splats, in_world, joined
 from ...capture.camera import Camera
-from ...capture.images import WHITE_LEVEL, read_image, read_mask, read_view
-from ...capture.mesh_geometry import (
-    MIN_DEPTH_M,
-    connected_parts,
-    pixels_of,
-    rasterize,
-    silhouette,
-    triangle_normals,
+from ...capture.image_colors import colors_within, triangle_colors
+from ...capture.images import read_image
+from ...capture.mesh_geometry import pixels_of
+from ...capture.model import Capture, View
+from ...capture.visual_hull import (
+    FEW_CAMERAS,
+    foreground_of,
+    hull_surface,
+    voxel_size,
+    wide_silhouette,
 )
-from ...capture.model import Capture, View, evenly_spread, views_by_timestep
 from ...flame.model import faces_within, torso_faces
 from ...flame.parts import PARTS
 from ...flame.sequence import below_neck
@@ -29,42 +29,8 @@ from ...tracking.folder import read_torso_points
 from ..settings import TrainingSettings
 from .semantic_regions import Region, head_regions
 
-SAMPLED_HEIGHT_PIXELS = 400
-"""Images higher than this are shrunk to it: triangles are then two or three pixels wide."""
-MASK_EDGE_PIXELS = 3
-"""Along the mask's edge, colors are mixed with the background."""
-MAX_LATER_TIMESTEPS = 6
-"""Timesteps that are read after the first."""
-MAX_LATER_VIEWS = 2
-"""Views of each of these timesteps."""
-MIDDLE_GRAY = 0.5
-"""Brightness, 0…1, of splats that no view shows."""
-MIN_ONE_SIDED_FRACTION = 0.05
-"""Area of the triangles that no view shows, but whose mirror images are visible, as a fraction of
-the mesh; below it, the cameras stand on both sides of the head."""
-MAX_ASYMMETRY_FRACTION = 0.015
-"""Largest median distance of a symmetric mesh from its mirror image, of its diagonal."""
-VOXEL_SIZE_M = 0.004
-"""Distance between visual-hull points, on a mesh of a head's size."""
-MIN_VOXEL_SIZE_FRACTION = 1 / 200
-"""Least size of a voxel as a fraction of the mesh's diagonal, so that the grid of a mesh in
-millimeters fits into memory."""
 MIN_MESH_DISTANCE_M = 0.006
 """Points nearer to the mesh are covered by the mesh's own splats."""
-GRID_MARGIN_FRACTION = 0.25
-"""Margin of the grid around the mesh's bounding box, as a fraction of its diagonal."""
-BLOCK_VOXELS = 5
-"""Edge of the blocks that are carved before single voxels are, in voxels."""
-MIN_VISIBLE_FRACTION = 0.25
-"""Fraction of the views in whose image a voxel must lie; it must be foreground in all of these."""
-MIN_EXPOSED_FRACTION = 0.125
-"""Fraction of the views in which a voxel must be visible beside the mesh. Otherwise, volumes behind
-the head that no view contradicts would become floaters in other views."""
-SILHOUETTE_TOLERANCE_FRACTION = 0.01
-"""Error of the tracked silhouette, as a fraction of the image height."""
-FEW_CAMERAS = 4
-"""Largest number of cameras with which a torso's visual hull bulges by centimeters: `TorsoPoints`
-are better."""
 CONTINUED_FRACTION = 0.4
 """Length by which a torso is continued beyond the image of a single camera, as a fraction of the
 image's width."""
@@ -122,84 +88,6 @@ def unseen_fraction(capture: Capture, convention: str, splats: Splats) -> np.nda
     return fraction
 
 
-def triangle_colors(capture: Capture, views: Sequence[View]) -> np.ndarray:
-    """Mean color (F, 3) from 0 to 1 of each triangle in the first view's timestep or, if hidden
-    there, in later ones.
-
-    Teeth that the lips hide at first have their own color, not that of the lips. Where cameras
-    stand on one side of the head only, a triangle of the other side has the color of its mirror
-    image. Any other that no view shows has the color of the nearest one of the neutral mesh that is
-    connected with it: the back of a head that is seen from the front has the color of its sides.
-    Where all connected ones are hidden too, as a back tooth, it is the nearest of those that only
-    later timesteps show or, without any, of all. Gray if no view shows any.
-    """
-    by_timestep = views_by_timestep(views)
-    color, pixels = mean_colors(capture, by_timestep.pop(views[0].timestep))
-    visible = pixels > 0
-    later: list[View] = []  # a few, of timesteps that are evenly spread, by other cameras in each
-    for n, timestep in enumerate(evenly_spread(sorted(by_timestep), MAX_LATER_TIMESTEPS)):
-        step = -(-len(by_timestep[timestep]) // MAX_LATER_VIEWS)
-        later += by_timestep[timestep][n % step :: step]
-    late_color, pixels = mean_colors(capture, later)
-    late = (pixels > 0) & ~visible
-    color[late] = late_color[late]
-    visible |= late
-    if not visible.any():
-        return np.full(color.shape, MIDDLE_GRAY)
-    hidden, mirrored = mirror_images(capture, ~visible, visible)
-    area = np.linalg.norm(triangle_normals(capture.neutral[capture.faces]), axis=1)
-    if area[hidden].sum() >= MIN_ONE_SIDED_FRACTION * area.sum():
-        color[hidden] = color[mirrored]
-        visible[hidden] = True
-    centers = capture.neutral[capture.faces].mean(1)
-    others = late if late.any() else visible
-    nearest = np.flatnonzero(others)[cKDTree(centers[others]).query(centers)[1]]
-    part = connected_parts(len(capture.neutral), capture.faces)[capture.faces[:, 0]]
-    for number in np.unique(part[visible]):
-        members = np.flatnonzero(part == number)
-        known = np.flatnonzero((part == number) & visible)
-        nearest[members] = known[cKDTree(centers[known]).query(centers[members])[1]]
-    return np.asarray(color[nearest])
-
-
-def mean_colors(capture: Capture, views: Sequence[View]) -> tuple[np.ndarray, np.ndarray]:
-    """Mean color (F, 3) in 0…1 of each triangle in the views; (F,) how many pixels show it."""
-    total = np.zeros((len(capture.faces), 3))
-    count = np.zeros(len(capture.faces))
-    for view in views:
-        small, image, mask = read_view(view, min(1.0, SAMPLED_HEIGHT_PIXELS / view.camera.height))
-        triangle, _ = rasterize(capture.mesh(view.timestep), capture.faces, small.camera)
-        inside = triangle >= 0
-        if mask is not None:
-            inside &= binary_erosion(mask > 127, iterations=MASK_EDGE_PIXELS)
-        pixels = image[inside]
-        found = triangle[inside]
-        count += np.bincount(found, minlength=len(count))
-        for channel in range(3):
-            total[:, channel] += np.bincount(found, pixels[:, channel], len(count))
-    return total / np.maximum(count, 1)[:, None] / 255, count
-
-
-def mirrored(points: np.ndarray) -> np.ndarray:
-    """Points (N, 3) of a head, on its other side."""
-    return points * [-1, 1, 1] + [2 * points[:, 0].mean(), 0, 0]
-
-
-def mirror_images(
-    capture: Capture, hidden: np.ndarray, visible: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Triangles that are `hidden` (F,) bool and whose mirror images are `visible`, and these; none
-    where the mesh is not symmetric."""
-    centers = capture.neutral[capture.faces].mean(1)
-    distance, partner = cKDTree(centers).query(mirrored(centers))
-    rows = np.flatnonzero(hidden & visible[partner])
-    if np.median(distance) > MAX_ASYMMETRY_FRACTION * np.linalg.norm(
-        np.ptp(capture.neutral, axis=0)
-    ):
-        rows = rows[:0]
-    return rows, partner[rows]
-
-
 def visual_hull_points(
     capture: Capture, views: Sequence[View], convention: str, sh_degree: int, torso: bool = False
 ) -> Splats:
@@ -214,12 +102,12 @@ def visual_hull_points(
     """
     mesh = capture.mesh(views[0].timestep)
     voxel = voxel_size(mesh)
-    points = _hull_surface(mesh, capture.faces, views, voxel)
+    points = hull_surface(mesh, capture.faces, views, voxel)
     distance, face = _followed(capture, views[0].timestep, points, torso)
     outside = distance > MIN_MESH_DISTANCE_M
     world = _new_splats(points[outside], voxel, sh_degree)
-    beside = [~_silhouette(mesh, capture.faces, view.camera) for view in views]
-    world.sh[:, 0] = (_colors_within(world.xyz, views, beside) - 0.5) / SH_C0
+    beside = [~wide_silhouette(mesh, capture.faces, view.camera) for view in views]
+    world.sh[:, 0] = (colors_within(world.xyz, views, beside) - 0.5) / SH_C0
     frames = face_frames(mesh, capture.faces, capture.neutral, convention)
     hull = to_local(world, frames, face[outside])
     torso_points = read_torso_points(capture.root) if torso and len(views) <= FEW_CAMERAS else None
@@ -244,8 +132,8 @@ def visual_hull_points(
     frames = face_frames(mesh, capture.faces, capture.neutral, convention)
     world = _new_splats(points, voxel, sh_degree)
     views = [view for view in capture.views["train"] if view.timestep == torso_points.timestep]
-    within = [_foreground(view) for view in views]
-    world.sh[:, 0] = (_colors_within(world.xyz, views, within) - 0.5) / SH_C0
+    within = [foreground_of(view) for view in views]
+    world.sh[:, 0] = (colors_within(world.xyz, views, within) - 0.5) / SH_C0
     return joined([rest, to_local(world, frames, triangles[among])])
 
 
@@ -285,7 +173,7 @@ def flat_points(
         np.clip(rows.astype(int), 0, camera.height - 1),
         np.clip(columns.astype(int), 0, camera.width - 1),
     )
-    beside = (_foreground(view) & ~_silhouette(mesh, capture.faces, camera))[pixel]
+    beside = (foreground_of(view) & ~wide_silhouette(mesh, capture.faces, camera))[pixel]
     centers = np.stack([columns[beside], rows[beside]], axis=1)
     if not len(centers):
         return _new_splats(np.zeros((0, 3)), voxel, sh_degree)
@@ -329,11 +217,6 @@ def _without_face(capture: Capture) -> np.ndarray:
     return others if others.any() else ~others
 
 
-def voxel_size(mesh: np.ndarray) -> float:
-    """Distance in meters between visual-hull points around a mesh (V, 3)."""
-    return max(VOXEL_SIZE_M, MIN_VOXEL_SIZE_FRACTION * float(np.linalg.norm(np.ptp(mesh, axis=0))))
-
-
 def _nearest_triangle(
     points: np.ndarray, mesh: np.ndarray, faces: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -362,96 +245,6 @@ def _mesh_samples(mesh: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """Points (F · S, 3) of a lattice on every triangle, triangle by triangle."""
     samples = np.einsum("pc,fci->fpi", lattice_weights(4, inset=0.02), mesh[faces])
     return np.asarray(samples.reshape(-1, 3))
-
-
-def _hull_surface(
-    mesh: np.ndarray, faces: np.ndarray, views: Sequence[View], voxel: float
-) -> np.ndarray:
-    """Grid points (N, 3) on the surface of the visual hull that are visible beside the mesh."""
-    low = mesh.min(0)
-    high = mesh.max(0)
-    margin = GRID_MARGIN_FRACTION * np.linalg.norm(high - low)
-    axes = [np.arange(a - margin, b + margin, voxel) for a, b in zip(low, high, strict=True)]
-    foreground = [_foreground(view) for view in views]
-    min_visible = max(2, MIN_VISIBLE_FRACTION * len(views))
-    # first blocks are carved, whose bounding sphere lies in the background of an image, or outside
-    # of too many images
-    centers = [axis[::BLOCK_VOXELS] + (BLOCK_VOXELS - 1) / 2 * voxel for axis in axes]
-    points = np.stack(np.meshgrid(*centers, indexing="ij"), axis=-1).reshape(-1, 3)
-    radius = np.sqrt(3) / 2 * (BLOCK_VOXELS - 1) * voxel
-    kept = np.ones(len(points), bool)
-    outside = np.zeros(len(points), int)
-    for view, mask in zip(views, foreground, strict=True):
-        camera = view.camera
-        pixels, depth = camera.project(points)
-        before = depth - radius > MIN_DEPTH_M
-        nearest = np.maximum(depth - radius, MIN_DEPTH_M)
-        # Over a sphere, x / z differs from the center's by at most radius · |(x, z)| / (z · (z −
-        # radius)).
-        focal = [camera.fl_x, camera.fl_y]
-        slope = np.hypot(1, (pixels - [camera.cx, camera.cy]) / focal)
-        reach = np.ceil((slope * focal).max(1) * radius / nearest) + 1
-        beyond = np.maximum(-pixels, pixels - [camera.width, camera.height]).max(1)
-        outside += np.where(before, beyond > reach, depth + radius <= MIN_DEPTH_M)
-        # Beyond an image, what is background is not known.
-        clear = distance_transform_cdt(np.pad(~mask, 1), "chessboard")[1:-1, 1:-1]
-        x, y, in_image = pixels_of(points, camera)
-        kept &= ~(before & in_image & (clear[y, x] > reach))
-    kept &= len(views) - outside >= min_visible
-    within = kept.reshape([len(along) for along in centers])
-    for number, axis in enumerate(axes):
-        within = within.repeat(BLOCK_VOXELS, number).take(range(len(axis)), number)
-    # then voxels
-    rows = np.nonzero(within)
-    points = np.stack([axis[row] for axis, row in zip(axes, rows, strict=True)], axis=1)
-    inside = np.ones(len(points), bool)
-    visible, exposed = np.zeros((2, len(points)), np.int32)
-    for view, mask in zip(views, foreground, strict=True):
-        beside = ~_silhouette(mesh, faces, view.camera)
-        remaining = np.flatnonzero(inside)
-        x, y, in_image = pixels_of(points[remaining], view.camera)
-        remaining = remaining[in_image]
-        x = x[in_image]
-        y = y[in_image]
-        visible[remaining] += 1
-        exposed[remaining] += beside[y, x]
-        inside[remaining] = mask[y, x]
-    solid = within.copy()
-    solid[within] = inside & (visible >= min_visible)
-    surface = (solid & ~binary_erosion(solid))[within]
-    return np.asarray(
-        points[surface & (exposed >= np.maximum(1, MIN_EXPOSED_FRACTION * len(views)))]
-    )
-
-
-def _colors_within(
-    points: np.ndarray, views: Sequence[View], masks: Sequence[np.ndarray]
-) -> np.ndarray:
-    """Mean color (N, 3) in 0…1 of points (N, 3) in the views in which they lie within the masks (H,
-    W) bool; gray where there is none."""
-    total = np.zeros((len(points), 3))
-    count = np.zeros(len(points))
-    for view, mask in zip(views, masks, strict=True):
-        x, y, inside = pixels_of(points, view.camera)
-        rows = np.flatnonzero(inside & mask[y, x])
-        total[rows] += read_image(view)[y[rows], x[rows]] / 255
-        count[rows] += 1
-    mean = total / np.maximum(count, 1)[:, None]
-    return np.where(count[:, None] > 0, mean, MIDDLE_GRAY)
-
-
-def _silhouette(mesh: np.ndarray, faces: np.ndarray, camera: Camera) -> np.ndarray:
-    """(H, W) bool: pixels that the mesh covers, dilated by the tolerance."""
-    tolerance = max(1, round(SILHOUETTE_TOLERANCE_FRACTION * camera.height))
-    return np.asarray(binary_dilation(silhouette(mesh, faces, camera), iterations=tolerance))
-
-
-def _foreground(view: View) -> np.ndarray:
-    """(H, W) bool from the mask or, without one, from the image's difference to white."""
-    mask = read_mask(view)
-    if mask is not None:
-        return np.asarray(mask > 127)
-    return np.asarray((read_image(view) < WHITE_LEVEL).any(axis=2))
 
 
 def _new_splats(points: np.ndarray, voxel: float, sh_degree: int) -> Splats:

@@ -10,6 +10,7 @@ from scipy.spatial import cKDTree
 from ...avatar.embedding import FaceFrames, face_frames
 from ...avatar.lattice import NORMAL_AXIS
 from ...capture.camera import look_at
+from ...capture.image_colors import SAMPLED_HEIGHT_PIXELS, mirrored
 from ...capture.images import read_view
 from ...capture.mesh_geometry import (
     connected_parts,
@@ -20,10 +21,10 @@ from ...capture.mesh_geometry import (
     triangle_normals,
 )
 from ...capture.model import Capture, View, evenly_spread, views_by_timestep
+from ...capture.visual_hull import FEW_CAMERAS, voxel_size
 from ...flame.model import torso_faces
 from ...flame.quaternions import unit
 from ...tracking.solve import lid_fractions
-from .initial_splats import FEW_CAMERAS, SAMPLED_HEIGHT_PIXELS, mirrored, voxel_size
 from .outlines import TOLERANCE_FRACTION, clear_of
 from .semantic_regions import (
     EYES_TO_MIDDLE,

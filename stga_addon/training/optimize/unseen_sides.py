@@ -7,10 +7,10 @@ import numpy as np
 
 from ...avatar.embedding import MIN_DIVISOR, FaceFrames, face_areas, points_to_world
 from ...avatar.splats import Splats, colored_off_axis, sh_color
+from ...capture.image_colors import mean_colors, mirror_images
 from ...capture.mesh_geometry import connected_parts
 from ...capture.model import Capture, View, evenly_spread, views_by_timestep
 from ...flame.quaternions import unit
-from .initial_splats import mean_colors, mirror_images
 from .semantic_regions import (
     BROWS_LEVEL,
     HeadCoordinates,

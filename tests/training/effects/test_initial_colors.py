@@ -9,8 +9,9 @@ from PIL import Image, ImageDraw
 
 from stga_addon.avatar.splats import SH_C0
 from stga_addon.capture.camera import Camera
+from stga_addon.capture.image_colors import triangle_colors
 from stga_addon.capture.model import Capture, View
-from stga_addon.training.optimize.initial_splats import initial_splats, triangle_colors
+from stga_addon.training.optimize.initial_splats import initial_splats
 from stga_addon.training.settings import make_settings
 
 from .scenes import own_colors
@@ -28,7 +29,7 @@ def test_splats_start_with_the_colors_of_the_images(painted, monkeypatch):
     assert np.percentile(error[front], 95) < 15
     assert not splats.sh[:, 1:].any()
     colors = triangle_colors(capture, capture.views["train"])
-    monkeypatch.setattr("stga_addon.training.optimize.initial_splats.MIN_ONE_SIDED_FRACTION", 2.0)
+    monkeypatch.setattr("stga_addon.capture.image_colors.MIN_ONE_SIDED_FRACTION", 2.0)
     assert_array_equal(colors, triangle_colors(capture, capture.views["train"]))
 
 
