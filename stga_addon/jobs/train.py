@@ -225,13 +225,14 @@ def train_and_finish(request: Training, report: Report, log: Log) -> Written:
 
     prepared = prepare(request, report, log)
     folder = request.run
+    draw = CurveUpdater(folder)
     for warning in prepared.capture.warnings:
         log(f"warning: {warning}")
-    for line in format_table(describe_effects(prepared.run.effect_plan)):
+    effects = describe_effects(prepared.run.effect_plan)
+    for line in format_table(effects):
         log(line)
     choices = {decision.effect: decision.on for decision in prepared.run.effect_plan}
     after = [choices.get(RELIGHT, True), choices.get(WORLD, False)]
-    draw = CurveUpdater(folder)
     latest = Progress()
     is_stopped = False
 

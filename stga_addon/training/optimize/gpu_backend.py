@@ -79,13 +79,13 @@ class GpuBackend:
         self._settings = settings
         self._frames = frames
         self.device = device
+        self._triangles = len(capture.faces)
+        distance_limits = settings.distance_limit * frames.units
+        self._limits = np.column_stack([*frames.scale_limits(settings), distance_limits])
         self._rasterizer = rasterize.Rasterizer(device)
         self._embedding = Embedding(
             device, capture.neutral, capture.faces, frames.convention, frames.strain
         )
-        self._triangles = len(capture.faces)
-        distance_limits = settings.distance_limit * frames.units
-        self._limits = np.column_stack([*frames.scale_limits(settings), distance_limits])
         self._pending: deque[_Queued] = deque()
         self._readbacks = [Readback(device, COUNTS + 1) for _ in range(QUEUED_ITERATIONS)]
         self._rasterizer.make_room(0)

@@ -129,8 +129,8 @@ def visual_hull_points(
     )
     points = (torso_points.at + spread).reshape(-1, 3)
     _, among = _nearest_triangle(points, mesh, capture.faces[triangles])
-    frames = face_frames(mesh, capture.faces, capture.neutral, convention)
     world = _new_splats(points, voxel, sh_degree)
+    frames = face_frames(mesh, capture.faces, capture.neutral, convention)
     views = [view for view in capture.views["train"] if view.timestep == torso_points.timestep]
     within = [foreground_of(view) for view in views]
     world.sh[:, 0] = (colors_within(world.xyz, views, within) - 0.5) / SH_C0
@@ -177,14 +177,16 @@ def flat_points(
     centers = np.stack([columns[beside], rows[beside]], axis=1)
     if not len(centers):
         return _new_splats(np.zeros((0, 3)), voxel, sh_degree)
-    points = _at_depth_of(_without_face(capture), camera, samples, centers)
+    behind_face = _without_face(capture)
+    points = _at_depth_of(behind_face, camera, samples, centers)
     if has_long_hair:
-        hanging = _at_depth_of(_ears_and_scalp(capture), camera, samples, centers)
+        beside_hair = _ears_and_scalp(capture)
+        hanging = _at_depth_of(beside_hair, camera, samples, centers)
         above = ~below_neck(neck, view.timestep, hanging) if neck else np.ones(len(hanging), bool)
         points[above] = hanging[above]
     _, face = _followed(capture, view.timestep, points, torso)
-    frames = face_frames(mesh, capture.faces, capture.neutral, convention)
     splats = _new_splats(points, voxel, sh_degree)
+    frames = face_frames(mesh, capture.faces, capture.neutral, convention)
     if neck is None:
         return to_local(splats, frames, face)
     cut = ~pixels_of(points, camera)[2]

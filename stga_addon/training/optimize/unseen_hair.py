@@ -88,7 +88,8 @@ class UnseenHair:
         face = np.repeat(rows, np.maximum(np.diff(ends, prepend=0), 1))
         weights = np.random.default_rng(0).dirichlet(np.ones(3), len(face))[:, :, None]
         place = (surface[faces[face]] * weights).sum(1)
-        normal = unit((vertex_normals(surface, faces)[faces[face]] * weights).sum(1), 1e-20)
+        normals = vertex_normals(surface, faces)
+        normal = unit((normals[faces[face]] * weights).sum(1), 1e-20)
         along = growth(at, place, normal)
         axes = np.stack([along, np.cross(normal, along), normal], axis=2)
         world = replace(

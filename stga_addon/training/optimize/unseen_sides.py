@@ -95,7 +95,8 @@ def unseen_sides(surface: Surface) -> UnseenSides:
     capture = surface.capture
     cosine = surface.facing
     is_outside = surface.outside
-    color, pixels = mean_colors(capture, _color_views(capture))
+    views = _color_views(capture)
+    color, pixels = mean_colors(capture, views)
     density = pixels / np.maximum(face_areas(capture.neutral, capture.faces), MIN_DIVISOR)
     facing = density[cosine > WELL_VISIBLE_COSINE]
     median = np.median(facing[facing > 0]) if facing.any() else 0.0

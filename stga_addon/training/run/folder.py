@@ -132,7 +132,8 @@ class Run:
 
 
 def write_run(folder: Path, run: Run) -> None:
-    write_document(folder / RUN, FORMAT, VERSION, to_json(run))
+    values = to_json(run)
+    write_document(folder / RUN, FORMAT, VERSION, values)
 
 
 def has_run(folder: Path) -> bool:

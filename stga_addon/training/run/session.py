@@ -182,7 +182,8 @@ def train_more(
     lpips.load_network()
     with folders.locked(out):
         run = replace(run, identity=folders.check_identity(out, run, capture))
-        session = _resume(_usable(capture), out, run, report)
+        capture = _usable(capture)
+        session = _resume(capture, out, run, report)
         session.begin_addition(seconds)
         session.complete()
     return Trained(out / AVATAR, session.measured)
