@@ -7,12 +7,12 @@ import bpy
 import numpy as np
 
 from ..stga_addon.capture.open import open_capture
+from ..stga_addon.capture.selection import KEY_REGIONS, SelectionOptions, select_capture
 from ..stga_addon.errors import StgaError
 from ..stga_addon.scene import tags
 from ..stga_addon.scene import vertex_groups as groups
 from ..stga_addon.scene.avatar_scene import viewports
 from ..stga_addon.scene.objects import show_progress
-from ..stga_addon.selection import KEY_REGIONS, SelectionOptions, select_capture
 from ..stga_addon.training.run.folder import read_residuals
 from ..stga_addon.training.settings import TrainingSettings
 from . import options

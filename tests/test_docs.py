@@ -16,10 +16,10 @@ from stga_addon import api
 from stga_addon.avatar import lattice, strain
 from stga_addon.avatar.splats import SH_C0
 from stga_addon.capture import visual_hull
+from stga_addon.capture.selection import SelectionOptions
 from stga_addon.cli.main import make_parser
 from stga_addon.export.formats import FORMATS
 from stga_addon.export.ply import write_ply
-from stga_addon.selection import SelectionOptions
 from stga_addon.training.optimize import (
     floaters,
     hidden_layers,

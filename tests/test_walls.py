@@ -33,13 +33,13 @@ TRAININGS = ("stga_addon/raster/", "stga_addon/training/", "stga_addon/developme
 # A module may import from layers before its own; a package counts as its first name.
 LAYERS = (
     {"errors", "__version__"}, {"files", "format"}, {"schema"}, {"options", "progress"}, {"worker"},
-    {"flame"}, {"capture"}, {"avatar", "selection"}, {"raster"}, {"light"}, {"export"}, {"render"},
+    {"flame"}, {"capture"}, {"avatar"}, {"raster"}, {"light"}, {"export"}, {"render"},
     {"tracking"}, {"driving"}, {"training"}, {"jobs"}, {"api"}, {"scene"}, {"cli"},
     {"development"}, {"__main__", "__init__"},
 )  # fmt: skip
 LIGHT = (
     "errors", "files", "flame", "capture", "capture.open", "avatar", "avatar.file", "export.ply",
-    "selection", "jobs.perform", "jobs.monitor_state", "jobs.python_check", "api",
+    "capture.selection", "jobs.perform", "jobs.monitor_state", "jobs.python_check", "api",
 )  # fmt: skip
 
 
@@ -169,8 +169,7 @@ def test_imports_run_one_way(path):
             continue
         assert level == len(parts), f"{name_of(path)} imports from outside stga_addon"
         other = module.split(".")[0]
-        is_beside = other == parts[0] or {parts[0], other} <= {"avatar", "selection"}
-        assert is_beside or layer(other) < own, f"{name_of(path)} imports {module}"
+        assert other == parts[0] or layer(other) < own, f"{name_of(path)} imports {module}"
 
 
 def test_no_file_imports_itself_by_way_of_others():

@@ -18,6 +18,7 @@ from ..capture.coverage import capture_coverage
 from ..capture.model import Capture, summarize_capture
 from ..capture.open import has_mesh_files, is_capture, needs_no_flame, open_capture
 from ..capture.other_input import other_input
+from ..capture.selection import SelectionOptions
 from ..errors import StgaError, printable
 from ..export.formats import FORMATS
 from ..export.splat_files import is_splats, read_splats
@@ -51,7 +52,6 @@ from ..options import (
     serves,
 )
 from ..progress import Clock, Progress, ignore
-from ..selection import SelectionOptions
 from ..tracking.folder import describe_focal_length
 from ..training.run.folder import AVATAR, Run, claimed_folder, has_run, open_run, read_run
 from ..training.settings import TrainingSettings, make_settings

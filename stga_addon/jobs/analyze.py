@@ -9,11 +9,11 @@ from time import monotonic
 from ..capture.open import is_capture, open_capture, repair_capture
 from ..capture.other_input import other_input
 from ..capture.repairs import REPAIR_OPTION
+from ..capture.selection import SelectionOptions, select_capture
 from ..format import format_duration
 from ..options import When, like
 from ..progress import Log, Progress, Report
 from ..raster.devices import choose_device
-from ..selection import SelectionOptions, select_capture
 from ..training.effect_catalog import EffectDecision
 from ..training.run.folder import RUN
 from ..training.settings import PRESETS, TrainingSettings, make_settings

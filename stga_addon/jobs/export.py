@@ -11,6 +11,7 @@ from ..avatar.file import Avatar
 from ..avatar.observed import observed_part
 from ..capture.camera import Camera
 from ..capture.model import Capture
+from ..capture.selection import SelectionOptions, select_capture
 from ..driving.head_map import page_controls
 from ..driving.open_motion import MotionOptions
 from ..driving.performers import is_performance
@@ -31,7 +32,6 @@ from ..format import format_bytes, format_name
 from ..light.relight import albedo_avatar
 from ..options import When, like, option
 from ..progress import Log, Report, Written, counted
-from ..selection import SelectionOptions, select_capture
 from ..training.run.folder import AVATAR, SELECTION
 from . import avatar_source
 from .train import Train

@@ -10,8 +10,8 @@ import numpy as np
 
 from ..capture.loader import LoadedView, ViewLoader
 from ..capture.model import Capture, evenly_spread, views_by_timestep
+from ..capture.selection import select_capture
 from ..errors import StgaError
-from ..selection import select_capture
 from .effects.plan import plan_effects
 from .optimize.avatar_tracking import TrainedAvatar, track_by_avatar, tracked_timesteps
 from .optimize.image_preparation import image_preparation

@@ -8,10 +8,10 @@ from typing import Any
 from ..avatar.embedding import CONVENTIONS
 from ..avatar.offsets import OFFSETS
 from ..avatar.splats import MAX_SH_DEGREE
+from ..capture.selection import SelectionOptions
 from ..errors import StgaError
 from ..options import duration, option
 from ..schema import MAX_COUNT, complaint, setting, validate
-from ..selection import SelectionOptions
 from .effect_catalog import CHOICES, EFFECTS, parse_choice
 
 STRATEGIES = {

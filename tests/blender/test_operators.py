@@ -19,12 +19,12 @@ from stga_addon.avatar.embedding import to_world
 from stga_addon.avatar.file import Avatar, read_avatar, write_avatar
 from stga_addon.avatar.lattice import lattice_splats
 from stga_addon.capture.open import open_capture
+from stga_addon.capture.selection import SelectionOptions, select_capture
 from stga_addon.development.demo.in_blender import evaluated_splats
 from stga_addon.export.formats import export_avatar
 from stga_addon.export.ply import read_ply, write_ply
 from stga_addon.jobs.track import Track
 from stga_addon.scene.vertex_groups import read_selection
-from stga_addon.selection import SelectionOptions, select_capture
 
 from .captures import closure, mesh_at
 from .session import failure, ops, panel, reopen

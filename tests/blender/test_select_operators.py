@@ -7,12 +7,12 @@ from numpy.testing import assert_allclose, assert_array_equal, assert_equal
 from refusal import refusal
 
 from stga_addon.capture.open import open_capture
+from stga_addon.capture.selection import SelectionOptions, select_capture
 from stga_addon.scene import tags
 from stga_addon.scene.arrays import evaluated_vertices, mesh_triangles, read_values
 from stga_addon.scene.display.splat_attributes import read_attribute
 from stga_addon.scene.rig.head import import_head
 from stga_addon.scene.vertex_groups import FRACTION, HEAT, read_selection, write_selection
-from stga_addon.selection import SelectionOptions, select_capture
 
 from .captures import closure, flame_model, flame_sequence, mesh_capture, motion_capture
 from .session import failure, ops, panel

@@ -16,10 +16,10 @@ from refusal import refusal
 from stga_addon.capture.images import read_image, read_mask
 from stga_addon.capture.model import format_ranges, summarize_capture
 from stga_addon.capture.open import open_capture
+from stga_addon.capture.selection import SelectionOptions, select_capture
 from stga_addon.flame.forward import flame_forward
 from stga_addon.flame.model import read_flame
 from stga_addon.flame.sequence import read_frame
-from stga_addon.selection import SelectionOptions, select_capture
 from stga_addon.tracking.footage.open import open_footage
 from stga_addon.training.effects.samples import take_samples
 

@@ -31,6 +31,7 @@ from stga_addon.avatar.embedding import to_world
 from stga_addon.avatar.file import read_avatar, write_avatar
 from stga_addon.avatar.observed import observed_part
 from stga_addon.capture.open import open_capture
+from stga_addon.capture.selection import SelectionOptions
 from stga_addon.cli import commands
 from stga_addon.cli.commands import COMMANDS
 from stga_addon.development.package import ROOT
@@ -38,7 +39,6 @@ from stga_addon.errors import StgaError
 from stga_addon.export.ply import read_ply
 from stga_addon.jobs.render import unique_names
 from stga_addon.options import option_fields
-from stga_addon.selection import SelectionOptions
 from stga_addon.training.evaluate.forecast import kept_line
 from stga_addon.training.run.checkpoint import read_checkpoint
 from stga_addon.training.run.folder import read_run

@@ -8,7 +8,7 @@ from numpy.random import default_rng
 from numpy.testing import assert_allclose, assert_array_equal
 
 from raster.test_kernels import SCENES
-from stga_addon.avatar.embedding import CONVENTIONS, face_frames
+from stga_addon.avatar.embedding import CONVENTIONS, face_areas, face_frames
 from stga_addon.avatar.offsets import SIGNALS
 from stga_addon.avatar.strain import MAX_STRAIN, strain_basis
 from stga_addon.capture.camera import Camera
@@ -161,7 +161,7 @@ def test_frames_and_signals_are_numpys(device, convention, mesh):
     basis = strain_basis(neutral, faces, np.float32(ends) if mesh == "ball" else None)
     in_world = face_frames(posed, faces, neutral, convention, basis)
     expected = frames_in_camera(in_world, camera)
-    step = Embedding(device, neutral, faces, convention, basis)
+    step = Embedding(device, face_areas(neutral, faces), faces, convention, basis)
     step.upload(posed, camera)
     with device.record() as work:
         table = step.compose(work, {})

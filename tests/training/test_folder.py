@@ -12,7 +12,7 @@ from capture import factory
 from numpy.testing import assert_array_equal, assert_equal
 from refusal import refusal
 
-from stga_addon.selection import SelectionOptions
+from stga_addon.capture.selection import SelectionOptions
 from stga_addon.training.optimize.state import arrays_of
 from stga_addon.training.run import checkpoint as checkpoint_files
 from stga_addon.training.run import folder, metrics_log

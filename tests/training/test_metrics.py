@@ -19,6 +19,7 @@ from stga_addon.avatar.splats import SH_C0
 from stga_addon.capture.camera import Camera
 from stga_addon.capture.images import read_image
 from stga_addon.capture.model import View
+from stga_addon.capture.selection import visible_pixels
 from stga_addon.render.render import render_avatar
 from stga_addon.training.evaluate.metrics import (
     MAX_EVALUATION_VIEWS,
@@ -32,7 +33,6 @@ from stga_addon.training.evaluate.metrics import (
     match_exposure,
     read_evaluation_view,
     triangle_residuals,
-    visible_pixels,
 )
 from stga_addon.training.optimize.image_preparation import image_preparation
 from stga_addon.training.run.continuation import grouped_evaluation_views

@@ -5,8 +5,8 @@ import dataclasses
 import pytest
 from refusal import refusal
 
+from stga_addon.capture.selection import SelectionOptions
 from stga_addon.schema import from_json, to_json
-from stga_addon.selection import SelectionOptions
 from stga_addon.training.settings import Rates, TrainingSettings, make_settings
 
 

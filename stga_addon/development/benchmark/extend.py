@@ -28,9 +28,9 @@ import numpy as np
 from ...capture.loader import ViewLoader
 from ...capture.model import View
 from ...capture.open import open_capture
+from ...capture.selection import SelectionOptions, select_capture
 from ...jobs.train import Extend, Prepared, Refine, prepare
 from ...progress import ignore
-from ...selection import SelectionOptions, select_capture
 from ...training.effects.plan import add_effects, plan_effects
 from ...training.evaluate.metrics import evaluate, known_exposure
 from ...training.optimize.image_preparation import image_preparation

@@ -4,11 +4,11 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from ...capture.selection import SelectionOptions
 from ...errors import StgaError
 from ...jobs.train import Train
 from ...options import like, option
 from ...schema import setting
-from ...selection import SelectionOptions
 from ...training.settings import PRESETS, STRATEGIES, TrainingSettings, make_settings
 
 

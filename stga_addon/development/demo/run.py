@@ -19,6 +19,7 @@ from ...capture.camera import UP, Camera, orbited
 from ...capture.images import read_image
 from ...capture.model import Capture
 from ...capture.open import open_capture
+from ...capture.selection import SelectionOptions, select_capture
 from ...cli.commands import carry_out
 from ...driving.demo_speech import SPEECH_FILE, demo_speech
 from ...driving.inverse import write_performance
@@ -33,7 +34,6 @@ from ...jobs.track import RUN_FOLDER
 from ...jobs.train import Train
 from ...raster.cpu.precompile import begin_compiling
 from ...render.render import render, render_avatar, to_uint8
-from ...selection import SelectionOptions, select_capture
 from ...training.evaluate.metrics import evaluate_avatar
 from ...training.run.folder import AVATAR, RUN, open_refined
 from ...training.settings import make_settings

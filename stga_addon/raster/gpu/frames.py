@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from ...avatar import embedding
+from ...avatar.embedding import CONVENTIONS
 from ...avatar.offsets import OFFSETS
 from ...avatar.strain import AVERAGING_ROUNDS, STRAIN_COMPONENTS, StrainBasis
 from ...capture.camera import Camera
@@ -26,23 +26,21 @@ class Embedding:
     def __init__(
         self,
         device: Device,
-        neutral: np.ndarray,
+        areas: np.ndarray,
         faces: np.ndarray,
         convention: str,
         basis: StrainBasis | None = None,
     ) -> None:
-        """neutral (V, 3), faces (F, 3); convention as in `face_frames`; basis: where splats follow
-        the deformation."""
-        if convention not in embedding.CONVENTIONS:
-            known = embedding.CONVENTIONS
-            raise ValueError(f"embedding convention {convention!r} is not one of {known}")
+        """areas (F,) of the neutral mesh; faces (F, 3); convention as in `face_frames`; basis:
+        where splats follow the deformation."""
+        if convention not in CONVENTIONS:
+            raise ValueError(f"embedding convention {convention!r} is not one of {CONVENTIONS}")
         self._follows = basis is not None
         self._device = device
         self._count = len(faces)
         self._area_scales = convention == "stga"
-        area = embedding.face_areas(neutral, faces)
         # zero only where the float64 is
-        area[area > 0] = np.maximum(area[area > 0], np.finfo(np.float32).tiny)
+        areas = np.where(areas > 0, np.maximum(areas, np.finfo(np.float32).tiny), areas)
         rows = np.zeros(0, np.float32)
         touching = np.zeros(0, np.uint32)
         if basis is not None:
@@ -53,7 +51,7 @@ class Embedding:
             device.upload("neighbors", list_words(basis.neighbors))
         self._tables = {
             "faces": device.upload("faces", faces.astype(np.uint32)),
-            "neutral_area": device.upload("neutral_area", area.astype(np.float32)),
+            "neutral_area": device.upload("neutral_area", areas.astype(np.float32)),
             "basis": device.upload("basis", rows),
             "vertex_faces": device.upload("vertex_faces", touching),
             "tensors": device.buffer("tensors", len(rows) and 6 * len(faces)),

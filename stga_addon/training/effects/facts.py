@@ -9,13 +9,13 @@ import numpy as np
 from ...avatar.lattice import splats_per_triangle
 from ...capture.mesh_geometry import triangle_normals
 from ...capture.model import Capture, cameras_at_once, evenly_spread
+from ...capture.selection import select_capture
 from ...flame.forward import FlameFrame
 from ...flame.model import JOINTS
 from ...flame.parts import PARTS
 from ...flame.quaternions import unit
 from ...flame.sequence import joint_angles
 from ...flame.teeth import lip_pairs
-from ...selection import select_capture
 from ..settings import TrainingSettings
 from . import evidence
 from .evidence import CameraColors, Evidence

@@ -18,13 +18,12 @@ from ...avatar.file import Avatar
 from ...avatar.splats import SH_C0, Splats
 from ...capture.images import read_image, read_mask, read_view
 from ...capture.loader import Preparation
-from ...capture.mesh_geometry import rasterize
 from ...capture.model import Capture, View, ViewExposure
+from ...capture.selection import SelectionOptions, select_capture, visible_pixels
 from ...raster.cpu.layout import Parameters
 from ...raster.cpu.rasterize import BufferPool, frames_in_camera, render_backward, render_forward
 from ...raster.posed_splats import PosedSplats
 from ...render.render import posed_avatar, render_avatar, render_layers
-from ...selection import SelectionOptions, select_capture
 from ..optimize.image_loss import mean_ssim
 from ..optimize.image_preparation import NO_CORRECTION, fit_lines, view_exposure, without_backdrop
 from . import lpips
@@ -98,12 +97,6 @@ def read_evaluation_view(
         interior = inside if inside.sum() >= MIN_REGION_PIXELS else None
     regions = {name: where for name, where in regions.items() if where.sum() >= MIN_REGION_PIXELS}
     return EvaluationView(view, target, regions, interior)
-
-
-def visible_pixels(capture: Capture, view: View, faces: np.ndarray) -> np.ndarray:
-    """(H, W) bool: pixels at which the nearest triangle is one of `faces` (F,) bool."""
-    triangle, _ = rasterize(np.asarray(capture.mesh(view.timestep)), capture.faces, view.camera)
-    return (triangle >= 0) & faces[triangle]
 
 
 def known_exposure(rows: Sequence[Sequence[float]], training_views: Iterable[View]) -> ViewExposure:

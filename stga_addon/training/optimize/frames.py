@@ -55,6 +55,7 @@ class FrameStore:
 
     strain    `strain_basis` of the neutral mesh, None if nothing depends on strain
     neutral   face frames of the neutral mesh
+    areas     (F,) square meters of its triangles
     units     (F,) float32: the length that a triangle's limits are multiples of, in local units
     unit_lengths  (F,) meters of the neutral mesh that are a triangle's local unit
     voxel     meters between visual-hull points
@@ -77,12 +78,14 @@ class FrameStore:
         self._moved_mesh = moved_mesh
         limits = trained_range(len(capture.faces)) if limits is None else limits
         self.strain = strain_basis(capture.neutral, capture.faces, limits) if strain else None
+        neutral = capture.neutral
+        self.areas = face_areas(neutral, capture.faces)
         self.units = np.ones(len(capture.faces), np.float32)
         if convention != "gaussian_avatars":
-            areas = face_areas(capture.neutral, capture.faces)
-            self.units = np.asarray(np.sqrt(2 * areas), np.float32)
-        neutral = capture.neutral
-        self.neutral = face_frames(neutral, capture.faces, neutral, convention)
+            self.units = np.asarray(np.sqrt(2 * self.areas), np.float32)
+        self.neutral = face_frames(
+            neutral, capture.faces, neutral, convention, neutral_areas=self.areas
+        )
         self.unit_lengths = np.maximum(self.neutral.scale, MIN_DIVISOR)
         self.voxel = voxel_size(neutral)
         self.surface = Surface(capture)
@@ -139,8 +142,9 @@ class FrameStore:
         entry = self._latest(timestep)
         capture = self.capture
         if entry.frames is None:
+            neutral = capture.neutral
             entry.frames = face_frames(
-                entry.mesh, capture.faces, capture.neutral, self.convention, self.strain
+                entry.mesh, capture.faces, neutral, self.convention, self.strain, self.areas
             )
         return entry.frames
 

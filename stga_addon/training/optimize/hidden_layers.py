@@ -62,6 +62,7 @@ def layer_on(
 ) -> Splats:
     """The hidden layer on some triangles (F,) bool: lattices of these orders (F,)."""
     capture = frames.capture
+    insets = border_inset(frames.surface, order)
     parts = []
     for number in np.unique(order):
         rows = np.flatnonzero(triangles & (order == number)).astype(np.int32)
@@ -77,7 +78,7 @@ def layer_on(
     layer = joined(parts)
     face = layer.face
     axis = NORMAL_AXIS[frames.convention]
-    inset = border_inset(frames.surface, order)[face]
+    inset = insets[face]
     xyz = layer.xyz * inset[:, None]
     xyz[:, axis] += frames.layer_height[face]
     log_scale = layer.log_scale + np.log(inset * frames.hair_widening[face])[:, None]

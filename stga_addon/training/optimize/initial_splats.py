@@ -100,17 +100,17 @@ def visual_hull_points(
     nearest one of the torso, and of few cameras where `stga track` has seen it instead of on the
     hull.
     """
+    torso_points = read_torso_points(capture.root) if torso and len(views) <= FEW_CAMERAS else None
     mesh = capture.mesh(views[0].timestep)
     voxel = voxel_size(mesh)
     points = hull_surface(mesh, capture.faces, views, voxel)
     distance, face = _followed(capture, views[0].timestep, points, torso)
     outside = distance > MIN_MESH_DISTANCE_M
     world = _new_splats(points[outside], voxel, sh_degree)
-    beside = [~wide_silhouette(mesh, capture.faces, view.camera) for view in views]
-    world.sh[:, 0] = (colors_within(world.xyz, views, beside) - 0.5) / SH_C0
     frames = face_frames(mesh, capture.faces, capture.neutral, convention)
     hull = to_local(world, frames, face[outside])
-    torso_points = read_torso_points(capture.root) if torso and len(views) <= FEW_CAMERAS else None
+    beside = [~wide_silhouette(mesh, capture.faces, view.camera) for view in views]
+    hull.sh[:, 0] = (colors_within(world.xyz, views, beside) - 0.5) / SH_C0
     if (
         torso_points is None
         or capture.flame is None
@@ -131,10 +131,11 @@ def visual_hull_points(
     _, among = _nearest_triangle(points, mesh, capture.faces[triangles])
     world = _new_splats(points, voxel, sh_degree)
     frames = face_frames(mesh, capture.faces, capture.neutral, convention)
+    seen = to_local(world, frames, triangles[among])
     views = [view for view in capture.views["train"] if view.timestep == torso_points.timestep]
     within = [foreground_of(view) for view in views]
-    world.sh[:, 0] = (colors_within(world.xyz, views, within) - 0.5) / SH_C0
-    return joined([rest, to_local(world, frames, triangles[among])])
+    seen.sh[:, 0] = (colors_within(world.xyz, views, within) - 0.5) / SH_C0
+    return joined([rest, seen])
 
 
 def flat_points(

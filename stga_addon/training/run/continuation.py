@@ -8,6 +8,7 @@ import numpy as np
 
 from ...avatar.file import read_avatar
 from ...capture.model import Capture, View, evenly_spread, views_by_timestep
+from ...capture.selection import visible_pixels
 from ...errors import StgaError
 from ...files import file_digest
 from ...raster.cpu.layout import Parameters
@@ -141,9 +142,7 @@ def grouped_evaluation_views(
         for view in evenly_spread(members, limit):
             found = metrics.read_evaluation_view(capture, view, background, backdrop)
             found = replace(found, group=name if len(groups) > 1 else "")
-            pixels = (
-                np.zeros(0) if region is None else metrics.visible_pixels(capture, view, region)
-            )
+            pixels = np.zeros(0) if region is None else visible_pixels(capture, view, region)
             if pixels.sum() >= metrics.MIN_REGION_PIXELS:
                 found = replace(found, regions={**found.regions, "region": pixels})
             chosen.append(found)

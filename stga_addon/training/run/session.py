@@ -20,13 +20,13 @@ import numpy as np
 from ...avatar.file import Avatar, read_avatar, write_avatar
 from ...capture.loader import DEFAULT_LIMITS, ViewLoader
 from ...capture.model import Capture, View, evenly_spread, views_by_timestep
+from ...capture.selection import select_capture
 from ...capture.usable_views import with_training_views
 from ...errors import DeviceError, StgaError, shorten
 from ...files import replacing
 from ...progress import Cancelled, Progress, Report, ignore
 from ...raster.cpu.threads import threads
 from ...render.render import render_avatar
-from ...selection import select_capture
 from ...tracking.folder import is_in_order
 from ..evaluate import lpips, metrics
 from ..evaluate.evaluator import EVALUATIONS, Evaluator, Spent

@@ -7,9 +7,9 @@ import pytest
 from refusal import refusal
 
 from stga_addon.capture.model import Capture
+from stga_addon.capture.selection import KEY_REGIONS, SelectionOptions, select_capture, select_faces
 from stga_addon.flame.parts import KEY_MASKS
 from stga_addon.schema import validate
-from stga_addon.selection import KEY_REGIONS, SelectionOptions, select_capture, select_faces
 
 THRESHOLD = 0.01
 COUNT = 8

@@ -1,13 +1,14 @@
-"""Selection of the triangles that move in a timestep, whose splats it trains."""
+"""Selection of the triangles that move in a timestep, whose splats it trains; their pixels."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 
-from .capture.model import Capture
-from .flame.sequence import ZERO_POSES
-from .options import option
+from ..flame.sequence import ZERO_POSES
+from ..options import option
+from .mesh_geometry import rasterize
+from .model import Capture, View
 
 KEY_REGIONS = ("left_eye", "right_eye", "mouth", "nose")
 
@@ -64,3 +65,9 @@ def select_capture(capture: Capture, options: SelectionOptions) -> dict[int, np.
             faces = select_faces(mesh, capture.neutral, capture.faces, regions, options.threshold)
         chosen[timestep] = faces
     return chosen
+
+
+def visible_pixels(capture: Capture, view: View, faces: np.ndarray) -> np.ndarray:
+    """(H, W) bool: pixels at which the nearest triangle is one of `faces` (F,) bool."""
+    triangle, _ = rasterize(np.asarray(capture.mesh(view.timestep)), capture.faces, view.camera)
+    return (triangle >= 0) & faces[triangle]
