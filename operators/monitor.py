@@ -6,6 +6,7 @@ carries out effects, those that depend on the kind of request by the tables in `
 """
 
 import shutil
+from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
@@ -211,18 +212,26 @@ def _stamp(path: Path) -> states.Stamp | None:
     return found.st_mtime_ns, found.st_size
 
 
-def _read_curve(run: Path, folder: Path | None) -> Curve | None:
-    """What training, or the tracking of the request in the folder, shows; None where that is
-    damaged, which training reports."""
+def _read_picture(folder: Path | None) -> dict[str, np.ndarray]:
+    """The arrays of what the tracking of the request in the folder shows; none where there is
+    nothing yet."""
+    with suppress(StgaError):
+        if folder is not None:
+            return read_npz(folder / PICTURE)
+    return {}
+
+
+def _read_curve(run: Path, picture: Mapping[str, np.ndarray]) -> Curve | None:
+    """What training, or the picture of a tracking, shows; None where that is damaged, which
+    training reports."""
     with suppress(StgaError, KeyError, TypeError, ValueError):
         found = curve_image(read_metrics(run))
         if found is not None:
             return found
-    with suppress(StgaError, KeyError):
-        rgb = read_npz(folder / PICTURE)["rgb"] if folder is not None else np.empty(0)
-        if rgb.ndim == 3 and rgb.dtype == np.uint8:
-            rgba = np.dstack([rgb, np.full(rgb.shape[:2], 255, np.uint8)])
-            return rgba[::-1].astype(np.float32) / 255, "", ""
+    rgb = picture.get("rgb", np.empty(0))
+    if rgb.ndim == 3 and rgb.dtype == np.uint8:
+        rgba = np.dstack([rgb, np.full(rgb.shape[:2], 255, np.uint8)])
+        return rgba[::-1].astype(np.float32) / 255, "", ""
     return None
 
 
@@ -266,9 +275,10 @@ def _carry_out(scene: Any, state: RequestState, effect: states.Effect) -> states
             except Exception as error:
                 return states.Failed(f"Unexpected {describe(error)}")
         case states.ReadCurve(run):
-            curves[run] = _read_curve(run, state.folder)
+            picture = _read_picture(state.folder)
+            curves[run] = _read_curve(run, picture)
             if state.kind in CAPTURES and state.folder is not None:
-                show_tracked(scene, CAPTURES[state.kind](state), state.folder / PICTURE)
+                show_tracked(scene, CAPTURES[state.kind](state), picture)
         case states.StopWorker(folder):
             status.request_cancel(folder)
         case states.KillWorker(folder):

@@ -2,17 +2,17 @@
 
 import json
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
 import bpy
+import numpy as np
 
 from ..stga_addon.avatar.file import Avatar, read_avatar
 from ..stga_addon.errors import StgaError
-from ..stga_addon.files import read_npz
 from ..stga_addon.jobs.monitor_state import Displayed, RequestState, SliceBuilt
 from ..stga_addon.jobs.perform import read_request, read_result
 from ..stga_addon.jobs.table import TRAINS, Kind
@@ -369,17 +369,14 @@ CAPTURES = {
 """Kind of request -> where it tracks a head."""
 
 
-def show_tracked(scene: Any, capture: Path, picture: Path) -> None:
+def show_tracked(scene: Any, capture: Path, picture: Mapping[str, np.ndarray]) -> None:
     """Show the mesh of a head that is being tracked, until its capture is imported."""
-    arrays = {}
-    with suppress(StgaError):  # none yet
-        arrays = read_npz(picture, ("vertices", "faces"))
     busy = bpy.app.is_job_running("RENDER") or _head_of_capture(scene, capture) is not None
-    if len(arrays) == 2 and not busy:
+    if {"vertices", "faces"} <= picture.keys() and not busy:
         before = tags.find(tags.TRACKED_HEAD, capture)
         if before and before[0].mode == "EDIT":
             return
-        mesh = triangle_mesh("Head, being tracked", arrays["vertices"], arrays["faces"])
+        mesh = triangle_mesh("Head, being tracked", picture["vertices"], picture["faces"])
         place_tracked(scene, capture, mesh, next(iter(before), None))
 
 

@@ -231,7 +231,7 @@ def test_preview_follows_the_evaluations(extension, tmp_path):
     def draw():
         """Read evaluations as the training monitor does, and draw; the texts below."""
         drawn.clear()
-        monitor.curves[tmp_path] = monitor._read_curve(tmp_path, None)
+        monitor.curves[tmp_path] = monitor._read_curve(tmp_path, {})
         curve.draw_curve(layout, tmp_path)
         return list(drawn)
 

@@ -152,12 +152,12 @@ def test_the_head_is_shown_while_it_is_tracked(extension, tmp_path):
     capture = write_mesh_capture(tmp_path / "capture")
     vertices, faces = ball()
     show = extension.operators.results.show_tracked
-    show(scene, capture, tmp_path / "picture.npz")
+    show(scene, capture, {})
     assert not scene.objects["Cube"].hide_render
     before = set(bpy.data.objects)
     for size in (1.0, 2.0):
-        np.savez(tmp_path / "picture.npz", vertices=size * vertices, faces=faces)
-        show(scene, capture, tmp_path / "picture.npz")
+        picture = {"vertices": size * vertices, "faces": faces}
+        show(scene, capture, picture)
         (head,) = set(bpy.data.objects) - before
         found = np.array([head.matrix_world @ vertex.co for vertex in head.data.vertices])
         expected = size * vertices @ np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0]])
@@ -166,5 +166,5 @@ def test_the_head_is_shown_while_it_is_tracked(extension, tmp_path):
     name = head.name
     ops.import_capture(directory=capture)
     assert name not in bpy.data.objects
-    show(scene, capture, tmp_path / "picture.npz")  # the last picture, read late
+    show(scene, capture, picture)  # the last picture, read late
     assert name not in bpy.data.objects
