@@ -119,8 +119,7 @@ class UnseenHair:
     @property
     def _count(self) -> float:
         """How many strands there are."""
-        capture = self._frames.capture
-        area = face_areas(capture.neutral, capture.faces)
+        area = self._frames.areas
         scalp = self._frames.surface.kinds["scalp"]
         return float(STRANDS * area[self.has_strands].sum() / area[scalp].sum())
 
