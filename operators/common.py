@@ -15,7 +15,6 @@ from bpy_extras.io_utils import ExportHelper, ImportHelper
 from ..stga_addon.capture.open import open_capture
 from ..stga_addon.capture.transforms import DEFAULT_PRINCIPAL_POINT
 from ..stga_addon.errors import StgaError, telling_refusals
-from ..stga_addon.files import check_encodable
 from ..stga_addon.flame.sequence import FlameSequence
 from ..stga_addon.progress import Cancelled
 from ..stga_addon.scene import tags
@@ -24,7 +23,7 @@ from ..stga_addon.scene.record import capture_of, stored_path
 from ..stga_addon.scene.rig.head import check_editable, check_local, find_rig, usable_rig
 from ..stga_addon.scene.rig.keyframes import shape_key_names
 from ..stga_addon.scene.tags import is_head
-from ..stga_addon.schema import alternatives, type_hints
+from ..stga_addon.schema import alternatives, check_encodable, type_hints
 from ..stga_addon.training.run.folder import has_run
 from . import options
 from .options import ONCE

@@ -407,41 +407,6 @@ def _mode(path: Path) -> int:
         raise StgaError(f"{path}: cannot be read ({error.strerror or error})") from error
 
 
-def usable_path(text: str) -> Path:
-    """Raises StgaError for a name that no file can have (empty, too long or with a NUL), that is
-    not UTF-8, folders above included, or relative where the folder it counts from was removed."""
-    try:
-        os.lstat(text)
-        too_long = False
-    except OSError as error:
-        too_long = error.errno == errno.ENAMETOOLONG
-    except ValueError as error:  # a NUL, or a character that file names cannot encode
-        raise StgaError(f"'{text}' is not a usable path ({error})") from error
-    # The system looks at names in turn and stops at the first that is missing.
-    if too_long or any(len(os.fsencode(part)) > MAX_NAME_BYTES for part in Path(text).parts):
-        raise StgaError(f"'{text}' is not a usable path (too long)")
-    if not text:
-        raise StgaError("the path is empty")
-    check_encodable(Path(text))
-    return Path(text)
-
-
-def check_encodable(path: Path) -> None:
-    """Raise StgaError where the path or a folder above is not named in UTF-8: the JSON of runs and
-    requests, USD and other libraries cannot hold it. Also where the path is relative, and the
-    folder in which this process works was removed."""
-    try:
-        whole = os.path.abspath(path)
-    except FileNotFoundError as error:
-        problem = "the working folder was removed; change to one that exists"
-        raise StgaError(f"{path}: is not a usable path ({problem})") from error
-    try:
-        os.fsencode(whole).decode("utf-8")  # as the system stores it, whatever the locale
-    except UnicodeDecodeError as error:
-        problem = "the name of this file or of a folder above is not UTF-8; rename it"
-        raise StgaError(f"{whole}: is not a usable path ({problem})") from error
-
-
 def file_size(path: Path) -> int:
     """Size in bytes. Raises StgaError for no regular file: a pipe or a device need never end."""
     try:

@@ -10,8 +10,7 @@ from types import NoneType
 from typing import Any, get_args, get_origin
 
 from .errors import StgaError, shorten
-from .files import usable_path
-from .schema import alternatives, expectation, setting, type_hints
+from .schema import alternatives, expectation, setting, type_hints, usable_path
 
 MAX_DIGITS = 18  # Digits of a whole number on the command line, which fits 64 bits
 

@@ -1,6 +1,7 @@
 """Dataclasses whose fields state their allowed values: validation, and JSON in both directions."""
 
 import dataclasses
+import errno
 import inspect
 import math
 import os
@@ -15,7 +16,6 @@ from typing import Any, ParamSpec, TypeVar, Union, get_args, get_origin, get_typ
 import numpy as np
 
 from .errors import StgaError, shorten
-from .files import usable_path
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -23,6 +23,8 @@ MAX_COUNT = (1 << 31) - 1  # Largest whole number that kernels can count to
 KIND = "kind"  # Key that names the dataclass where a field may hold one of several
 ARRAY = "array"  # Key of an array's place in JSON: its name among the arrays beside it
 IS_PATH = "is_path"  # Key of a field's metadata: of `setting`
+MAX_NAME_BYTES = 255
+"""Longest name within a path, as `files.MAX_NAME_BYTES`."""
 
 Arrays = dict[str, np.ndarray]
 
@@ -78,6 +80,49 @@ def validate(value: Any, prefix: str = "") -> None:
         value.check()
 
 
+def complaint(name: str, expected: str, value: Any) -> str:
+    """The message for a field with a value that is not allowed."""
+    return f"setting {name}: expected {expected}, got {shorten(value)}"
+
+
+# Paths
+
+
+def usable_path(text: str) -> Path:
+    """Raises StgaError for a name that no file can have (empty, too long or with a NUL), that is
+    not UTF-8, folders above included, or relative where the folder it counts from was removed."""
+    try:
+        os.lstat(text)
+        too_long = False
+    except OSError as error:
+        too_long = error.errno == errno.ENAMETOOLONG
+    except ValueError as error:  # a NUL, or a character that file names cannot encode
+        raise StgaError(f"'{text}' is not a usable path ({error})") from error
+    # The system looks at names in turn and stops at the first that is missing.
+    if too_long or any(len(os.fsencode(part)) > MAX_NAME_BYTES for part in Path(text).parts):
+        raise StgaError(f"'{text}' is not a usable path (too long)")
+    if not text:
+        raise StgaError("the path is empty")
+    check_encodable(Path(text))
+    return Path(text)
+
+
+def check_encodable(path: Path) -> None:
+    """Raise StgaError where the path or a folder above is not named in UTF-8: the JSON of runs and
+    requests, USD and other libraries cannot hold it. Also where the path is relative, and the
+    folder in which this process works was removed."""
+    try:
+        whole = os.path.abspath(path)
+    except FileNotFoundError as error:
+        problem = "the working folder was removed; change to one that exists"
+        raise StgaError(f"{path}: is not a usable path ({problem})") from error
+    try:
+        os.fsencode(whole).decode("utf-8")  # as the system stores it, whatever the locale
+    except UnicodeDecodeError as error:
+        problem = "the name of this file or of a folder above is not UTF-8; rename it"
+        raise StgaError(f"{whole}: is not a usable path ({problem})") from error
+
+
 def takes_paths(function: Callable[P, R]) -> Callable[P, R]:
     """The function, which also takes a str or an os.PathLike where it expects a Path, or a
     dataclass with such fields. Raises StgaError for a name that no file can have."""
@@ -108,9 +153,7 @@ def _with_path(hint: Any, value: Any) -> Any:
     return value
 
 
-def complaint(name: str, expected: str, value: Any) -> str:
-    """The message for a field with a value that is not allowed."""
-    return f"setting {name}: expected {expected}, got {shorten(value)}"
+# Type hints
 
 
 @cache

@@ -13,7 +13,6 @@ import numpy as np
 
 from ..errors import StgaError, listed, shorten
 from ..files import (
-    check_encodable,
     is_file,
     is_folder,
     matching,
@@ -37,6 +36,7 @@ from ..flame.sequence import (
     sequence_mesh,
     with_identity,
 )
+from ..schema import check_encodable
 from . import meshes
 from .distortion import distortion, undistorted
 from .mesh_geometry import pixels_of, without_head_motion

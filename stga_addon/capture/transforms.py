@@ -15,6 +15,7 @@ import numpy as np
 
 from ..errors import StgaError, shorten
 from ..files import is_file, read_json
+from ..schema import MAX_NAME_BYTES
 from .camera import MAX_COORDINATE_M, MAX_FOCAL_PIXELS, Camera, camera_from_gl, is_image_size
 from .model import FPS_LIMIT, Item, View, Views
 
@@ -39,8 +40,6 @@ INDEX_LIMIT = 1 << 31
 """Timesteps and camera indices are below it, to fit into int32."""
 MAX_PATH_CHARACTERS = 2000
 """Longest path that a file may name."""
-MAX_NAME_BYTES = 255
-"""Longest name within a path, as `files.MAX_NAME_BYTES`."""
 MATRIX = "a 4x4 matrix of finite numbers"
 """What a message says that `transform_matrix` must be."""
 

@@ -13,7 +13,8 @@ import numpy as np
 
 from ..avatar.splats import Splats
 from ..errors import StgaError
-from ..files import check_encodable, replacing
+from ..files import replacing
+from ..schema import check_encodable
 from ..worker.helpers import claim_stdout
 from ..worker.launch import start_piped
 from ..worker.messages import receive, send

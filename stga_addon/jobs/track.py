@@ -13,10 +13,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..errors import StgaError, shorten
-from ..files import read_json, usable_path, write_json
+from ..files import read_json, write_json
 from ..format import format_duration
 from ..options import option
 from ..progress import Cancelled, Log, Progress, Report, TimeLeft, Written
+from ..schema import usable_path
 from ..tracking.folder import (
     KEPT_FOLDER,
     LOCK_FILE,

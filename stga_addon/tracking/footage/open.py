@@ -16,7 +16,8 @@ from ...capture.lens import Lens, Undistortion, undistortion
 from ...capture.model import View, evenly_spread
 from ...capture.transforms import IMAGE_SUFFIXES, VIDEO_SUFFIXES
 from ...errors import StgaError, listed
-from ...files import check_encodable, is_file, is_folder
+from ...files import is_file, is_folder
+from ...schema import check_encodable
 from .calibrations import EXPECTED, calibration_above, find_calibration, read_calibration
 from .colmap import is_distorted, model_suffix
 from .focal_tags import photo_focal, video_focal
