@@ -7,7 +7,7 @@ from functools import cached_property
 
 import numpy as np
 
-from ...avatar.embedding import MIN_DIVISOR, FaceFrames, face_areas, face_frames
+from ...avatar.embedding import MIN_DIVISOR, FaceFrames, face_frames
 from ...avatar.lattice import SCALE
 from ...avatar.offsets import SIGNALS
 from ...avatar.strain import strain_basis, trained_range
@@ -55,7 +55,6 @@ class FrameStore:
 
     strain    `strain_basis` of the neutral mesh, None if nothing depends on strain
     neutral   face frames of the neutral mesh
-    areas     (F,) square meters of its triangles
     units     (F,) float32: the length that a triangle's limits are multiples of, in local units
     unit_lengths  (F,) meters of the neutral mesh that are a triangle's local unit
     voxel     meters between visual-hull points
@@ -76,19 +75,17 @@ class FrameStore:
         self.capture = capture
         self.convention = convention
         self._moved_mesh = moved_mesh
+        self.surface = Surface(capture)
         limits = trained_range(len(capture.faces)) if limits is None else limits
         self.strain = strain_basis(capture.neutral, capture.faces, limits) if strain else None
-        neutral = capture.neutral
-        self.areas = face_areas(neutral, capture.faces)
+        areas = self.surface.areas
         self.units = np.ones(len(capture.faces), np.float32)
         if convention != "gaussian_avatars":
-            self.units = np.asarray(np.sqrt(2 * self.areas), np.float32)
-        self.neutral = face_frames(
-            neutral, capture.faces, neutral, convention, neutral_areas=self.areas
-        )
+            self.units = np.asarray(np.sqrt(2 * areas), np.float32)
+        neutral = capture.neutral
+        self.neutral = face_frames(neutral, capture.faces, neutral, convention, neutral_areas=areas)
         self.unit_lengths = np.maximum(self.neutral.scale, MIN_DIVISOR)
         self.voxel = voxel_size(neutral)
-        self.surface = Surface(capture)
         self._most = int(CACHE_BYTES / BYTES_PER_TRIANGLE / len(capture.faces))
         self._cached: dict[int, _Timestep] = {}
 
@@ -142,9 +139,13 @@ class FrameStore:
         entry = self._latest(timestep)
         capture = self.capture
         if entry.frames is None:
-            neutral = capture.neutral
             entry.frames = face_frames(
-                entry.mesh, capture.faces, neutral, self.convention, self.strain, self.areas
+                entry.mesh,
+                capture.faces,
+                capture.neutral,
+                self.convention,
+                self.strain,
+                self.surface.areas,
             )
         return entry.frames
 

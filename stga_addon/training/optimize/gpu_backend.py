@@ -84,7 +84,7 @@ class GpuBackend:
         self._limits = np.column_stack([*frames.scale_limits(settings), distance_limits])
         self._rasterizer = rasterize.Rasterizer(device)
         self._embedding = Embedding(
-            device, frames.areas, capture.faces, frames.convention, frames.strain
+            device, frames.surface.areas, capture.faces, frames.convention, frames.strain
         )
         self._pending: deque[_Queued] = deque()
         self._readbacks = [Readback(device, COUNTS + 1) for _ in range(QUEUED_ITERATIONS)]

@@ -132,8 +132,7 @@ def _behind_sides(
 def _reaches_beside(surface: Surface, rows: np.ndarray, offsets: np.ndarray) -> np.ndarray:
     """(N, K) bool: whether a splat at one of the offsets (N, K, 3), as `beside_masks` has them,
     would show beside masks."""
-    area = face_areas(surface.neutral, surface.capture.faces[rows])
-    size = np.maximum(np.sqrt(2 * area), CELL_VOXELS * surface.voxel)
+    size = np.maximum(np.sqrt(2 * surface.areas[rows]), CELL_VOXELS * surface.voxel)
     plane = np.delete(np.eye(3), NORMAL_AXIS["stga"], axis=0)
     reach = SPLAT_REACH * size[:, None, None] * np.concatenate([plane, -plane])
     ends = [offsets + end[:, None] for end in reach.swapaxes(0, 1)]

@@ -7,7 +7,7 @@ import numpy as np
 from scipy.ndimage import binary_dilation
 from scipy.spatial import cKDTree
 
-from ...avatar.embedding import FaceFrames, face_frames
+from ...avatar.embedding import FaceFrames, face_areas, face_frames
 from ...avatar.lattice import NORMAL_AXIS
 from ...capture.camera import look_at
 from ...capture.image_colors import SAMPLED_HEIGHT_PIXELS, mirrored
@@ -108,12 +108,17 @@ STANDING_REACH_VOXELS = 4
 
 
 class Surface:
-    """The triangles (F,) of a capture, each property found out when it is asked for first."""
+    """The triangles (F,) of a capture, each property found out when it is asked for first.
+
+    neutral   (V, 3) the capture's, float64; centers (F, 3) and areas (F,) of its triangles
+    voxel     meters between visual-hull points
+    """
 
     def __init__(self, capture: Capture) -> None:
         self.capture = capture
         self.neutral = np.asarray(capture.neutral, np.float64)
         self.centers = self.neutral[capture.faces].mean(1)
+        self.areas = face_areas(self.neutral, capture.faces)
         self.voxel = voxel_size(self.neutral)
 
     @cached_property

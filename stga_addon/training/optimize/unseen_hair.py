@@ -119,7 +119,7 @@ class UnseenHair:
     @property
     def _count(self) -> float:
         """How many strands there are."""
-        area = self._frames.areas
+        area = self._frames.surface.areas
         scalp = self._frames.surface.kinds["scalp"]
         return float(STRANDS * area[self.has_strands].sum() / area[scalp].sum())
 

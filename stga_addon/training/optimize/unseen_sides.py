@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ...avatar.embedding import MIN_DIVISOR, FaceFrames, face_areas, points_to_world
+from ...avatar.embedding import MIN_DIVISOR, FaceFrames, points_to_world
 from ...avatar.splats import Splats, colored_off_axis, sh_color
 from ...capture.image_colors import mean_colors, mirror_images
 from ...capture.mesh_geometry import connected_parts
@@ -97,7 +97,7 @@ def unseen_sides(surface: Surface) -> UnseenSides:
     is_outside = surface.outside
     views = _color_views(capture)
     color, pixels = mean_colors(capture, views)
-    density = pixels / np.maximum(face_areas(capture.neutral, capture.faces), MIN_DIVISOR)
+    density = pixels / np.maximum(surface.areas, MIN_DIVISOR)
     facing = density[cosine > WELL_VISIBLE_COSINE]
     median = np.median(facing[facing > 0]) if facing.any() else 0.0
     visible = density > MIN_VISIBLE_FRACTION * median
