@@ -13,7 +13,7 @@ from ..raster.kernel_cache import NATIVE_KERNELS
 from ..worker.launch import PREPARING, cache_folder
 from ..worker.lock import hold_folder
 
-LOADED_AHEAD = ("avatar", "capture", "flame", "raster.cpu", "training", "report")
+LOADED_AHEAD = ("avatar", "capture", "flame", "raster.cpu", "training")
 """Rooms that a worker which trains loads before it begins."""
 TORCH_MODULES = ("raster.cpu.autograd",)  # Modules in them that import torch, which takes seconds
 
