@@ -1,7 +1,7 @@
 """Views that show nobody, because their matte or their image failed: found, and left out."""
 
 import statistics
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import lru_cache
@@ -110,6 +110,16 @@ def with_training_views(capture: Capture) -> tuple[Capture, tuple[str, ...]]:
             "on the person"
         )
     return usable, warnings
+
+
+def without_training_views(capture: Capture, left_out: Collection[tuple[int, ...]]) -> Capture:
+    """The capture without some training views, by (camera index, timestep)."""
+    kept = [
+        view
+        for view in capture.views["train"]
+        if (view.camera_index, view.timestep) not in left_out
+    ]
+    return replace(capture, views={**capture.views, "train": tuple(kept)})
 
 
 def _timesteps(views: Iterable[View]) -> str:

@@ -44,6 +44,13 @@ _LIMITS = {"scale_limit": 1.5, "stray_limit": 0.5, "stray_reset_interval": 20, "
 """Settings with which splats stay small and near their triangles."""
 _EFFECTS = (
     Effect(
+        "occlusions",
+        "No hands on the face",
+        "free",
+        "none: expressions that only these views show are not trained",
+        off={"covered": ()},
+    ),
+    Effect(
         "view-color",
         "Moving highlights",
         "slower",

@@ -140,6 +140,8 @@ class TrainingSettings:
     exposure       per training camera: its index, and gain and offset (levels of 255) of red, green
                    and blue in its images, which are corrected when they are read; where it drifts,
                    several rows with their timestep
+    covered        camera index and timestep of the training views that are left out, because
+                   something covers the head
     tracking       whether the avatar tracks its own head halfway (`RefinedTracking`)
     effects        effect -> "on" or "off" where the user has decided; the others are decided from
                    the capture (`effects.plan`). None: these settings are final
@@ -218,6 +220,7 @@ class TrainingSettings:
     teeth: bool = True
     torso: bool = False
     exposure: tuple[tuple[float, ...], ...] = ()
+    covered: tuple[tuple[int, ...], ...] = ()
     tracking: bool = False
     effects: Mapping[str, str] | None = option(
         "switch an effect on or off instead of deciding from the capture (docs/effects.md); may be "
@@ -263,6 +266,9 @@ class TrainingSettings:
                 rows = "rows of a camera index, three gains above 0, three offsets"
                 expected = f"{rows}, and a timestep where they drift"
                 raise StgaError(complaint("exposure", expected, row))
+        for row in self.covered:
+            if len(row) != 2 or not all(0 <= number <= MAX_COUNT for number in row):
+                raise StgaError(complaint("covered", "rows of a camera index and a timestep", row))
         if not set(self.driven_offsets) <= set(OFFSETS):
             expected = f"names among {', '.join(OFFSETS)}"
             raise StgaError(complaint("driven_offsets", expected, self.driven_offsets))

@@ -1,6 +1,7 @@
 """Measurements of a capture that the rules of effects ask for, each made once and only if asked."""
 
 from collections import Counter
+from collections.abc import Collection
 from dataclasses import replace
 from functools import cache, cached_property
 
@@ -8,8 +9,9 @@ import numpy as np
 
 from ...avatar.lattice import splats_per_triangle
 from ...capture.mesh_geometry import triangle_normals
-from ...capture.model import Capture, cameras_at_once, evenly_spread
+from ...capture.model import Capture, View, cameras_at_once, evenly_spread
 from ...capture.selection import select_capture
+from ...capture.usable_views import without_training_views
 from ...flame.forward import FlameFrame
 from ...flame.model import JOINTS
 from ...flame.parts import PARTS
@@ -19,6 +21,7 @@ from ...flame.teeth import lip_pairs
 from ..settings import TrainingSettings
 from . import evidence
 from .evidence import CameraColors, Evidence
+from .occlusions import covered_views
 from .samples import Samples, take_samples
 
 MAX_TIMESTEPS = 64
@@ -43,6 +46,20 @@ class CaptureFacts:
     @cached_property
     def samples(self) -> Samples:
         return take_samples(self.capture)
+
+    @cached_property
+    def covered_views(self) -> list[View]:
+        """Training views in which something covers the head."""
+        return covered_views(self.capture, self.samples)
+
+    def without(self, left_out: Collection[tuple[int, ...]]) -> "CaptureFacts":
+        """The same of the capture without some training views, by (camera index, timestep)."""
+        capture = without_training_views(self.capture, left_out)
+        facts = CaptureFacts(capture, self.settings, self.device)
+        sampled = zip(self.samples.camera.tolist(), self.samples.timestep.tolist(), strict=True)
+        rows = np.array([each not in left_out for each in sampled])
+        facts.samples = self.samples.of_views(rows)
+        return facts
 
     @cached_property
     def stable_colors(self) -> np.ndarray:

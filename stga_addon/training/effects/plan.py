@@ -10,8 +10,8 @@ import numpy as np
 from ...avatar.offsets import OFFSETS
 from ...capture.camera import Camera
 from ...capture.model import Capture
-from ...capture.usable_views import with_training_views
-from ...errors import StgaError
+from ...capture.usable_views import NAMED_TIMESTEPS, with_training_views
+from ...errors import StgaError, listed
 from ...flame.parts import PARTS
 from ...flame.sequence import MIN_JOINT_ANGLE_DEG
 from ...tracking.folder import is_tracked, read_torso_motion
@@ -78,6 +78,22 @@ class Verdict:
 
 Rule = Callable[[CaptureFacts], Verdict | None]
 """Decides one effect; None where the effect does not apply to the capture."""
+
+
+def occlusions(facts: CaptureFacts) -> Verdict:
+    """On where something covers the head of a single camera's recording for a while."""
+    if not facts.has_one_camera:
+        reason = "several cameras show at a time what one of them does not"
+        return Verdict(False, reason, fixed=True)
+    covered = facts.covered_views
+    if not covered:
+        return Verdict(False, "nothing covers the head for a while", fixed=True)
+    timesteps = sorted({view.timestep for view in covered})
+    rows = tuple((view.camera_index, view.timestep) for view in covered)
+    count = f"{len(covered)} of {len(facts.views)} training views"
+    where = f"timestep{'s' if len(timesteps) > 1 else ''} {listed(timesteps, NAMED_TIMESTEPS)}"
+    reason = f"something covers the head in {count}, which are left out ({where})"
+    return Verdict(True, reason, changes={"covered": rows})
 
 
 def view_color(facts: CaptureFacts) -> Verdict:
@@ -308,6 +324,7 @@ def tracking(facts: CaptureFacts) -> Verdict | None:
 
 
 RULES: dict[str, Rule] = {
+    "occlusions": occlusions,
     "view-color": view_color,
     "exposure": exposure,
     "antialiasing": antialiasing,
@@ -365,6 +382,8 @@ def plan_effects(
         if verdict.fixed and on != verdict.on:
             raise StgaError(f"{flag}: is not possible, because {verdict.reason}")
         decided = _switched(decided, effect, on, verdict)
+        if on and "covered" in verdict.changes:  # no other effect is for views that are left out
+            facts = facts.without(decided.covered)
         plan.append(EffectDecision(effect.name, choice, on, verdict.reason, effect.cost))
     return decided, tuple(plan)
 

@@ -73,6 +73,13 @@ class Samples:
     background_spread: np.ndarray
     white: np.ndarray
 
+    def of_views(self, rows: np.ndarray) -> "Samples":
+        """Samples of some of the views, (S,) bool."""
+        of_views = {name: array for name, array in vars(self).items() if name != "faces"}
+        signals = {name: signal[rows] for name, signal in of_views.pop("signals").items()}
+        arrays = {name: array[rows] for name, array in of_views.items()}
+        return Samples(self.faces, signals=signals, **arrays)
+
 
 def sample_views(views: Sequence[View], seed: int = 0) -> list[View]:
     """MAX_VIEWS, or one of each camera: timesteps evenly spread, cameras equally often."""
@@ -114,7 +121,7 @@ def take_samples(capture: Capture, seed: int = 0) -> Samples:
         for name, signal in SIGNALS.items()
     }
     with ThreadPoolExecutor(IMAGES_AT_A_TIME) as pool:
-        rows = list(pool.map(lambda view: _sample_view(capture, view, faces), views))
+        rows = list(pool.map(lambda view: sample_view(capture, view, faces), views))
     return Samples(
         faces,
         np.array([view.camera_index for view in views]),
@@ -127,7 +134,7 @@ def take_samples(capture: Capture, seed: int = 0) -> Samples:
     )
 
 
-def _sample_view(capture: Capture, view: View, faces: np.ndarray) -> dict[str, np.ndarray]:
+def sample_view(capture: Capture, view: View, faces: np.ndarray) -> dict[str, np.ndarray]:
     """One view's row of every array of `Samples` that depends on the image."""
     scale = SAMPLED_HEIGHT_PIXELS / view.camera.height
     small, image, mask = read_view(view, scale if scale < 2 / 3 else 1.0)

@@ -21,7 +21,7 @@ from ...avatar.file import Avatar, read_avatar, write_avatar
 from ...capture.loader import DEFAULT_LIMITS, ViewLoader
 from ...capture.model import Capture, View, evenly_spread, views_by_timestep
 from ...capture.selection import select_capture
-from ...capture.usable_views import with_training_views
+from ...capture.usable_views import with_training_views, without_training_views
 from ...errors import DeviceError, StgaError, shorten
 from ...files import replacing
 from ...progress import Cancelled, Progress, Report, ignore
@@ -163,7 +163,7 @@ def train_run(
             raise StgaError(f"{out}: already holds a run; resume it, or choose another folder")
         has_begun = exists and folders.read_run(out).identity is not None
         run = replace(run, identity=folders.check_identity(out, run, capture))
-        capture = _usable(capture)
+        capture = _usable(capture, run)
         if has_begun and (out / CHECKPOINT).exists():
             session = _resume(capture, out, run, report)
         else:
@@ -182,18 +182,19 @@ def train_more(
     lpips.load_network()
     with folders.locked(out):
         run = replace(run, identity=folders.check_identity(out, run, capture))
-        capture = _usable(capture)
+        capture = _usable(capture, run)
         session = _resume(capture, out, run, report)
         session.begin_addition(seconds)
         session.complete()
     return Trained(out / AVATAR, session.measured)
 
 
-def _usable(capture: Capture) -> Capture:
+def _usable(capture: Capture, run: Run) -> Capture:
+    """The capture without the views that show nobody, and those that the run leaves out."""
     usable, warnings = with_training_views(capture)
     for sentence in warnings:
         _log.warning("%s", sentence)
-    return usable
+    return without_training_views(usable, run.settings.covered)
 
 
 class _Addition(NamedTuple):
@@ -426,7 +427,9 @@ class _Session:
         left_out = evenly_spread(left_out, LEFT_OUT_VIEWS)
         error = self._squared_error(left_out)
         capture = replace(self.capture, views={"train": views})
-        if not self._track(self._avatar(), tracking, capture, tracked, timesteps):
+        covered = {timestep for _, timestep in self.run.settings.covered}
+        changed = sorted(covered.union(timesteps))
+        if not self._track(self._avatar(), tracking, capture, tracked, changed):
             return
         self.trainer.frames.clear()
         self.strain_range = None
