@@ -65,7 +65,7 @@ def from_one_side(tmp_path_factory):
 
 
 def test_what_is_hidden_and_what_it_looks_like(from_one_side):
-    """Catches another side, normal or mirror plane."""
+    """Catches another side, normal or mirror plane, and a mirrored side without its details."""
     capture = from_one_side
     sides = sides_of(from_one_side)
     neutral, posed = (
@@ -81,7 +81,8 @@ def test_what_is_hidden_and_what_it_looks_like(from_one_side):
     partner = (mirrored @ direction.T).argmax(1)
     copied = sides.triangles & (cosine[partner] > 0.7)
     assert copied.sum() > 20
-    assert_array_equal(sides.color[copied], sides.color[partner[copied]])
+    pairs = sides.color[copied].ravel(), sides.color[partner[copied]].ravel()
+    assert np.corrcoef(*pairs)[0, 1] > 0.9
 
 
 def test_restored_colors_are_those_of_the_avatar(from_one_side):
@@ -422,9 +423,14 @@ def test_a_beard_goes_on_beside_the_jaw(bundled, tmp_path):
     beard = of_cheek & (surface.facing < 0.48)
     color[beard] = HAIR
     sides = sides_of(filmed(bundled, color, (0,), 0.0, tmp_path))
-    rows = beard & (surface.facing < 0.2)
+    unseen = beard & (surface.facing < 0.2) & (np.abs(centers[:, 0]) > 0.05)
+    border, _ = cKDTree(centers[beard & (surface.facing > 0.3)]).query(centers)
+    rows = unseen & (border < 0.006)
     assert rows.sum() > 20
-    assert np.mean(np.abs(255 * sides.color[rows] - HAIR).max(1) < 30) > 0.7
+    toward_beard, toward_skin = (
+        np.linalg.norm(255 * sides.color[rows] - end, axis=1) for end in (HAIR, SKIN)
+    )
+    assert (toward_skin / (toward_skin + toward_beard)).mean() > 0.4  # a bare cheek: 0
 
 
 def test_hair_ends_at_the_ears(bundled, frontal, outside):
@@ -455,7 +461,7 @@ def test_shoulders_behind_a_shirt_are_clothed(bundled, tmp_path):
         rows = unseen & (color == kind).all(1)
         assert rows.sum() > 100
         away = np.abs(255 * sides.color[rows] - kind).max(1)
-        assert (away < 30).mean() > 0.88
+        assert (away < 30).mean() > 0.85
 
 
 def test_what_lips_and_lids_hide(bundled, turning, outside):
@@ -573,7 +579,8 @@ def test_a_chest_below_the_images(bundled, tmp_path):
     of_chest = below[state.face]
     assert state.parameters.opacity[of_chest].min() > 2
     colors = 0.5 + SH_C0 * state.average.sh[of_chest, 0]
-    assert_allclose(colors, frames.sides.color[state.face[of_chest]], atol=1e-5)
+    is_plausible = np.abs(colors - frames.sides.color[state.face[of_chest]]).max(1) < 1e-4
+    assert is_plausible.mean() > 0.99  # the others are of the layer behind
     shown = (faces_camera & (row < end - 5))[state.face] & ~state.unbound
     changed = state.parameters.opacity[shown] != before[shown]
     assert changed.mean() < 0.1
@@ -598,8 +605,8 @@ def test_a_mirrored_cheek(bundled, tmp_path):
     for rows in (cheek & (facing < GRAZING_COSINE), cheek, hair):
         assert rows.sum() > 20
         assert sides.visible[rows].mean() < 0.1
-        away = abs(255 * sides.color[rows] - color[rows])
-        assert (away < 0.1 * color[rows] + 4).mean() > 0.9
+        away = abs(255 * sides.color[rows] - color[rows]).max(1)
+        assert (away < 40).mean() > 0.9  # skin and hair are 180 levels apart
 
 
 def test_hair_off_axis(bundled, tmp_path):

@@ -2,15 +2,16 @@
 mouth."""
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
 from ...avatar.embedding import MIN_DIVISOR, FaceFrames, points_to_world
 from ...avatar.splats import Splats, colored_off_axis, sh_color
 from ...capture.image_colors import mean_colors, mirror_images
-from ...capture.mesh_geometry import connected_parts
 from ...capture.model import Capture, View, evenly_spread, views_by_timestep
 from ...flame.quaternions import unit
+from .color_fill import filled_colors
 from .semantic_regions import (
     BROWS_LEVEL,
     HeadCoordinates,
@@ -49,6 +50,15 @@ SOURCE_TRIANGLES = 100
 """Triangles over which hair's color off axis, and that of the layer behind skin, are medians."""
 COLLAR_SLOPE = 0.6
 """Rise of a collar from front to back, by its depth."""
+SOURCE_WEIGHT = 5.0
+"""Weight of a source's color, as `filled_colors` counts it, where a camera faces it well; it falls
+to 0 at SOURCE_COSINE, where hair and the backdrop shine through."""
+MIRROR_WEIGHT = 0.1
+"""The same of a mirror image's color, and of hair's color on an unseen scalp: colors turn to these
+within a few triangles from what is observed."""
+MIRROR_GAIN = 0.1
+"""Least difference of cosines by which a mirror image must face its camera better; with less,
+noise decides between neighbors."""
 LEVEL_WEIGHT = 8.0
 """Factor by which visible triangles of neck and shoulders count as farther where they are above or
 below a hidden triangle, along the normal of the collar's plane, instead of beside it: only a neck's
@@ -88,10 +98,9 @@ class UnseenSides:
 
 
 def unseen_sides(surface: Surface) -> UnseenSides:
-    """Colors of triangles that no camera faces. They take the color of the nearest visible
-    triangles on either side of the head; those on the other side are mirrored. Unseen hair has one
-    color, and ears take the color of ears. Visible triangles keep their color, except on faces of
-    few cameras, which take their mirror image's color where that is shown better."""
+    """Colors of triangles that no camera faces, which continue the observed ones. Unseen hair has
+    one color. Visible triangles keep their color, except where a face turns away from few
+    cameras."""
     capture = surface.capture
     cosine = surface.facing
     is_outside = surface.outside
@@ -109,35 +118,32 @@ def unseen_sides(surface: Surface) -> UnseenSides:
     unseen = is_outside & (cosine < SOURCE_COSINE)
     well_visible = is_source & (cosine > WELL_VISIBLE_COSINE)
     hair = _hair(surface, color, pixels > 0, is_source)
-    sides = _Sides(surface, color)
     hidden = unseen | ~visible | surface.lids
+    is_face = np.zeros_like(visible)
+    if surface.at is not None:
+        is_face = ~surface.kinds["scalp"] & ~surface.kinds["body"]
+    turns_away = is_face & is_outside & (cosine < WELL_VISIBLE_COSINE)
+    may_be_mirrored = unseen | turns_away if surface.has_few_cameras else unseen
+    sources = is_source & ~_hanging_hair(surface, color, well_visible, hair)
+    mirrored, images = mirror_images(capture, may_be_mirrored, sources)
+    is_better = cosine[images] > cosine[mirrored] + MIRROR_GAIN
+    pairs = _MirrorImages(mirrored[is_better], images[is_better])
+    continued = _continued(surface, color, sources, pairs, hair)
     found = color.copy()
-    ears = surface.regions.within(Region.EAR)
-    found[hidden] = sides.nearest(is_source & ~ears, hidden)
+    found[hidden] = continued[hidden]
+    visible[pairs.triangles[well_visible[pairs.images]]] = False
     turned = np.where(is_outside, surface.turned_from(VIEW_INDEPENDENT_COSINE, SOURCE_COSINE), 0.0)
     off_axis = color.copy()
+    if surface.has_few_cameras:
+        found[turns_away] = continued[turns_away]
+        off_axis[turns_away] = continued[turns_away]
     is_hair = np.zeros_like(visible)
-    may_be_mirrored = unseen.copy()
-    if surface.at is not None:
-        # what faces a camera beyond its image goes on as the image ends
-        body = surface.kinds["body"]
-        of_kind = (body, body & ~unseen, False), (body, body & unseen, True), (ears, ears, False)
-        for like, kind, is_level in of_kind:
-            if (like & is_source).any() and (kind & hidden).any():
-                found[kind & hidden] = sides.nearest(like & is_source, kind & hidden, is_level)
-        if surface.has_few_cameras:
-            turns_away = sides.of_face & is_outside & (cosine < WELL_VISIBLE_COSINE)
-            off_axis[turns_away] = sides.nearest(is_source & ~ears, turns_away)
-            may_be_mirrored |= turns_away
+    if len(hair):
         scalp = surface.kinds["scalp"]
-        if len(hair):
-            near = nearest_rows(sides.centers[hair], sides.centers[scalp], SOURCE_TRIANGLES)
-            off_axis[scalp] = np.median(color[hair[near]], axis=1)
-            is_hair = scalp.copy()
-            found[scalp & unseen] = np.median(color[hair], axis=0)
-    rows, mirrored = sides.mirrored(may_be_mirrored, well_visible)
-    found[rows] = mirrored
-    visible[rows] = False
+        near = nearest_rows(surface.centers[hair], surface.centers[scalp], SOURCE_TRIANGLES)
+        off_axis[scalp] = np.median(color[hair[near]], axis=1)
+        is_hair = scalp.copy()
+        found[scalp & unseen] = np.median(color[hair], axis=0)
     inner = _unseen_inner(capture, pixels > 0, is_outside) | _unseen_teeth(capture, pixels, visible)
     within = inner | (~is_outside & (~visible | (pixels == 0)))
     found[within] = inside_colors(capture, color, visible, within)
@@ -194,52 +200,104 @@ def _hair(
     return hairy_triangles(rows, surface.centers, color, color[is_skin])
 
 
-class _Sides:
-    """Colors of a surface's triangles by those that are shown on either side of the head."""
+def _hanging_hair(
+    surface: Surface, color: np.ndarray, well_visible: np.ndarray, hair: np.ndarray
+) -> np.ndarray:
+    """(F,) bool: triangles of a face, below the brows, whose observed color is nearer to that of
+    long hair, triangles (M,), than to that of skin: hair hangs before them. None where hair is
+    short."""
+    skin = well_visible & surface.regions.face
+    if not surface.has_long_hair or not len(hair) or not skin.any():
+        return np.zeros(len(color), bool)
+    from_hair, from_skin = (
+        np.linalg.norm(color - np.median(color[rows], axis=0), axis=1) for rows in (hair, skin)
+    )
+    return np.asarray(surface.regions.face & (from_hair < from_skin))
 
-    def __init__(self, surface: Surface, color: np.ndarray) -> None:
-        capture = surface.capture
-        self._color = color
-        self.centers = surface.centers
-        self.of_face = np.zeros(len(color), bool)
-        if surface.at is not None:
-            self.of_face = ~surface.kinds["scalp"] & ~surface.kinds["body"]
-            _, up, ahead = surface.at.axes
-            tilted = unit(up + COLLAR_SLOPE * ahead)
-            farther = (LEVEL_WEIGHT - 1) * (self.centers @ tilted)
-            self._raised = self.centers + np.outer(farther, tilted)
-        self._part = connected_parts(len(capture.neutral), capture.faces)[capture.faces[:, 0]]
-        every = np.ones(len(color), bool)
-        self._partner, self._image = mirror_images(capture, every, every)
 
-    def nearest(
-        self, sources: np.ndarray, hidden: np.ndarray, is_level: bool = False
-    ) -> np.ndarray:
-        """Colors (N, 3) of the triangles `hidden` (F,) bool: medians of those of the NEAREST
-        sources (F,) bool or mirror images of these, of the same connected part where it has
-        any. is_level: whether those above and below count as farther (LEVEL_WEIGHT)."""
-        centers = self._raised if is_level else self.centers
-        direct = np.flatnonzero(sources)
-        of_source = sources[self._image]
-        rows = np.concatenate([direct, self._partner[of_source]])
-        places = centers[rows]
-        colors = self._color[np.concatenate([direct, self._image[of_source]])]
-        parts = self._part[rows]
-        found = self._color.copy()
-        for number in np.unique(self._part[hidden]):
-            rows = np.flatnonzero(hidden & (self._part == number))
-            known = parts == number
-            if not known.any():
-                known[:] = True
-            near = nearest_rows(places[known], centers[rows], NEAREST)
-            found[rows] = np.median(colors[known][near], axis=1)
-        return np.asarray(found[hidden])
+class _MirrorImages(NamedTuple):
+    """Triangles (N,) whose mirror images (N,) face a camera better than they do."""
 
-    def mirrored(self, hidden: np.ndarray, visible: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Which of the triangles `hidden` (F,) bool have mirror images that are `visible`, and
-        their colors (N, 3)."""
-        are_visible = hidden[self._partner] & visible[self._image]
-        return self._partner[are_visible], self._color[self._image[are_visible]]
+    triangles: np.ndarray
+    images: np.ndarray
+
+
+def _continued(
+    surface: Surface,
+    color: np.ndarray,
+    is_source: np.ndarray,
+    mirrored: _MirrorImages,
+    hair: np.ndarray,
+) -> np.ndarray:
+    """Colors (F, 3) of all triangles, continued from those of the sources (F,) bool and, less, from
+    mirror images and from an unseen scalp, which has the median color of the hair, triangles (M,).
+    Ears continue ears, if any is well visible."""
+    scalp = surface.kinds["scalp"]
+    body = surface.kinds["body"]
+    ears = surface.regions.within(Region.EAR)
+    turned_away = surface.facing < SOURCE_COSINE
+    observed = color.copy()
+    facing = (surface.facing - SOURCE_COSINE) / (WELL_VISIBLE_COSINE - SOURCE_COSINE)
+    weight = np.where(is_source, SOURCE_WEIGHT * np.clip(facing, 0, 1) ** 2, 0.0)
+    weight[ears & (surface.facing < WELL_VISIBLE_COSINE)] = 0
+    light = _side_light(surface, color, is_source)
+    for unseen, level_weight in ((body & turned_away, LEVEL_WEIGHT), (body & ~turned_away, 1.0)):
+        rows = unseen & surface.outside & ~is_source
+        if (body & is_source).any() and rows.any():
+            both_sides = _nearest_colors(surface, color, is_source, rows, level_weight)
+            observed[rows] = both_sides * np.sqrt(light[rows])
+            weight[rows] = SOURCE_WEIGHT
+    if len(hair):
+        rows = scalp & surface.outside & turned_away
+        observed[rows] = np.median(color[hair], axis=0)
+        weight[rows] = MIRROR_WEIGHT
+    detail = np.full(color.shape, np.nan)
+    detail[mirrored.triangles] = color[mirrored.images] * light[mirrored.triangles]
+    rows = mirrored.triangles[weight[mirrored.triangles] < MIRROR_WEIGHT]
+    observed[rows] = detail[rows]
+    weight[rows] = MIRROR_WEIGHT
+    ears_apart = ears & (ears & (weight > 0)).any()
+    found = filled_colors(surface.capture.faces, observed, weight, ears_apart, detail)
+    missing = np.isnan(found[:, 0])
+    if missing.any():  # parts of the mesh that nothing shows, such as an eyeball
+        near = nearest_rows(surface.centers[is_source], surface.centers[missing], NEAREST)
+        found[missing] = np.median(color[is_source][near], axis=1)
+    return np.clip(found, 0, 1)
+
+
+def _side_light(surface: Surface, color: np.ndarray, is_source: np.ndarray) -> np.ndarray:
+    """(F, 3) how much brighter a triangle is than its mirror image, by the ratio of both sides of
+    the face where both are sources (F,) bool; 1 in the middle, in front and behind."""
+    at = surface.at
+    if at is None:
+        return np.ones_like(color)
+    of_face = is_source & surface.regions.face
+    left, right = mirror_images(surface.capture, of_face & (at.azimuth > 0), of_face)
+    sums = (np.maximum(color[rows].sum(0), MIN_DIVISOR) for rows in (left, right))
+    return np.asarray(np.divide(*sums) ** np.sin(at.azimuth)[:, None])
+
+
+def _nearest_colors(
+    surface: Surface,
+    color: np.ndarray,
+    is_source: np.ndarray,
+    unseen: np.ndarray,
+    level_weight: float,
+) -> np.ndarray:
+    """Colors (N, 3) of unseen triangles (F,) bool of neck and shoulders: medians of the NEAREST
+    sources (F,) bool there, or mirror images of these; `level_weight`: see LEVEL_WEIGHT."""
+    assert surface.at is not None
+    _, up, ahead = surface.at.axes
+    tilted = unit(up + COLLAR_SLOPE * ahead)
+    farther = (level_weight - 1) * (surface.centers @ tilted)
+    centers = surface.centers + np.outer(farther, tilted)
+    sources = is_source & surface.kinds["body"]
+    rows, images = mirror_images(surface.capture, ~sources, sources)
+    direct = np.flatnonzero(sources)
+    places = centers[np.concatenate([direct, rows])]
+    colors = color[np.concatenate([direct, images])]
+    near = nearest_rows(places, centers[unseen], NEAREST)
+    return np.asarray(np.median(colors[near], axis=1))
 
 
 def _lid_colors(
