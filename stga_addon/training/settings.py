@@ -147,6 +147,8 @@ class TrainingSettings:
                    the capture (`effects.plan`). None: these settings are final
     """
 
+    LATER_FIELDS = ("covered",)
+
     strategy: str = option(
         "which splats an iteration trains (default global, with --schedule paper selective)",
         "global",

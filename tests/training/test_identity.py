@@ -140,6 +140,19 @@ def test_last_bits_of_another_machine_are_accepted(toy):
     assert difference(one, two) is None
 
 
+def test_runs_from_before_a_setting_can_be_resumed(copy):
+    """Catches a new setting that makes all earlier runs ones with other settings."""
+    file = copy / "run.json"
+    values = json.loads(file.read_text())
+    del values["settings"]["covered"]
+    file.write_text(json.dumps(values))
+    stored = read_run(copy)
+    capture = open_capture(stored.capture)
+    assert identity_of(capture, stored.principal_point, stored.settings) == stored.identity
+    covered = replace(stored.settings, covered=((0, 1),))
+    assert identity_of(capture, stored.principal_point, covered) != stored.identity
+
+
 def test_another_flame_model_is_refused(toy, tmp_path):
     """Catches a run that goes on with the meshes of another FLAME model, though --flame may name a
     moved one, and one that blames the FLAME file where it is resumed on tracked meshes."""

@@ -3,7 +3,6 @@
 import hashlib
 import json
 from dataclasses import asdict, dataclass
-from typing import Any
 
 import numpy as np
 
@@ -74,7 +73,7 @@ def identity_of(capture: Capture, principal_point: str, settings: TrainingSettin
         _digest(np.ascontiguousarray(capture.faces, np.int32).tobytes()),
         _digest(_quantized(capture.neutral)),
         "" if capture.flame_file is None or flame is None else flame.model.file_digest,
-        _settings_digest(to_json(settings)),
+        _settings_digest(settings),
     )
 
 
@@ -90,8 +89,11 @@ def difference(trained: RunIdentity, given: RunIdentity) -> str | None:
     return phrases[other[0]] if other else None
 
 
-def _settings_digest(settings: dict[str, Any]) -> str:
-    return _digest(json.dumps(settings, sort_keys=True).encode())
+def _settings_digest(settings: TrainingSettings) -> str:
+    """A later field counts only where it is set, so that runs from before it can be resumed."""
+    values = to_json(settings)
+    kept = {n: v for n, v in values.items() if v or n not in TrainingSettings.LATER_FIELDS}
+    return _digest(json.dumps(kept, sort_keys=True).encode())
 
 
 def _digest(data: bytes) -> str:
