@@ -30,6 +30,7 @@ import numpy as np
 from numpy.typing import ArrayLike, DTypeLike
 
 from .errors import StgaError, shorten
+from .schema import MAX_NAME_BYTES
 
 MAX_FILE_BYTES = 1 << 30
 """Largest file that is read where its reader sets no limit."""
@@ -70,8 +71,6 @@ MIN_NUMBER_BYTES = 4
 floats."""
 BLOCK_BYTES = 1 << 20
 """Bytes of an array that are looked at together."""
-MAX_NAME_BYTES = 255
-"""Longest name of a file or folder on the file systems of Linux, macOS and Windows."""
 PARTIAL_NAME = re.compile(
     r"\..+\.(?P<host>[0-9a-f]{8})-(?P<process>\d{1,10})-[0-9a-f]{8}\.partial", re.DOTALL
 )

@@ -23,7 +23,7 @@ MAX_COUNT = (1 << 31) - 1  # Largest whole number that kernels can count to
 KIND = "kind"  # Key that names the dataclass where a field may hold one of several
 ARRAY = "array"  # Key of an array's place in JSON: its name among the arrays beside it
 IS_PATH = "is_path"  # Key of a field's metadata: of `setting`
-MAX_NAME_BYTES = 255  # Longest name within a path, as `files.MAX_NAME_BYTES`
+MAX_NAME_BYTES = 255  # Longest name of a file or folder
 
 Arrays = dict[str, np.ndarray]
 

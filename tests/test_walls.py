@@ -32,7 +32,7 @@ HEAVY = {"torch", "numba", "wgpu"}
 TRAININGS = ("stga_addon/raster/", "stga_addon/training/", "stga_addon/development/benchmark/")
 # A module may import from layers before its own; a package counts as its first name.
 LAYERS = (
-    {"errors", "__version__"}, {"files", "format", "schema"}, {"options", "progress"}, {"worker"},
+    {"errors", "__version__"}, {"format", "schema"}, {"files"}, {"options", "progress"}, {"worker"},
     {"flame"}, {"capture"}, {"avatar"}, {"raster"}, {"light"}, {"export"}, {"render"},
     {"tracking"}, {"driving"}, {"training"}, {"jobs"}, {"api"}, {"scene"}, {"cli"},
     {"development"}, {"__main__", "__init__"},
