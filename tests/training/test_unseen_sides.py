@@ -609,6 +609,19 @@ def test_a_mirrored_cheek(bundled, tmp_path):
         assert (away < 40).mean() > 0.9  # skin and hair are 180 levels apart
 
 
+def test_a_mirrored_side_keeps_its_light(bundled, tmp_path):
+    """Catches a cheek in shade that has its mirror image's light where no view shows it."""
+    centers, level = middles(bundled)
+    is_right = centers[:, 0] < 0
+    color = np.where(is_right[:, None], 0.5, 1.0) * painted(bundled)
+    surface = Surface(filmed(bundled, color, (0, 30, 60), 0.0, tmp_path))
+    unseen = surface.outside & is_right & (surface.facing < GRAZING_COSINE)
+    cheek = unseen & (centers[:, 2] > 0.02) & (abs(level + 0.4) < 0.4)
+    assert cheek.sum() > 20
+    found = 255 * unseen_sides(surface).color[cheek].mean(0)
+    assert_allclose(found, 0.5 * SKIN, rtol=0.2)
+
+
 def test_hair_off_axis(bundled, tmp_path):
     """Catches an avatar of one camera that does not look from there as it was trained, streaks of
     hair that run around the head as they shine in front, a face that is smoothed with them, a
