@@ -74,16 +74,14 @@ def test_what_is_part_of_the_recording_stays(turning, tmp_path):
     assert not planned(with_hand(capture, COVERED, side=5))[1]["occlusions"].on
 
 
-def test_other_effects_do_not_see_the_hand(covered, turning, tmp_path):
-    """Catches exposures that are fitted to a hand: those of the other views are as without it."""
-    clean = planned(photograph(tmp_path, turning))[0].exposure
-    found = planned(covered)[0].exposure
-    kept = {row[-1]: row[1:4] for row in found}
-    expected = {row[-1]: row[1:4] for row in clean if row[-1] in kept}
-    gains = np.array([[kept[t], expected[t]] for t in expected])
-    ratio = gains[:, 0] / gains[:, 1]
-    assert len(gains) > 20
-    assert np.abs(ratio / ratio.mean(0) - 1).max() < 0.04
+def test_other_effects_do_not_see_the_hand(covered):
+    """Catches effects that are decided by views that are left out, such as an exposure that is
+    fitted to a hand."""
+    settings, plan = planned(covered)
+    assert plan["exposure"].on
+    fitted = {(int(row[0]), int(row[-1])) for row in settings.exposure}
+    assert len(fitted) > 20
+    assert not fitted & set(settings.covered)
 
 
 def test_a_run_trains_without_them(covered, tmp_path):
