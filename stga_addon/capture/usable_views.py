@@ -1,4 +1,5 @@
-"""Views that show nobody, because their matte or their image failed: found, and left out."""
+"""Views that are left out: those that show nobody, because their matte or their image failed, are
+found; others are named by a run."""
 
 import statistics
 from collections.abc import Collection, Iterable, Sequence

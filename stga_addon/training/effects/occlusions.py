@@ -27,7 +27,7 @@ MIN_NEIGHBOR_FRACTION = 0.6
 """Fraction of the visible neighbors that must differ as well: highlights and wrinkles are small."""
 MIN_COVERED_FRACTION = 0.03
 """Covered fraction of the head's pixels from which a view is left out: hands before real faces
-cover 0.03 to 0.25, and ten recordings without hands reach 0.025."""
+cover 0.03 to 0.49, and twelve recordings without hands reach 0.025."""
 MAX_COVERED_VIEWS = 0.5
 """Fraction of the sampled views above which nothing is left out: what covers a face most of the
 time, such as a mask, is part of the person."""
@@ -56,13 +56,14 @@ class TypicalColors:
     neighbors: np.ndarray
 
     def covered_fraction(self, color: np.ndarray, pixels: np.ndarray) -> float:
-        """Fraction of the head's visible pixels that differ from the typical colors in one piece;
+        """Fraction of the head's visible pixels without their typical color, in one piece;
         color (F, 3), NaN where not visible, and pixels (F,) of a view, as in `Samples`."""
         color = color[self.rows].astype(np.float64)
         visible = ~np.isnan(color[:, 0])
         if not visible.any():
             return 0.0
-        difference = self.difference(color)
+        even = color / _exposure(color, self.color)
+        difference = np.abs(even - self.color).max(1)
         differs = difference > np.maximum(MIN_DIFFERENCE_LEVELS, MIN_DEVIATIONS * self.deviation)
         differs &= visible
         around = np.maximum(visible[self.neighbors].sum(1), NEIGHBORS / 2)
@@ -70,14 +71,10 @@ class TypicalColors:
         area = np.where(visible, pixels[self.rows], 0.0)
         return float(area[differs & together].sum() / max(area.sum(), 1e-9))
 
-    def difference(self, color: np.ndarray) -> np.ndarray:
-        """(K,) largest difference of a channel (K, 3) from the typical colors, exposure aside;
-        NaN where not visible."""
-        return np.asarray(np.abs(color / exposure(color, self.color) - self.color).max(1))
 
-
-def exposure(color: np.ndarray, typical: np.ndarray) -> np.ndarray:
-    """(3,) gain of each channel of a view's colors (K, 3), NaN where not visible."""
+def _exposure(color: np.ndarray, typical: np.ndarray) -> np.ndarray:
+    """(3,) gain of each channel of a view's colors (K, 3), NaN where not visible: a median, which a
+    hand does not change."""
     return np.asarray(np.nanmedian((color + DARK_LEVELS) / (typical + DARK_LEVELS), axis=0))
 
 
@@ -99,7 +96,7 @@ def typical_colors(capture: Capture, samples: Samples) -> TypicalColors | None:
     even = color
     for _ in range(EXPOSURE_ITERATIONS):
         typical = np.nanmedian(even, axis=0)
-        even = color / np.stack([exposure(view, typical) for view in color])[:, None]
+        even = color / np.stack([_exposure(view, typical) for view in color])[:, None]
     difference = np.abs(even - typical).max(2)
     deviation = 1.4826 * np.nanmedian(difference, axis=0)
     centers = capture.neutral[capture.faces[samples.faces[rows]]].mean(1)

@@ -29,7 +29,9 @@ def filled_colors(
     """
     adjacency: Any = trimesh.graph.face_adjacency
     pairs = adjacency(faces)
-    first, second = pairs[group[pairs[:, 0]] == group[pairs[:, 1]]].T
+    pairs = pairs[group[pairs[:, 0]] == group[pairs[:, 1]]]
+    first = pairs[:, 0]
+    second = pairs[:, 1]
     count = len(faces)
     rows = np.concatenate([first, second])
     columns = np.concatenate([second, first])

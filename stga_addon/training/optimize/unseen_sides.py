@@ -45,7 +45,8 @@ MIN_VISIBLE_FRACTION = 0.1
 """Fraction of the median of the pixels that show as much of the surface, below which it is not
 visible: a folded eyelid has less."""
 NEAREST = 24
-"""Neighbors whose colors' median hidden triangles and free splats have, and that show a tooth."""
+"""Neighbors whose colors' median unseen necks and shoulders, and free splats, have, and that show a
+tooth."""
 SOURCE_TRIANGLES = 100
 """Triangles over which hair's color off axis, and that of the layer behind skin, are medians."""
 COLLAR_SLOPE = 0.6
