@@ -43,7 +43,7 @@ def compiling():
     compile(source, "inspect", "exec")
     return time.process_time() - begin
 
-reference = min(compiling() for _ in range(5))
+reference = sorted(compiling() for _ in range(5))[2]  # as disturbed as enabling is
 print("RESULT " + json.dumps([took / reference, panels]))
 """
 
