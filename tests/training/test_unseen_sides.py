@@ -622,6 +622,22 @@ def test_a_mirrored_side_keeps_its_light(bundled, tmp_path):
     assert_allclose(found, 0.5 * SKIN, rtol=0.2)
 
 
+def test_a_neck_lit_from_one_side(bundled, tmp_path):
+    """Catches a neck whose shaded side is as bright as the lit one from where no view shows it, and
+    an edge between both behind it."""
+    at = Surface(filmed(bundled, painted(bundled), (0,), 0.0, tmp_path)).at
+    light = 4.0 ** (0.5 * np.sin(at.azimuth) - 0.5)  # 1 on the left, 1/4 on the right
+    color = light[:, None] * painted(bundled)
+    surface = Surface(filmed(bundled, color, (0,), 0.0, tmp_path))
+    neck = surface.outside & surface.kinds["body"] & (surface.facing < SOURCE_COSINE)
+    neck &= (color == light[:, None] * SKIN).all(1)
+    found = 255 * unseen_sides(surface).color
+    for side in (neck & (at.azimuth > 0), neck & (at.azimuth < 0)):
+        assert side.sum() > 20
+        away = abs(found[side] / color[side] - 1).max(1)
+        assert np.median(away) < 0.2  # 0.25 and 0.3 where only the result is relit
+
+
 def test_hair_off_axis(bundled, tmp_path):
     """Catches an avatar of one camera that does not look from there as it was trained, streaks of
     hair that run around the head as they shine in front, a face that is smoothed with them, a

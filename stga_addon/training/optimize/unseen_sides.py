@@ -232,7 +232,8 @@ def _continued(
 ) -> np.ndarray:
     """Colors (F, 3) of all triangles, continued from those of the sources (F,) bool and, less, from
     mirror images and from an unseen scalp, which has the median color of the hair, triangles (M,).
-    Ears continue ears, if any is well visible."""
+    Ears continue ears, if any is well visible; colors of neck and shoulders are compared in even
+    light."""
     scalp = surface.kinds["scalp"]
     body = surface.kinds["body"]
     ears = surface.regions.within(Region.EAR)
@@ -245,7 +246,8 @@ def _continued(
     for unseen, level_weight in ((body & turned_away, LEVEL_WEIGHT), (body & ~turned_away, 1.0)):
         rows = unseen & surface.outside & ~is_source
         if (body & is_source).any() and rows.any():
-            both_sides = _nearest_colors(surface, color, is_source, rows, level_weight)
+            even = color / np.sqrt(light)
+            both_sides = _nearest_colors(surface, even, is_source, rows, level_weight)
             observed[rows] = both_sides * np.sqrt(light[rows])
             weight[rows] = SOURCE_WEIGHT
     if len(hair):
