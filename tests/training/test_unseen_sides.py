@@ -623,8 +623,8 @@ def test_a_mirrored_side_keeps_its_light(bundled, tmp_path):
 
 
 def test_a_neck_lit_from_one_side(bundled, tmp_path):
-    """Catches a neck whose shaded side is as bright as the lit one from where no view shows it, and
-    an edge between both behind it."""
+    """Catches a neck whose shaded side is too bright, and whose lit side is too dark, where no view
+    shows it."""
     at = Surface(filmed(bundled, painted(bundled), (0,), 0.0, tmp_path)).at
     light = 4.0 ** (0.5 * np.sin(at.azimuth) - 0.5)  # 1 on the left, 1/4 on the right
     color = light[:, None] * painted(bundled)
