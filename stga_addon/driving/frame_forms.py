@@ -12,8 +12,8 @@ from .clocks import MAX_FRAME_STEP
 from .performance import arkit_name
 
 FACE_CAP_COLUMNS = ("k", "time_ms", "px", "py", "pz", "rx", "ry", "rz", "lx", "ly", "rx2", "ry2")
-"""Values before the shapes in Face Cap's lines: position of the head, then angles in degrees of the
-head, about x, y and z, and of the eyes."""
+"""Columns before the shapes in Face Cap's lines: the kind of line, its time, the head's position,
+and angles in degrees: the head's about x, y and z, then those of the eyes."""
 NAME_OF_SHAPE = ("blendShapeLocation", "blendShape", "blendshape", "shape", "categoryName", "name")
 """Keys of a shape's name in a row of one shape."""
 VALUE_OF_SHAPE = ("value", "weight", "score", "coefficient")
@@ -85,8 +85,8 @@ def face_cap_frames(path: Path, text: str) -> list[Any]:
         elif cells[0] == "k":
             before = len(FACE_CAP_COLUMNS)
             if len(cells) != before + len(names):
-                expected = f"expected {before + len(names)} values"
-                raise StgaError(f"{path}: line {number}: has {len(cells)}, {expected}")
+                expected = f"expected {before + len(names)}"
+                raise StgaError(f"{path}: line {number}: has {len(cells)} columns, {expected}")
             try:
                 values = [float(cell) for cell in cells[1:]]
             except ValueError as error:

@@ -66,7 +66,7 @@ def build_shot(head: Any, person: FlameSequence, speech: Path) -> None:
     performance that it speaks from. Raises StgaError."""
     scene = bpy.context.scene
     set_frames_per_second(scene, FRAMES_PER_SECOND)
-    _act(head, person, speech)
+    _key_performance(head, person, speech)
     scene.frame_start = 1
     scene.frame_end = FRAMES
     vertices = evaluated_vertices(head) @ np.array(head.matrix_world)[:3, :3].T
@@ -75,7 +75,7 @@ def build_shot(head: Any, person: FlameSequence, speech: Path) -> None:
     neck = Vector((middle.x, middle.y + NECK_BEHIND_M, vertices[:, 2].min()))
     armature = _body(neck)
     attach_to_bone(head, armature, "chest")
-    _turn(armature)
+    _key_body(armature)
     _room(middle)
     _lamps(scene, middle)
     _camera(scene, middle)
@@ -159,8 +159,8 @@ def _body(neck: Vector) -> Any:
     return armature
 
 
-def _act(head: Any, person: FlameSequence, speech: Path) -> None:
-    """The performance as a strip, and keyframes of lids and eyes that are added to it."""
+def _key_performance(head: Any, person: FlameSequence, speech: Path) -> None:
+    """Apply the performance as a strip, and keyframe lids and eyes in actions above it."""
     performance = read_performance(speech)
     rate = float(FRAMES_PER_SECOND)
     motion = performed(performance, person, head.name, MotionOptions(), fps=rate)
@@ -178,8 +178,8 @@ def _act(head: Any, person: FlameSequence, speech: Path) -> None:
     bpy.context.scene.frame_set(1)
 
 
-def _turn(armature: Any) -> None:
-    """Keyframes of the body."""
+def _key_body(armature: Any) -> None:
+    """Keyframes that turn the body's chest."""
     armature.pose.bones["chest"].rotation_mode = "XYZ"
     turns = {frame: [0.0, np.radians(angle), 0.0] for frame, angle in TURN_DEG.items()}
     _key(armature, 'pose.bones["chest"].rotation_euler', turns)

@@ -16,25 +16,26 @@ from .status import CANCEL_FILE, LOG_FILE, STATUS_FILE, refuse_running_worker, r
 from .training_python import this_python
 
 CACHE_VARIABLE = "STGA_CACHE"
-"""Environment variable that names the folder. Blender's extension sets it to one that uninstalling
-removes."""
+"""Environment variable that names the cache folder. Blender's extension sets it to a folder that
+uninstalling removes."""
 KERNELS = "kernels"
-"""Folder of the cache: of Numba."""
+"""Folder in the cache in which Numba keeps compiled kernels."""
 BUNDLED = "bundled kernels"
-"""Folder of kernels that an edition brings, where this processor is faster with its own
-(`raster.cpu.bundled`)."""
+"""Folder in the cache for kernels that the complete edition brings, on a processor that compiles
+faster ones into KERNELS (`raster.cpu.bundled`)."""
 BYTECODE = "bytecode"
-"""Folder of Python (`PYTHONPYCACHEPREFIX`)."""
+"""Folder in the cache for Python's bytecode (`PYTHONPYCACHEPREFIX`)."""
 CHARTS = "matplotlib"
-"""Folder of matplotlib."""
+"""Folder in the cache for matplotlib."""
 PREPARING = "preparing.lock"
-"""Held in it by the process that compiles ahead of a training (`jobs.compile_ahead`)."""
+"""File in the cache that is locked by the process that compiles ahead of a training
+(`jobs.compile_ahead`)."""
 PACKAGES_FOLDER = Path(__file__).resolve().parents[2]
 """The folder that holds `stga_addon`, for a worker's import path."""
 NICENESS = 5
-"""Added to the nice value of a worker, so that Blender has precedence."""
+"""How much nicer than Blender a worker is, which Blender's window thus does not wait for."""
 BACKGROUND_NICENESS = 15
-"""Added to that of what runs in the background, so that workers have."""
+"""How much nicer than its parent a process in the background is: nicer than workers."""
 PR_SET_PDEATHSIG = 1  # Option of prctl(2)
 # Windows: own process group, so that closing the console does not end the worker; no console
 # window; and BELOW_NORMAL_PRIORITY_CLASS. Elsewhere: an own session.
@@ -74,8 +75,8 @@ def start_worker(folder: Path, python: str, arguments: Sequence[str]) -> subproc
     """Start `python -m ARGUMENTS…` at low priority in a prepared status folder; it outlives the
     calling process.
 
-    Raises StgaError where the interpreter cannot be started; then only the status is removed from
-    the folder.
+    Raises StgaError where the log cannot be opened, and where the interpreter cannot be started;
+    then the files of `prepare_status_folder` are removed, and the folder if nothing else is in it.
     """
     path = folder / LOG_FILE
     with naming(path):

@@ -115,37 +115,41 @@ def combinations(heads: list[Head], poses: int) -> None:
 
 
 def leaks(driver: Head, driven: Head, poses: int) -> None:
-    """The driver's expressions hold what the identity components do not: a random ICT-FaceKit
-    face."""
+    """A table of ways in which one head takes over another's tracked motion: distances from where
+    ICT-FaceKit's shapes, and from where this head's own coefficients, put its face points.
+
+    The driver's face at rest is a random one of ICT-FaceKit, which its identity components cannot
+    show: a tracker finds the rest of it as expressions, which then leak into the driven head.
+    """
     rng = np.random.default_rng(7)
     weights = random_poses(poses + QUIET_FRAMES, rng)
     weights[:QUIET_FRAMES] = 0.02 * weights[:QUIET_FRAMES]
     take = Performance(np.arange(len(weights)) / 30, weights, np.zeros(3), 30.0)
-    bias = _leaked(driver)
-    tracked = [replace(frame, expr=frame.expr + bias) for frame in driver.map.frames(take)]
-    theirs = quiet_neutral(tracked)
-    relative = exchanged_neutral(tracked, theirs)
-    back = arkit_weights(relative, driver.map, driver.sequence)[QUIET_FRAMES:]
+    leaked = _leaked(driver)
+    tracked = [replace(frame, expr=frame.expr + leaked) for frame in driver.map.frames(take)]
+    quiet = quiet_neutral(tracked)
+    relative = exchanged_neutral(tracked, quiet)
+    found_weights = arkit_weights(relative, driver.map, driver.sequence)[QUIET_FRAMES:]
     copied = _values(tracked)
-    apart = _values(relative)
-    rest = driver.points(np.concatenate([theirs["face"], theirs["jaw"]]))
+    from_quiet = _values(relative)
+    rest = driver.points(np.concatenate([quiet["face"], quiet["jaw"]]))
     scale = np.linalg.norm(driven.rest - driven.rest.mean(axis=0)) / np.linalg.norm(
         driver.rest - driver.rest.mean(axis=0)
     )
     displaced = [driven.rest + scale * (driver.points(row) - rest) for row in copied]
-    mapped = _values(driven.map.frames(take))
+    own = _values(driven.map.frames(take))
     true = [driven.true_points(row) for row in weights[QUIET_FRAMES:]]
-    through = driven.map.parameters(back)[:, : driven.count + 3]
+    by_weights = driven.map.parameters(found_weights)[:, : driven.count + 3]
     ways = {
         "coefficients copied": copied,
-        "coefficients, relative to the quiet face": apart,
-        "displacements of the points, fitted": _fitted(driven, displaced, apart),
-        "ARKit weights and this head's map": through,
+        "coefficients, relative to the quiet face": from_quiet,
+        "displacements of the points, fitted": _fitted(driven, displaced, from_quiet),
+        "ARKit weights and this head's map": by_weights,
         "ARKit weights, what they do fitted": _fitted(
-            driven, [driven.true_points(row) for row in back], through
+            driven, [driven.true_points(row) for row in found_weights], by_weights
         ),
-        "this head's own coefficients": mapped,
-        "best of this model": _fitted(driven, true, mapped),
+        "this head's own coefficients": own,
+        "best of this model": _fitted(driven, true, own),
     }
     print("\n## Another person's motion\n")
     print("| way | from ICT-FaceKit mm | less % | from own coefficients mm | less % |")
@@ -157,10 +161,7 @@ def leaks(driver: Head, driven: Head, poses: int) -> None:
             [
                 np.mean([mean_distance(p, t) for p, t in zip(points, true, strict=True)]),
                 np.mean(
-                    [
-                        mean_distance(p, driven.points(v))
-                        for p, v in zip(points, mapped, strict=True)
-                    ]
+                    [mean_distance(p, driven.points(v)) for p, v in zip(points, own, strict=True)]
                 ),
             ]
         )

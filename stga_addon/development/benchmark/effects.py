@@ -4,7 +4,8 @@
         [--together] [--picture FILE] [--flame FILE] [--iterations 500] [--seeds 3]
 
 Trains with each effect on and off, or with --together all of them, the others decided by Auto.
---picture writes ground truth, off and on of two unseen timesteps. Prints a table in Markdown: PSNR
+--picture writes ground truth, off and on of two unseen timesteps, a file named FILE-EFFECT for each
+of several trainings. Prints a table in Markdown: PSNR
 of the held-out view and unseen expressions, means over seeds ± their standard deviation,
 milliseconds of an iteration, and LPIPS with STGA_LPIPS (docs/dependencies.md). Each seed trains the
 variants in another order. Run it on an idle machine.
@@ -147,11 +148,14 @@ def main() -> None:
     parser.add_argument("--picture", type=Path)
     options = parser.parse_args()
     capture = open_capture(options.capture.resolve(), options.flame)
+    if options.picture and not capture.views.get("test"):
+        parser.error("--picture shows test views, and the capture has none")
     _, plan = plan_effects(capture, make_settings(iterations=options.iterations, effects={}))
     decided = {each.effect: f"{'on' if each.on else 'off'}: {each.reason}" for each in plan}
     row("effect", "decided", "val, off → on", "test", "LPIPS, test", "ms")
     row(*["---"] * 6)
-    for effects in [options.switch] if options.together else [[name] for name in options.switch]:
+    trainings = [options.switch] if options.together else [[name] for name in options.switch]
+    for effects in trainings:
         on, off = on_and_off(capture, effects, options)
         gains = [
             f"{cell(off.psnr[split], 2)} → {cell(on.psnr[split], 2)}" if split in on.psnr else ""
@@ -166,7 +170,10 @@ def main() -> None:
             f"{on.pace.mean - off.pace.mean:+.1f}",
         )
         if options.picture:
-            write_picture(options.picture, on, off)
+            path = options.picture
+            if len(trainings) > 1:
+                path = path.with_stem(f"{path.stem}-{effects[0]}")
+            write_picture(path, on, off)
 
 
 if __name__ == "__main__":

@@ -205,6 +205,11 @@ def main() -> None:
 
 
 def measure(folder: Path, run: Path, seconds: str, pictures: Path | None) -> None:
+    """Print a table for one head: an avatar trained under light A, in the other lights.
+
+    folder: with captures of each light; run: of the avatar, trained for `seconds` if it is missing;
+    pictures: a folder for the truth beside each relit image, None for no pictures.
+    """
     capture = open_capture(folder / "capture_A")
     avatar = trained(folder / "capture_A", run, seconds)
     bench = Bench(folder, avatar)

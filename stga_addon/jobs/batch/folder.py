@@ -28,11 +28,12 @@ from .plan import REPLACED, Job, Plan, input_paths
 
 
 def job_digests(plan: Plan) -> dict[str, str]:
-    """Name of each job -> SHA-256 of it.
+    """Name of each job -> SHA-256 of all that its result depends on.
 
-    Inputs count by name, size and time of change; a run that no job of the batch makes, by the
-    content of its run file and avatar; what another job makes, by that job's digest; what the batch
-    writes into an input, not at all. Raises StgaError where an input cannot be read.
+    That is the request, with the paths in it, and its inputs: files by path, size and time of
+    change; a run that no job of the batch makes by the content of its run file and avatar; what
+    another job makes by that job's digest. What the batch itself writes into an input does not
+    count. Raises StgaError where an input cannot be read.
     """
     folders = {job.name: job.folder for job in plan.jobs}
     fields = ((job.request, JOBS[type(job.request)].output) for job in plan.jobs)

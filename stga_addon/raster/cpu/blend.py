@@ -144,25 +144,25 @@ def outline(mean_x, mean_y, precision_x, shear, precision_y, extent_y):
 
 @part_jit
 def rows_within(outline, left, width, rows):
-    """First and past-the-last of rows 0 to `rows` in which a pixel of the `width` columns from
-    `left` on has its center in an outline; the first is not before the other where there are none.
-    All float32.
+    """The range first, end of those rows among 0 to `rows` in which an outline covers the center of
+    a pixel in the `width` columns from `left` on. Rounding may add a row, and never loses one; an
+    outline that covers none has first ≥ end. All float32.
 
-    Between the outermost centers the ellipse is highest where it is highest altogether, or else at
-    the nearer edge, and likewise lowest.
+    Of all columns, the ellipse reaches its highest point in one, and is lower the farther a column
+    is from it: among `width` columns, the one nearest to that point counts. Likewise the lowest.
     """
-    mean_x, mean_y, extent_y, lean, rate, chord, cut, slack = outline
-    low = left - mean_x
-    high = low + width - ONE
-    nearest = min(max(ZERO, low), high)
-    top = min(max(-lean, low), high)
-    bottom = min(max(lean, low), high)
-    up = rate * top - math.sqrt(max(ZERO, chord - cut * top * top)) - slack
-    down = rate * bottom + math.sqrt(max(ZERO, chord - cut * bottom * bottom)) + slack
-    first = np.ceil(max(ZERO, mean_y + max(up, -extent_y)))
-    past = np.floor(min(rows - ONE, mean_y + min(down, extent_y))) + ONE
-    reached = cut * nearest * nearest <= np.float32(1.00001) * chord
-    return min(first, rows) if reached else rows, max(past, ZERO) if reached else ZERO
+    center_x, center_y, extent_y, lean, rate, chord, cut, slack = outline
+    left_x = left - center_x
+    right_x = left_x + width - ONE
+    nearest_x = min(max(ZERO, left_x), right_x)
+    highest_x = min(max(-lean, left_x), right_x)
+    lowest_x = min(max(lean, left_x), right_x)
+    above = rate * highest_x - math.sqrt(max(ZERO, chord - cut * highest_x * highest_x)) - slack
+    below = rate * lowest_x + math.sqrt(max(ZERO, chord - cut * lowest_x * lowest_x)) + slack
+    first = np.ceil(max(ZERO, center_y + max(above, -extent_y)))
+    end = np.floor(min(rows - ONE, center_y + min(below, extent_y))) + ONE
+    reached = cut * nearest_x * nearest_x <= np.float32(1.00001) * chord
+    return min(first, rows) if reached else rows, max(end, ZERO) if reached else ZERO
 
 
 @part_jit

@@ -246,7 +246,9 @@ class SplatsEngine(bpy.types.RenderEngine):  # type: ignore[misc]
         renderers: list[SplatRenderer],
         with_depth: bool = False,
     ) -> ComposedImage:
-        """renderers: as of `draw_image`."""
+        """The splats of the layers as a view shows them, over nothing: drawn by the GPU if it is
+        faster and does not fail, else by the CPU's rasterizer. with_depth: whether the rasterizer
+        also finds depths, which the GPU always does; renderers: as of `draw_image`."""
         image = None
         if not is_rasterizer_faster():
             image = draw_image(layers, view, partial(self.report, {"WARNING"}), renderers)
@@ -290,8 +292,8 @@ _reported: set[str] = set()
 
 
 def is_rasterizer_faster() -> bool:
-    """Whether Blender's graphics compute on the CPU, where the rasterizer takes a third of their
-    time, and this Python has it."""
+    """Whether this Python has the CPU's rasterizer, and it is faster than Blender's graphics: where
+    the CPU computes these as well, it takes a third of their time."""
     return has_gpu_context() and is_software() and not missing_packages()
 
 

@@ -370,13 +370,17 @@ def _is_holdout(owner: Any, instance: Any, depsgraph: Any) -> bool:
 
 
 def relight_frame(splat_object: Any, scene: Any) -> None:
-    """Store the splats' colors in the scene's light at its frame, from its camera. Raises
-    StgaError."""
+    """Store the splats' colors in the scene's light, at the scene's frame and from its camera.
+
+    Raises StgaError for a hidden avatar, one that the scene does not light, and a scene without a
+    camera."""
     with kept_evaluated(with_heads(scene)):
         depsgraph = bpy.context.evaluated_depsgraph_get()
         only = lambda candidate: candidate == splat_object  # noqa: E731
         layers = visible_layers(depsgraph, SplatCache(), is_wanted=only)
-    if not layers or layers[0].relit is None:
+    if not layers:
+        raise StgaError(f"{splat_object.name}: is hidden from the camera; show it")
+    if layers[0].relit is None:
         raise StgaError(
             f"{splat_object.name}: is lit as recorded; choose Scene or Mix in the panel Lighting"
         )

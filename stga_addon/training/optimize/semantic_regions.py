@@ -143,9 +143,13 @@ class HeadRegions:
 
 
 def head_regions(capture: Capture) -> HeadRegions:
-    """Regions of a capture's triangles: those of KNOWN_HEADS, of whatever identity, with what is
-    grafted into the mouth; on other meshes the bundled head's nearest, when eyes and mouths lie
-    upon each other. OTHER where eyes or mouth, or the bundled head, are not known."""
+    """Regions of a capture's triangles.
+
+    Heads of KNOWN_HEADS, of any identity, are recognized by their triangles; what is grafted onto
+    them belongs to the mouth. On another mesh, each triangle has the region of the bundled head's
+    nearest triangle, after both heads' eyes and mouths are laid upon each other. Where a mesh has
+    no eyes or mouth, or the bundled head is missing, all regions are OTHER.
+    """
     faces = capture.faces
     arrays = _arrays()
     for name in KNOWN_HEADS:

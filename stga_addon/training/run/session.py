@@ -121,11 +121,11 @@ def train_run_or_fall_back(
     resume: bool = False,
     report: Report = ignore,
 ) -> Trained:
-    """`train_run`; where a GPU fails, on the CPU from the last checkpoint on."""
+    """`train_run`; where a GPU fails, the CPU continues, from the last checkpoint if any."""
     try:
         return train_run(capture, out, run, selection, resume, report)
     except DeviceError as error:
-        _log.warning("%s; continuing on the CPU from the last checkpoint", error.cause)
+        _log.warning("%s; continuing on the CPU", error.cause)
     # Outside the handler: the error's traceback would keep the failed loop and its buffers alive.
     report(Progress(stage="Continuing on the CPU"))
     return train_run(capture, out, replace(run, device="cpu"), selection, True, report)
