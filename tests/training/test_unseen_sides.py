@@ -740,9 +740,8 @@ def test_a_torso_that_is_elsewhere_is_not_flat(bundled, tmp_path):
     assert not Surface(capture).is_flat[shown].any()
 
 
-NARROWER = 0.88
 BASE = np.array([0, -0.11, 0.0])
-"""Width of masks, of a head; the base of the neck."""
+"""The base of the neck."""
 TIE = np.array([200, 20, 20], np.uint8)
 
 
@@ -761,15 +760,17 @@ def beside_masks(capture, layer, frames):
     return found
 
 
-def test_nobody_looks_through_a_side(bundled, tmp_path):
-    """Catches a head that is tracked wider than it is, through whose sides, transparent in all
-    images, one sees its inside from there; and a layer that shows beside the masks."""
+@pytest.mark.parametrize("narrower", [0.88, 0.7])
+def test_nobody_looks_through_a_side(bundled, tmp_path, narrower):
+    """Catches a head that is tracked wider than it is, by 10 or 25 mm at each side, through whose
+    sides, transparent in all images, one sees its inside from there; and a layer that shows beside
+    the masks."""
     capture = filmed(bundled, painted(bundled), TURNS_DEG, 0.0, tmp_path)
     for view in capture.views["train"]:
-        narrow = silhouette(capture.neutral * [NARROWER, 1, 1], capture.faces, view.camera)
+        narrow = silhouette(capture.neutral * [narrower, 1, 1], capture.faces, view.camera)
         Image.fromarray(np.uint8(255 * narrow)).save(view.mask)
     layer, frames = behind(FrameStore(capture, "stga"))
-    assert beside_masks(capture, layer, frames) < 0.1
+    assert beside_masks(capture, layer, frames) < 0.15
     centers, level = middles(capture)
     camera = look_at([1, 0, 0], [0, -0.02, 0], 160, 200, 480)
     triangle, _ = rasterize(capture.neutral, capture.faces, camera)

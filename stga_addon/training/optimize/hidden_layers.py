@@ -133,6 +133,7 @@ def occluding_splats(frames: FrameStore, sh_degree: int = 0) -> Splats:
     behind.log_scale[:, axis] += np.log(HIDDEN_FLATNESS)
     there = face_frames(occlusion.places, capture.faces, occlusion.places, frames.convention)
     world = to_world(behind, there)
+    world.xyz[:] -= occlusion.depth[behind.face, None] * there.rotation[behind.face, :, axis]
     least = np.where(np.arange(3) == axis, 0, CELL_WIDTH * CELL_VOXELS * frames.voxel)
     world = replace(world, log_scale=np.log(np.maximum(np.exp(world.log_scale), least)))
     behind = to_local(world, frames.neutral, behind.face)

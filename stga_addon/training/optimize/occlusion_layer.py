@@ -8,7 +8,6 @@ from scipy.spatial import cKDTree
 
 from ...avatar.embedding import face_areas, face_frames
 from ...avatar.lattice import NORMAL_AXIS
-from ...capture.mesh_geometry import vertex_normals
 from .semantic_regions import (
     CHIN_LEVEL,
     TORSO_HEIGHT,
@@ -36,7 +35,7 @@ BORDER_CELLS = 2.0
 """Least distance of clothes' layer from the mesh's edge, where it would stand out."""
 DEPTH_VOXELS = 0.5
 """Step between the depths at which the layer may lie."""
-MAX_DEPTHS = 10
+MAX_DEPTHS = 24
 """Depths that are tried; the first that lies within the masks is taken."""
 MARGIN_FRACTION = 0.015
 """Least distance of the layer from the masks' edge, as a fraction of their height."""
@@ -66,12 +65,14 @@ class OcclusionLayer:
     """The layer behind some triangles.
 
     triangles  (F,) bool: those behind which it has a splat
-    places     (V, 3) meters: where the neutral mesh's vertices are in the layer
+    places     (V, 3) meters: the neutral mesh's vertices, those of a torso's front in its back
+    depth      (F,) meters: depth of the layer below these
     color      (F, 3) in 0…1 of the layer
     """
 
     triangles: np.ndarray
     places: np.ndarray
+    depth: np.ndarray
     color: np.ndarray
 
 
@@ -83,11 +84,12 @@ def occlusion_layer(surface: Surface, sides: UnseenSides) -> OcclusionLayer:
     faces = surface.capture.faces
     at = surface.at
     if at is None or not surface.has_few_cameras:
-        return OcclusionLayer(np.zeros(len(faces), bool), surface.neutral, sides.off_axis)
+        nowhere = np.zeros(len(faces), bool)
+        return OcclusionLayer(nowhere, surface.neutral, np.zeros(len(faces)), sides.off_axis)
     front, back, median_color = _back(surface, at, sides.color)
     of_back = np.zeros(len(back), bool)
     of_back[faces[front]] = True
-    grazed, behind = _behind_sides(surface, at, ~of_back[faces].any(1))
+    grazed, depth = _behind_sides(surface, at, ~of_back[faces].any(1))
     centers = surface.centers
     color = sides.off_axis.copy()
     color[front] = median_color
@@ -95,8 +97,8 @@ def occlusion_layer(surface: Surface, sides: UnseenSides) -> OcclusionLayer:
     if len(skin):
         around = nearest_rows(centers[skin], centers[skin], SOURCE_TRIANGLES)
         color[skin] = np.median(color[skin][around], axis=1)
-    places = np.where(of_back[:, None], back, behind)
-    return OcclusionLayer(grazed | front, places, color)
+    places = np.where(of_back[:, None], back, surface.neutral)
+    return OcclusionLayer(grazed | front, places, depth, color)
 
 
 def _behind_sides(
@@ -104,10 +106,8 @@ def _behind_sides(
 ) -> tuple[np.ndarray, np.ndarray]:
     """One triangle in each cell of those `allowed` (F,) bool that an off-axis view may look
     through, as (F,) bool: the triangles of `_grazed`, and of neck and clothes, because images need
-    not make opaque what a collar or a fold hides from the cameras. And the neutral vertices (V, 3),
-    moved inside the head until masks cover them."""
-    faces = surface.capture.faces
-    neutral = surface.neutral
+    not make opaque what a collar or a fold hides from the cameras. And their depth (F,) in meters,
+    from which masks cover them, 0 elsewhere."""
     allowed = allowed & surface.outside & skin_of(surface.capture)
     allowed &= ~surface.regions.within(Region.EAR)
     grazed = allowed & _grazed(surface, at)
@@ -119,14 +119,14 @@ def _behind_sides(
     fits = ~surface.beside_masks(rows, offsets, -MARGIN_FRACTION)
     large = clothes[rows]
     fits[large] &= ~_reaches_beside(surface, rows[large], offsets[large])
-    deepest = np.zeros(len(neutral))
-    np.maximum.at(deepest, faces[rows], depths[fits.argmax(1), None])
+    depth = np.zeros(len(allowed))
     rows = rows[fits.any(1)]
+    depth[rows] = depths[fits.argmax(1)[fits.any(1)]]
     cells = np.floor(surface.centers[rows] / (CELL_VOXELS * surface.voxel))
     _, first = np.unique(cells, axis=0, return_index=True)
-    chosen = np.zeros(len(faces), bool)
+    chosen = np.zeros(len(allowed), bool)
     chosen[rows[first]] = True
-    return chosen, neutral - deepest[:, None] * vertex_normals(neutral, faces)
+    return chosen, np.where(chosen, depth, 0)
 
 
 def _reaches_beside(surface: Surface, rows: np.ndarray, offsets: np.ndarray) -> np.ndarray:
