@@ -31,6 +31,9 @@ ONE_DIRECTION_FACE_ANGLE_DEG = 30.0
 """FACE_ANGLE_DEG of such a head."""
 CELL_VOXELS = 2
 """Side of the cell of a head's surface behind which one splat is enough."""
+LARGEST_RATIO = 2.5
+"""Side of the largest triangle with a splat behind it, in those of the median: one splat behind a
+larger one, at a torso's corner, stands out as a spike."""
 BORDER_CELLS = 2.0
 """Least distance of clothes' layer from the mesh's edge, where it would stand out."""
 DEPTH_VOXELS = 0.5
@@ -98,7 +101,14 @@ def occlusion_layer(surface: Surface, sides: UnseenSides) -> OcclusionLayer:
         around = nearest_rows(centers[skin], centers[skin], SOURCE_TRIANGLES)
         color[skin] = np.median(color[skin][around], axis=1)
     places = np.where(of_back[:, None], back, surface.neutral)
-    return OcclusionLayer(grazed | front, places, depth, color)
+    triangles = _without_large(surface, grazed) | _without_large(surface, front)
+    return OcclusionLayer(triangles, places, depth, color)
+
+
+def _without_large(surface: Surface, triangles: np.ndarray) -> np.ndarray:
+    """Those of triangles (F,) bool that are not larger than LARGEST_RATIO says."""
+    median = np.median(surface.areas[triangles]) if triangles.any() else 0.0
+    return triangles & (surface.areas < LARGEST_RATIO**2 * median)
 
 
 def _behind_sides(
