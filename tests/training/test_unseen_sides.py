@@ -781,6 +781,22 @@ def test_nobody_looks_through_a_side(bundled, tmp_path, narrower):
         assert alpha_of(layer, camera, frames)[own].min() > 0.9
 
 
+def test_no_spike_behind_a_large_triangle(bundled, tmp_path):
+    """Catches a splat behind a triangle much larger than others, such as a torso's corner, that is
+    as large, and stands out beside it."""
+    color = painted(bundled)
+    of_bust = FrameStore(filmed(bundled, color, (-20, 0, 20), 0.0, tmp_path), "stga")
+    _, level = middles(bundled)
+    (lowest, *_) = np.argsort(np.where(of_bust.occlusion_layer.triangles, level, 0))
+    neutral = np.array(bundled.neutral)
+    neutral[bundled.faces[lowest, 0]] += [0, 0, -0.07]
+    capture = replace(bundled, neutral=neutral, mesh=lambda _: neutral)
+    capture = filmed(capture, color, (-20, 0, 20), 0.0, tmp_path)
+    layer, frames = behind(FrameStore(capture, "stga"))
+    width = np.exp(layer.log_scale).max(1) * frames.scale[layer.face]
+    assert width.max() < 0.0105
+
+
 def test_the_end_behind_a_bust_stays(turning):
     """Catches a hem behind a bust that training frays."""
     trainer = Trainer(turning.capture, quick_settings("global", lattice=None), {})
