@@ -289,7 +289,7 @@ def figures_of_priors():
     yield f"(beyond {degrees(unseen_sides.VIEW_INDEPENDENT_COSINE)})"
     yield f"{unseen_sides.OFF_AXIS_WEIGHT} · sin²"
     yield f"(cosine {unseen_sides.SOURCE_COSINE})"
-    yield f"the {unseen_sides.NEAREST} nearest of"
+    yield f"the {unseen_sides.NEIGHBORS} nearest of"
     yield f"few cameras, below {degrees(unseen_sides.WELL_VISIBLE_COSINE)}"
     yield f"(beyond {degrees(unseen_hair.STRAND_COSINE)})"
 

@@ -38,8 +38,8 @@ MIN_HAIR_CONTRAST = 0.9
 scalp's most different ones, in standard deviations of skin."""
 LEAST_SHADE = 0.02
 """Least standard deviation of skin's shades, in colors of 0…1."""
-SMOOTHED = 24
-"""Triangles around one over which a decision or color is smoothed."""
+NEIGHBORS = 24
+"""Triangles around one over which a decision or color is smoothed, or has its median."""
 
 DEPTHS = (0.0, 0.25, 0.45, 0.75)
 """Distances from the visible lips at which the colors of a mouth's inside are given: it gets darker
@@ -212,7 +212,7 @@ def hairy_triangles(
     shades = (skin - median).T @ (skin - median) / len(skin) + LEAST_SHADE**2 * np.eye(3)
     away = color[sources] - median
     contrast = np.sqrt((away * np.linalg.solve(shades, away.T).T).sum(1))
-    near = nearest_rows(centers[sources], centers[sources], SMOOTHED)
+    near = nearest_rows(centers[sources], centers[sources], NEIGHBORS)
     contrast = np.quantile(contrast[near], 0.1, axis=1)
     return np.asarray(sources[contrast > MIN_HAIR_CONTRAST * np.quantile(contrast, 0.9)])
 
@@ -230,7 +230,7 @@ def inside_colors(
     known = np.flatnonzero(visible & skin)
     if not len(known) or not inside.any():
         return np.asarray(color[inside])
-    near = nearest_rows(centers[known], centers[inside], SMOOTHED)
+    near = nearest_rows(centers[known], centers[inside], NEIGHBORS)
     found = np.median(color[known[near]], axis=1)
     eyeballs = eyeballs_of(capture)
     white = _white_of_eyes(color[eyeballs & visible])

@@ -50,11 +50,10 @@ an outline."""
 HIDDEN_COSINE = 0.0
 """Cosine below which a triangle is hidden."""
 GRAZING_COSINE = 0.2
-"""Cosine below which a triangle fills little of any image; many outlines show its shape."""
+"""Cosine below which a triangle fills little of any image, and may lie in the mesh's outline; many
+outlines show its shape."""
 OUTLINE_VIEWS = 16
 """Views, spread over all, whose outlines are measured."""
-OUTLINE_COSINE = 0.2
-"""Largest cosine between a camera and a triangle in the mesh's outline."""
 OUTSIDE_CAMERAS = 15
 """Cameras that distinguish the neutral head's outside from its inside."""
 OUTSIDE_DISTANCE = 4.0
@@ -462,7 +461,7 @@ class Surface:
         capture = self.capture
         center, normal = _centers_and_normals(capture, view.timestep)
         cosine = facing(view.camera, center, normal)
-        rows = np.flatnonzero(self.outside & (np.abs(cosine) < OUTLINE_COSINE))
+        rows = np.flatnonzero(self.outside & (np.abs(cosine) < GRAZING_COSINE))
         if not len(rows):
             return np.zeros(0, int), np.zeros(0)
         heights = np.arange(MAX_HEIGHT_VOXELS * STEPS_PER_VOXEL + 1) * self.voxel / STEPS_PER_VOXEL

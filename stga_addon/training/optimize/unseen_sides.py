@@ -14,6 +14,7 @@ from ...flame.quaternions import unit
 from .color_fill import filled_colors
 from .semantic_regions import (
     BROWS_LEVEL,
+    NEIGHBORS,
     HeadCoordinates,
     Region,
     hairy_triangles,
@@ -23,7 +24,7 @@ from .semantic_regions import (
     skin_of,
     teeth_of,
 )
-from .surface import FACING_TIMESTEPS, UNSEEN_COSINE, Surface
+from .surface import FACING_TIMESTEPS, GRAZING_COSINE, UNSEEN_COSINE, Surface
 
 SPREAD_VIEWS = 12
 """Training views, spread over all, whose colors are measured."""
@@ -37,16 +38,11 @@ SOURCE_COSINE = 0.25
 hair at the temples and a beard beside the jaw are seen at 60 to 75° at least."""
 WELL_VISIBLE_COSINE = 0.5
 """The same above which a view shows a face better than its mirror image does."""
-FRINGE_COSINE = 0.2
-"""The same for the scalp, which takes the color of a fringe where it is not visible itself."""
 FRINGE_FRACTION = 0.2
 """Highest fraction of the visible triangles above the brows; they show hair if there is any."""
 MIN_VISIBLE_FRACTION = 0.1
 """Fraction of the median of the pixels that show as much of the surface, below which it is not
 visible: a folded eyelid has less."""
-NEAREST = 24
-"""Neighbors whose colors' median unseen necks and shoulders, and free splats, have, and that show a
-tooth."""
 SOURCE_TRIANGLES = 100
 """Triangles over which hair's color off axis, and that of the layer behind skin, are medians."""
 COLLAR_SLOPE = 0.6
@@ -172,7 +168,7 @@ def plausible_off_axis(
     beside = np.flatnonzero(splats.unbound & ~sides.is_hair[face])
     if len(beside):
         places = points_to_world(splats.xyz[beside], neutral, face[beside])
-        around = beside[nearest_rows(places, places, NEAREST)]
+        around = beside[nearest_rows(places, places, NEIGHBORS)]
         plausible[beside] = np.median(color[around], axis=1)
         fraction[beside] = 1
         steepness[beside] = ALSO_BEHIND_STEEPNESS
@@ -196,7 +192,7 @@ def _hair(
     scalp = surface.outside & surface.regions.within(Region.SCALP)
     rows = np.flatnonzero(scalp & is_source)
     if not len(rows):
-        rows = _fringe(at, surface.outside & has_pixels & (surface.facing > FRINGE_COSINE))
+        rows = _fringe(at, surface.outside & has_pixels & (surface.facing > GRAZING_COSINE))
     is_skin = is_source & ~scalp & ~surface.kinds["body"] & (at.level < BROWS_LEVEL)
     return hairy_triangles(rows, surface.centers, color, color[is_skin])
 
@@ -263,7 +259,7 @@ def _continued(
     found = filled_colors(surface.capture.faces, observed, weight, ears_apart, detail)
     missing = np.isnan(found[:, 0])
     if missing.any():  # parts of the mesh that nothing shows, such as an eyeball
-        near = nearest_rows(surface.centers[is_source], surface.centers[missing], NEAREST)
+        near = nearest_rows(surface.centers[is_source], surface.centers[missing], NEIGHBORS)
         found[missing] = np.median(color[is_source][near], axis=1)
     return np.clip(found, 0, 1)
 
@@ -287,8 +283,8 @@ def _nearest_colors(
     unseen: np.ndarray,
     level_weight: float,
 ) -> np.ndarray:
-    """Colors (N, 3) of unseen triangles (F,) bool of neck and shoulders: medians of the NEAREST
-    sources (F,) bool there, or mirror images of these; `level_weight`: see LEVEL_WEIGHT."""
+    """Colors (N, 3) of unseen triangles (F,) bool of neck and shoulders: medians of the NEIGHBORS
+    nearest sources (F,) bool there, or mirror images of these; level_weight: see LEVEL_WEIGHT."""
     assert surface.at is not None
     _, up, ahead = surface.at.axes
     tilted = unit(up + COLLAR_SLOPE * ahead)
@@ -299,7 +295,7 @@ def _nearest_colors(
     direct = np.flatnonzero(sources)
     places = centers[np.concatenate([direct, rows])]
     colors = color[np.concatenate([direct, images])]
-    near = nearest_rows(places, centers[unseen], NEAREST)
+    near = nearest_rows(places, centers[unseen], NEIGHBORS)
     return np.asarray(np.median(colors[near], axis=1))
 
 
@@ -365,7 +361,7 @@ def _around_visible_teeth(surface: Surface, visible: np.ndarray) -> np.ndarray:
     found = np.zeros(len(visible), bool)
     if len(teeth):
         places = surface.centers[teeth]
-        found[teeth] = visible[teeth][nearest_rows(places, places, NEAREST)].any(1)
+        found[teeth] = visible[teeth][nearest_rows(places, places, NEIGHBORS)].any(1)
     return found
 
 
