@@ -125,7 +125,8 @@ def test_images_of_recorded_light_say_so(extension, tmp_path, capsys):
 
 
 def test_relit_color_of_a_frame(lighting):
-    """Catches relit colors that do not reach the nodes, or stay when taken back."""
+    """Catches relit colors that do not reach the nodes, or stay when taken back, and advice to light
+    an avatar that is hidden."""
     avatar = with_light(textured(avatar_of("stga")))
     shown, _ = show(avatar)
     camera = camera_at()
@@ -134,6 +135,10 @@ def test_relit_color_of_a_frame(lighting):
     with refusal("as recorded"):
         relight_frame(shown, bpy.context.scene)
     lighting.mode = "scene"
+    shown.visible_camera = False
+    with refusal("hidden from the camera"):
+        relight_frame(shown, bpy.context.scene)
+    shown.visible_camera = True
     relight_frame(shown, bpy.context.scene)
     (layer,) = shown_layers()
     eye = layer.eye_in_avatar(np.array(camera.matrix_world)[:3, 3])

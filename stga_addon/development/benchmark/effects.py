@@ -4,11 +4,11 @@
         [--together] [--picture FILE] [--flame FILE] [--iterations 500] [--seeds 3]
 
 Trains with each effect on and off, or with --together all of them, the others decided by Auto.
---picture writes ground truth, off and on of two unseen timesteps, a file named FILE-EFFECT for each
-of several trainings. Prints a table in Markdown: PSNR
-of the held-out view and unseen expressions, means over seeds ± their standard deviation,
-milliseconds of an iteration, and LPIPS with STGA_LPIPS (docs/dependencies.md). Each seed trains the
-variants in another order. Run it on an idle machine.
+--picture writes ground truth, off and on of two unseen timesteps, of several effects into
+FILE-EFFECT each. Prints a table in Markdown: PSNR of the held-out view and unseen expressions,
+means over seeds ± their standard deviation, milliseconds of an iteration, and LPIPS with
+STGA_LPIPS (docs/dependencies.md). Each seed trains the variants in another order. Run it on an idle
+machine.
 """
 
 import argparse
