@@ -33,9 +33,9 @@ PREPARING = "preparing.lock"
 PACKAGES_FOLDER = Path(__file__).resolve().parents[2]
 """The folder that holds `stga_addon`, for a worker's import path."""
 NICENESS = 5
-"""How much nicer than Blender a worker is, which Blender's window thus does not wait for."""
+"""Added to Blender's nice value for a worker, so that Blender's window stays responsive."""
 BACKGROUND_NICENESS = 15
-"""How much nicer than its parent a process in the background is: nicer than workers."""
+"""The same for processes that nobody waits for, so that workers come first."""
 PR_SET_PDEATHSIG = 1  # Option of prctl(2)
 # Windows: own process group, so that closing the console does not end the worker; no console
 # window; and BELOW_NORMAL_PRIORITY_CLASS. Elsewhere: an own session.
@@ -75,8 +75,8 @@ def start_worker(folder: Path, python: str, arguments: Sequence[str]) -> subproc
     """Start `python -m ARGUMENTS…` at low priority in a prepared status folder; it outlives the
     calling process.
 
-    Raises StgaError where the log cannot be opened, and where the interpreter cannot be started;
-    then the files of `prepare_status_folder` are removed, and the folder if nothing else is in it.
+    Raises StgaError where the log cannot be opened; and where the interpreter cannot be started,
+    after removing the status files, and the folder if nothing else is in it.
     """
     path = folder / LOG_FILE
     with naming(path):

@@ -125,8 +125,8 @@ def test_images_of_recorded_light_say_so(extension, tmp_path, capsys):
 
 
 def test_relit_color_of_a_frame(lighting):
-    """Catches relit colors that do not reach the nodes, or stay when taken back, and advice to light
-    an avatar that is hidden."""
+    """Catches relit colors that do not reach the nodes, or stay when taken back, and the advice to
+    light an avatar that is hidden."""
     avatar = with_light(textured(avatar_of("stga")))
     shown, _ = show(avatar)
     camera = camera_at()

@@ -144,9 +144,9 @@ def outline(mean_x, mean_y, precision_x, shear, precision_y, extent_y):
 
 @part_jit
 def rows_within(outline, left, width, rows):
-    """The range first, end of those rows among 0 to `rows` in which an outline covers the center of
-    a pixel in the `width` columns from `left` on. Rounding may add a row, and never loses one; an
-    outline that covers none has first ≥ end. All float32.
+    """The range first, end of those rows among 0 to `rows` in which an outline covers the center
+    of a pixel in the `width` columns from `left` on. Slack for rounding may add rows, and none is
+    lost; an outline that covers none has first ≥ end. All float32.
 
     Of all columns, the ellipse reaches its highest point in one, and is lower the farther a column
     is from it: among `width` columns, the one nearest to that point counts. Likewise the lowest.

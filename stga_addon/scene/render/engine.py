@@ -246,9 +246,9 @@ class SplatsEngine(bpy.types.RenderEngine):  # type: ignore[misc]
         renderers: list[SplatRenderer],
         with_depth: bool = False,
     ) -> ComposedImage:
-        """The splats of the layers as a view shows them, over nothing: drawn by the GPU if it is
-        faster and does not fail, else by the CPU's rasterizer. with_depth: whether the rasterizer
-        also finds depths, which the GPU always does; renderers: as of `draw_image`."""
+        """The layers' splats as a view shows them, drawn by Blender's GPU module if it is faster
+        and does not fail, else by the rasterizer. with_depth: whether the rasterizer finds depths
+        too, which the GPU module always does; renderers: as of `draw_image`."""
         image = None
         if not is_rasterizer_faster():
             image = draw_image(layers, view, partial(self.report, {"WARNING"}), renderers)
