@@ -57,7 +57,7 @@ SYNC = {
 TAKES = {
     "auto": "found out, and said",
     "around": "a camera that moves around a still head, or photos of one: their cameras are found",
-    "talk": "a head that moves before a camera",
+    "talk": "a head that moves in front of a camera",
 }
 """Choice of what was filmed -> what it is."""
 MATTES = {"auto": "made for frames without a mask", "none": "only those of the footage"}

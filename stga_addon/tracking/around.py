@@ -47,7 +47,7 @@ MAX_THREADS = 8
 """Largest number of threads of COLMAP: each takes up to 300 MB."""
 REMEDY = (
     "film in even light and without blur, in steps of at most 15° around a head that keeps still, "
-    "before a room with detail"
+    "in a room with detail"
 )
 """Advice at the end of errors in structure from motion."""
 
@@ -59,8 +59,8 @@ MORE_SAMPLES = 24
 SAMPLE_SIDE_PX = 720
 """Longer side of these frames."""
 MIN_TURN_DEG = 30.0
-"""Largest angle between two poses of the head before the camera, below which nobody walked around
-it."""
+"""Largest angle between two poses of the head relative to the camera, below which nobody walked
+around it."""
 MAX_AXIS_COSINE = -0.1
 """Largest cosine between the head's axes up and ahead and the camera's axes down and ahead, of a
 face that is visible."""
@@ -69,7 +69,7 @@ PAIR_S = 0.5
 TYPICAL_FPS = 30.0
 """Frames per second for a take without a rate."""
 MAX_HALVINGS = 3
-"""How often PAIR_S is halved if the head turns too far before the camera in that time."""
+"""How often PAIR_S is halved if the head turns too far relative to the camera in that time."""
 PAIR_TURN_DEG = 1.0, 25.0
 """Turns of the head between two frames that are compared."""
 MIN_MATCHES = 8
@@ -92,9 +92,9 @@ FACE_MARGIN = 0.6
 PERSON_PROBABILITY = 0.3
 """Probability of a person above which a pixel does not belong to the room."""
 MIN_PARALLAX = 0.2
-"""Radians that the room moves behind the head for each radian by which the head turns before the
-camera; 0 of a camera that stands still, 1 − (distance of the head / distance of the room) of one
-that goes around."""
+"""Radians that the room moves behind the head for each radian by which the head turns relative to
+the camera; 0 of a camera that stands still, 1 − (distance of the head / distance of the room) of
+one that goes around."""
 MIN_CORRELATION = 0.6
 """Correlation of the room's motion with the head's turns below which a hand shook the camera."""
 
@@ -107,7 +107,7 @@ class CamerasNotFound(StgaError):
 class Recognition:
     """What frames of a single camera show about the take.
 
-    turn_deg     largest angle between two poses of the head before the camera
+    turn_deg     largest angle between two poses of the head relative to the camera
     parallax     as MIN_PARALLAX; NaN where too little of a room is seen
     correlation  of the room's motion with the head's turns
     lip_change   by how much the gap between the lips differs, in distances of eyes and mouth
@@ -159,14 +159,14 @@ def with_found_cameras(
     kind, why = known or take_of(footage, workers)
     if kind == "talk":
         return footage, (
-            f"take: a head that moves before a camera ({why}; else give --take around)",
+            f"take: a head that moves in front of a camera ({why}; else give --take around)",
         )
     try:
         found, line = _with_cameras(footage, out, workers)
     except StgaError as error:
         warning = (
             f"take: looks like one around a still head, but {error}. It is tracked as one of a "
-            "head that turns before a camera"
+            "head that turns in front of a camera"
         )
         return replace(footage, warnings=(*footage.warnings, warning)), ()
     return found, (f"take: around a still head ({why}; else give --take talk); {line}",)

@@ -150,7 +150,7 @@ def test_a_head_that_turns_before_a_camera_is_none(tmp_path):
     folder = write_pictures(tmp_path / "talk", [picture(still, turn) for turn in turns])
     footage, line = found(folder, tmp_path / "out")
     assert (footage.timesteps, footage.focal) == (tuple(range(8)), "usual")
-    assert "a head that moves before a camera" in line
+    assert "a head that moves in front of a camera" in line
     assert "the room does not move with it" in line
 
 
@@ -162,7 +162,7 @@ def test_a_take_that_is_known_is_not_recognized_again(tmp_path, monkeypatch):
     steps = track._Steps(lambda progress: None)
     footage, lines = track._open(asked, steps, ("talk", "as seen before"))
     assert len(footage.timesteps) == COUNT
-    assert "a head that moves before a camera (as seen before; " in lines[0]
+    assert "a head that moves in front of a camera (as seen before; " in lines[0]
 
 
 @pytest.mark.parametrize(

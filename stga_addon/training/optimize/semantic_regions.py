@@ -120,7 +120,7 @@ class Region(IntEnum):
     BODY = 6
     """Neck and shoulders."""
     SIDE = 7
-    """Cheeks before the ears, which long hair hides."""
+    """Cheeks in front of the ears, which long hair hides."""
 
 
 @dataclass(frozen=True)
