@@ -33,9 +33,10 @@ PREPARING = "preparing.lock"
 PACKAGES_FOLDER = Path(__file__).resolve().parents[2]
 """The folder that holds `stga_addon`, for a worker's import path."""
 NICENESS = 5
-"""Added to Blender's nice value for a worker, so that Blender's window stays responsive."""
+"""Added to the nice value of the process that starts a worker, so that Blender's window, or a
+terminal, stays responsive."""
 BACKGROUND_NICENESS = 15
-"""The same for processes that nobody waits for, so that workers come first."""
+"""Added for a process that nobody waits for, so that workers come first."""
 PR_SET_PDEATHSIG = 1  # Option of prctl(2)
 # Windows: own process group, so that closing the console does not end the worker; no console
 # window; and BELOW_NORMAL_PRIORITY_CLASS. Elsewhere: an own session.

@@ -144,12 +144,12 @@ def outline(mean_x, mean_y, precision_x, shear, precision_y, extent_y):
 
 @part_jit
 def rows_within(outline, left, width, rows):
-    """The range first, end of those rows among 0 to `rows` in which an outline covers the center
-    of a pixel in the `width` columns from `left` on. Slack for rounding may add rows, and none is
-    lost; an outline that covers none has first ≥ end. All float32.
+    """First row and end (past the last) of a range that contains each of rows 0 to `rows` in which
+    an outline covers the center of a pixel in the `width` columns from `left` on. All float32.
 
-    Of all columns, the ellipse reaches its highest point in one, and is lower the farther a column
-    is from it: among `width` columns, the one nearest to that point counts. Likewise the lowest.
+    Slack for rounding may add rows to the range; it is empty where first ≥ end. Upward, the ellipse
+    extends farthest in one column, and less the farther a column is from that one: among `width`
+    columns, the nearest to it counts. Likewise downward.
     """
     center_x, center_y, extent_y, lean, rate, chord, cut, slack = outline
     left_x = left - center_x
@@ -182,9 +182,9 @@ def _find_blocks(count, batch):
         )
         bits = np.int32(0)
         for column in range(BLOCKS_ALONG):
-            first, past = rows_within(ellipse, np.float32(column * SIDE), side, rows)
+            first, end = rows_within(ellipse, np.float32(column * SIDE), side, rows)
             low = np.int32(np.floor(first / side))
-            high = np.int32(np.ceil(past / side))
+            high = np.int32(np.ceil(end / side))
             reached = np.int32(
                 max(np.int32(0), np.int32(np.int32(one << high) - np.int32(one << low)))
             )

@@ -372,8 +372,8 @@ def _is_holdout(owner: Any, instance: Any, depsgraph: Any) -> bool:
 def relight_frame(splat_object: Any, scene: Any) -> None:
     """Store the splats' colors in the scene's light, at the scene's frame and from its camera.
 
-    Raises StgaError for a hidden avatar, one that the scene does not light, and a scene without a
-    camera."""
+    Raises StgaError for an avatar that is hidden, that the scene does not light, or whose head is
+    gone or has other triangles, and for a scene without a camera."""
     with kept_evaluated(with_heads(scene)):
         depsgraph = bpy.context.evaluated_depsgraph_get()
         only = lambda candidate: candidate == splat_object  # noqa: E731
