@@ -115,11 +115,14 @@ def combinations(heads: list[Head], poses: int) -> None:
 
 
 def leaks(driver: Head, driven: Head, poses: int) -> None:
-    """A table of ways in which one head takes over another's tracked motion: distances from where
-    ICT-FaceKit's shapes, and from where this head's own coefficients, put its face points.
+    """Print how well one head takes over another's tracked motion, in several ways.
+
+    Mean distances in mm of the driven head's face points from where ICT-FaceKit's shapes put them,
+    and from where its own coefficients do; "less %" is by how much they are below the first way's.
+    poses: frames that are measured.
 
     The driver's face at rest is a random one of ICT-FaceKit, which its identity components cannot
-    show: a tracker finds the rest of it as expressions, which then leak into the driven head.
+    show: a tracker finds what is missing as expressions, which then leak into the driven head.
     """
     rng = np.random.default_rng(7)
     weights = random_poses(poses + QUIET_FRAMES, rng)

@@ -3,12 +3,12 @@
     python -m stga_addon.development.benchmark.effects CAPTURE --switch strain-color view-color
         [--together] [--picture FILE] [--flame FILE] [--iterations 500] [--seeds 3]
 
-Trains with each effect on and off, or with --together all of them, the others decided by Auto.
---picture writes ground truth, off and on of two unseen timesteps, of several effects into
-FILE-EFFECT each. Prints a table in Markdown: PSNR of the held-out view and unseen expressions,
-means over seeds ± their standard deviation, milliseconds of an iteration, and LPIPS with
-STGA_LPIPS (docs/dependencies.md). Each seed trains the variants in another order. Run it on an idle
-machine.
+Trains with each effect on and off, or with --together all of them at once, the others decided by
+Auto. Prints a table in Markdown, means over seeds ± their standard deviation: PSNR of the held-out
+view (val) and of unseen expressions (test), LPIPS with STGA_LPIPS (docs/dependencies.md), and by
+how many milliseconds the effects lengthen an iteration. --picture writes ground truth, off and on
+of two unseen timesteps; of several effects, each has a file: shown.jpg becomes
+shown-view-color.jpg. Each seed trains the variants in another order. Run it on an idle machine.
 """
 
 import argparse
@@ -152,7 +152,8 @@ def main() -> None:
         parser.error("--picture shows test views, and the capture has none")
     _, plan = plan_effects(capture, make_settings(iterations=options.iterations, effects={}))
     decided = {each.effect: f"{'on' if each.on else 'off'}: {each.reason}" for each in plan}
-    row("effect", "decided", "val, off → on", "test", "LPIPS, test", "ms")
+    header = ["effect", "Auto's decision", "PSNR val, off → on", "PSNR test, off → on"]
+    row(*header, "LPIPS test, off → on", "ms, on − off")
     row(*["---"] * 6)
     trainings = [options.switch] if options.together else [[name] for name in options.switch]
     for effects in trainings:

@@ -2,14 +2,13 @@
 it never saw.
 
     python -m stga_addon.development.benchmark.relight FOLDER [FOLDER …] [--train 150s]
-        [--folder out/relight]
+        [--folder out/relight] [--pictures]
 
 Each FOLDER holds `capture_A` (a capture under light A whose head never turns), `truth_A` …
 `truth_E` (captures of the same head and cameras with split "train": held-out views under each
-light) and `lights.json`, which says what the lights
-are (`lighting`). Light A is not given; its level is, as the colors of a gray ball. LPIPS needs
-STGA_LPIPS. Prints PSNR inside the mask / LPIPS / PSNR of eyes and mouth, and writes pictures beside
-the run with --pictures.
+light) and `lights.json`, which says what the lights are (`lighting`). Light A is not given; its
+level is, as the colors of a gray ball. LPIPS needs STGA_LPIPS. Prints PSNR inside the mask / LPIPS
+/ PSNR of eyes and mouth, and with --pictures writes pictures into the run.
 """
 
 import argparse
@@ -194,10 +193,12 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("folders", nargs="+", type=Path)
+    parser.add_argument("folders", nargs="+", type=Path, metavar="FOLDER", help="a head's captures")
     parser.add_argument("--train", default="150s", help="budget of the training under light A")
-    parser.add_argument("--folder", type=Path, default=Path("out/relight"))
-    parser.add_argument("--pictures", action="store_true")
+    parser.add_argument(
+        "--folder", type=Path, default=Path("out/relight"), help="receives a run for each head"
+    )
+    parser.add_argument("--pictures", action="store_true", help="truth beside each relit image")
     options = parser.parse_args()
     for folder in options.folders:
         run = options.folder / folder.name
