@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
+from flame.mouths import open_flame
 
 from stga_addon.capture.mesh_geometry import connected_parts
 from stga_addon.driving.performance import ARKIT_SHAPES, COLUMN, COUNT
@@ -23,6 +24,12 @@ OPPOSITES = (
     *((f"eyeLook{one}{side}", f"eyeLook{other}{side}") for one, other, side in LOOKS),
 )
 SAMPLES = 400
+
+
+def generated_flame(shared_data, components):
+    """FLAME 2023 Open with 60 identity components, a jaw, eyes, and generated expressions."""
+    model = _with_eyes(open_flame(shared_data))
+    return with_expressions(replace(model, posedirs=0 * model.posedirs), components)
 
 
 def with_expressions(model, components):
@@ -66,7 +73,7 @@ def random_poses(count, rng):
     return np.asarray(weights)
 
 
-def with_eyes(model):
+def _with_eyes(model):
     """The model whose eyeballs, the smaller parts of the mesh, follow their joints."""
     label = connected_parts(len(model.v_template), model.faces)
     weights = model.weights.copy()

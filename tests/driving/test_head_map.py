@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from flame.mouths import open_flame
 from flame.small_head import small_head
 from numpy.linalg import norm
 from numpy.random import default_rng
@@ -28,7 +27,7 @@ from stga_addon.flame.model import JOINTS
 from stga_addon.flame.parts import flame_model
 from stga_addon.flame.sequence import FlameSequence
 
-from .heads import random_poses, with_expressions, with_eyes
+from .heads import generated_flame, random_poses, with_expressions
 
 NOSE_TIP = 4
 UPPER_LIP = 13
@@ -115,8 +114,7 @@ def test_points_agree_with_the_detector(shared_data):
     from stga_addon.tracking.correspondence import calibrate
     from stga_addon.tracking.face_networks import FaceNetworks
 
-    model = with_eyes(open_flame(shared_data))
-    model = with_expressions(replace(model, posedirs=0 * model.posedirs), 1)
+    model = generated_flame(shared_data, 1)
     places, used = face_points(model, "open FLAME")
     detected, reliable = calibrate(model, FaceNetworks(), "open FLAME")
     apart = places.on(model.v_template, model.faces) - detected.on(model.v_template, model.faces)

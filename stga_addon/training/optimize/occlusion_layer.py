@@ -106,7 +106,7 @@ def occlusion_layer(surface: Surface, sides: UnseenSides) -> OcclusionLayer:
 
 
 def _without_large(surface: Surface, triangles: np.ndarray) -> np.ndarray:
-    """Those of triangles (F,) bool that are not larger than LARGEST_RATIO says."""
+    """(F,) bool: these triangles (F,) bool, but for those larger than LARGEST_RATIO allows."""
     median = np.median(surface.areas[triangles]) if triangles.any() else 0.0
     return triangles & (surface.areas < LARGEST_RATIO**2 * median)
 
@@ -116,8 +116,8 @@ def _behind_sides(
 ) -> tuple[np.ndarray, np.ndarray]:
     """One triangle in each cell of those `allowed` (F,) bool that an off-axis view may look
     through, as (F,) bool: the triangles of `_grazed`, and of neck and clothes, because images need
-    not make opaque what a collar or a fold hides from the cameras. And their depth (F,) in meters,
-    from which masks cover them, 0 elsewhere."""
+    not make opaque what a collar or a fold hides from the cameras. And the depth (F,) in
+    meters at which masks cover a triangle's layer; 0 where there is none."""
     allowed = allowed & surface.outside & skin_of(surface.capture)
     allowed &= ~surface.regions.within(Region.EAR)
     grazed = allowed & _grazed(surface, at)
@@ -129,14 +129,15 @@ def _behind_sides(
     fits = ~surface.beside_masks(rows, offsets, -MARGIN_FRACTION)
     large = clothes[rows]
     fits[large] &= ~_reaches_beside(surface, rows[large], offsets[large])
+    lies_within = fits.any(1)
+    rows = rows[lies_within]
     depth = np.zeros(len(allowed))
-    rows = rows[fits.any(1)]
-    depth[rows] = depths[fits.argmax(1)[fits.any(1)]]
+    depth[rows] = depths[fits[lies_within].argmax(1)]
     cells = np.floor(surface.centers[rows] / (CELL_VOXELS * surface.voxel))
     _, first = np.unique(cells, axis=0, return_index=True)
     chosen = np.zeros(len(allowed), bool)
     chosen[rows[first]] = True
-    return chosen, np.where(chosen, depth, 0)
+    return chosen, depth
 
 
 def _reaches_beside(surface: Surface, rows: np.ndarray, offsets: np.ndarray) -> np.ndarray:
