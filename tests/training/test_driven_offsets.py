@@ -104,7 +104,7 @@ def test_the_step_is_adam_in_float64():
         splats = random_state(40, faces)
         splats = replace(splats, face=face, driven_offsets={offset.name: state})
         splats.gradients.xyz[:] = gradient
-        signal = {offset.signal: smoothed}.__getitem__
+        signal = {offset: smoothed}.__getitem__
         rates = {offset.rate: rate}
         adam.step_offsets(splats, rows, signal, rates, options)
         for f in np.unique(face[rows]):

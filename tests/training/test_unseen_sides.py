@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from capture import factory
 from numpy.linalg import norm
+from numpy.random import default_rng
 from numpy.testing import assert_allclose, assert_array_equal
 from PIL import Image
 from scipy.ndimage import binary_dilation, binary_erosion
@@ -14,6 +15,7 @@ from scipy.spatial import cKDTree
 from stga_addon.avatar.embedding import face_areas, face_frames, points_to_world, to_world
 from stga_addon.avatar.file import UNSEEN_REGION
 from stga_addon.avatar.lattice import NORMAL_AXIS, lattice_splats
+from stga_addon.avatar.offsets import COLOR, OFFSETS
 from stga_addon.avatar.splats import SH_C0, joined, sh_color
 from stga_addon.capture.camera import look_at
 from stga_addon.capture.mesh_geometry import connected_parts, rasterize, silhouette
@@ -518,6 +520,37 @@ def test_splats_behind_closed_lips_stay_small(frontal):
     assert (width[of_inner] < 0.4 * side[state.face[of_inner]]).all()
     of_outer = (lips & outside & sides.visible)[state.face] & ~state.unbound
     assert (state.parameters.log_scale[of_outer] == before[of_outer]).any(1).mean() > 0.9
+
+
+def speaking(capture, weight):
+    """The capture with a second timestep, in which the jaw opens by this weight and brows rise."""
+    model = capture.flame.model
+    names = model.expression_names
+    changes = model.shapedirs[..., model.n_identity :]
+    posed = model.v_template + changes[..., names.index("jawOpen")] * weight
+    posed += changes[..., names.index("browInnerUp")]
+    views = capture.views["train"]
+    views += tuple(replace(view, timestep=1) for view in views)
+    meshes = [model.v_template, posed]
+    return replace(capture, views={"train": views}, timesteps=(0, 1), mesh=meshes.__getitem__)
+
+
+@pytest.mark.parametrize(("weight", "is_shut"), [(0.1, True), (0.8, False)])
+def test_a_mouth_that_was_never_open_stays_as_it_is(weight, is_shut, frontal):
+    """Catches the few movements of shut lips that are continued to an open mouth, where they draw
+    large splats across the teeth; and a mouth that was filmed open but does not follow it."""
+    capture = speaking(frontal.capture, weight)
+    settings = quick_settings("global", lattice=1, driven_offsets=tuple(OFFSETS))
+    trainer = Trainer(capture, settings, {})
+    view = capture.views["train"][1]
+    target = default_rng(0).integers(0, 255, (view.camera.height, view.camera.width, 3), np.uint8)
+    trainer.step(view, target, 0.0)
+    mouth = head_regions(capture).within(Region.MOUTH)
+    for name, state in trainer.state.driven_offsets.items():
+        changed = state.value.any((1, 2))
+        assert changed[~mouth].sum() > 100
+        stays = is_shut and OFFSETS[name].target != COLOR
+        assert changed[mouth].any() != stays, name
 
 
 def test_what_sticks_out_of_masks_is_not_closed(bundled, tmp_path):

@@ -4,7 +4,7 @@ from collections.abc import Callable, Mapping
 
 import numpy as np
 
-from ...avatar.offsets import COLOR, OFFSETS, SCALE
+from ...avatar.offsets import COLOR, OFFSETS, SCALE, DrivenOffset
 from ...avatar.splats import MAX_SH_DEGREE, SH_C0
 from ...capture.camera import Camera
 from ...raster.cpu.optimizer import (
@@ -66,15 +66,15 @@ def step(
 def step_offsets(
     state: TrainState,
     rows: np.ndarray,
-    signal: Callable[[str], np.ndarray],
+    signal: Callable[[DrivenOffset], np.ndarray],
     rates: Mapping[str, float],
     options: AdamOptions,
 ) -> None:
     """Adam step of the driven offsets of the triangles of the listed splats rows (M,), which have
     gradients.
 
-    signal: name of SIGNALS -> (F, 3); rates: the splats'. A triangle changes all its splats alike,
-    so its gradient is their sum.
+    signal: what drives an offset, (F, 3); rates: the splats'. A triangle changes all its splats
+    alike, so its gradient is their sum.
     """
     if not state.driven_offsets:
         return
@@ -94,7 +94,7 @@ def step_offsets(
             stepped,
             (by_color if is_color else gradients.xyz, *moved),
             (offset.target == SCALE, np.float32(1 / SH_C0 if is_color else 1)),
-            signal(offset.signal),
+            signal(offset),
             driven.steps,
             AdamTables._make([*tables, rate]),
             options,

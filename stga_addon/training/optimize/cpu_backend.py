@@ -59,9 +59,9 @@ class CpuBackend:
         options = adam.adam_options(settings, batch.view.camera)
         color = adam.color_step(state, batch.rates, options, batch.options.sh_degree)
         rows, screen, loss = self._backward(frames, batch.view, target, batch.options, focus, color)
-        signals = self._frames.signals(batch.view.timestep)
+        driving = self._frames.driving(batch.view.timestep)
         # before the limits' gradients are added
-        adam.step_offsets(state, rows, signals, batch.rates, options)
+        adam.step_offsets(state, rows, driving, batch.rates, options)
         # what keeps splats near what they cover, and unbound ones out of the air
         if settings.scale_weight:
             log_scale = state.parameters.log_scale

@@ -9,7 +9,7 @@ import numpy as np
 
 from ...avatar.embedding import MIN_DIVISOR, FaceFrames, face_frames
 from ...avatar.lattice import SCALE
-from ...avatar.offsets import SIGNALS
+from ...avatar.offsets import COLOR, SIGNALS, DrivenOffset
 from ...avatar.strain import strain_basis, trained_range
 from ...capture.model import Capture
 from ...capture.visual_hull import voxel_size
@@ -162,6 +162,26 @@ class FrameStore:
             return entry.signals[name]
 
         return signal
+
+    def driving(self, timestep: int) -> Callable[[DrivenOffset], np.ndarray]:
+        """Driven offset -> the signal (F, 3) that trains it: `signals`, and zero where `is_trained`
+        leaves a triangle out."""
+        signals = self.signals(timestep)
+
+        def signal(offset: DrivenOffset) -> np.ndarray:
+            left_out = ~self.is_trained(offset)
+            found = signals(offset.signal)
+            return np.where(left_out[:, None], np.float32(0), found) if left_out.any() else found
+
+        return signal
+
+    def is_trained(self, offset: DrivenOffset) -> np.ndarray:
+        """(F,) bool: triangles of which a driven offset is trained. Those of a `shut_mouth` keep
+        their splats' places and sizes: its few movements would be continued to open lips, and draw
+        splats across teeth."""
+        if offset.target == COLOR:
+            return np.ones(len(self.units), bool)
+        return ~self.surface.shut_mouth
 
     def moved(self, timestep: int, coefficients: Mapping[str, np.ndarray]) -> FaceFrames:
         """The timestep's frames, moved and colored by the driven offsets of these coefficients."""

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from ...avatar.offsets import OFFSETS
 from ...avatar.strain import IndexLists
 from ...capture.model import View
 from ...raster.cpu.image_loss import LOSS_REACH_PX
@@ -122,10 +123,9 @@ class GpuBackend:
         upload("limits", self._limits.astype(np.float32))
         self._place(tables, {name: columns[name] for name in FIXED}, state.parameters.sh.shape[1])
         self._offsets = {}
-        splats_of = self._splats_by_triangle() if state.driven_offsets else None
         for name, offset in state.driven_offsets.items():
             parts = [upload(f"{name} {part}", each) for part, each in vars(offset).items()]
-            self._offsets[name] = OffsetTables._make([*parts, splats_of])
+            self._offsets[name] = OffsetTables._make([*parts, self._splats_by_triangle(name)])
 
     def _place(
         self, tables: dict[str, Any], fixed: dict[str, np.ndarray], coefficients: int
@@ -144,9 +144,15 @@ class GpuBackend:
             limits=device.buffer("limits", 0),
         )
 
-    def _splats_by_triangle(self) -> Any:
-        lists = IndexLists(*rows_by_triangle(self._fixed["face"], self._triangles))
-        return self.device.upload("splats by triangle", list_words(lists))
+    def _splats_by_triangle(self, name: str) -> Any:
+        """Those of each triangle of which a driven offset is trained."""
+        face = self._fixed["face"]
+        is_trained = self._frames.is_trained(OFFSETS[name])
+        starts, rows = rows_by_triangle(
+            np.where(is_trained[face], face, self._triangles), self._triangles
+        )
+        lists = IndexLists(starts, rows[: starts[-1]])
+        return self.device.upload(f"{name} splats by triangle", list_words(lists))
 
     def blend_weights(self, view: View) -> np.ndarray:
         self._finish_all()
@@ -193,9 +199,8 @@ class GpuBackend:
         fixed = {name: column[numbers] for name, column in self._fixed.items()}
         self._place(take_rows(self.device, numbers, tables), fixed, self._splats.coefficients)
         if self._offsets:
-            splats_of = self._splats_by_triangle()
             for name, offset in self._offsets.items():
-                self._offsets[name] = offset._replace(splats_of=splats_of)
+                self._offsets[name] = offset._replace(splats_of=self._splats_by_triangle(name))
 
     def _column(self, name: str) -> Column:
         if name in HISTORY:

@@ -110,7 +110,7 @@ def _step() -> None:
     optimizer.add_screen_gradients(rows, np.zeros(2, np.float32), screen, total)
     state = with_offsets(state, OFFSETS, 1)
     signal = np.zeros((1, 3), np.float32)
-    adam.step_offsets(state, rows, lambda name: signal, rates, adam.PLAIN)
+    adam.step_offsets(state, rows, lambda offset: signal, rates, adam.PLAIN)
     coefficients = {name: offset.value for name, offset in state.driven_offsets.items()}
     camera_frames = frames_in_camera(moved_frames(WORLD, coefficients, lambda name: signal), CAMERA)
     counts = np.zeros((2, 2), np.int32)

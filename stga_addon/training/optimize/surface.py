@@ -22,8 +22,10 @@ from ...capture.mesh_geometry import (
 )
 from ...capture.model import Capture, View, evenly_spread, views_by_timestep
 from ...capture.visual_hull import FEW_CAMERAS, voxel_size
+from ...errors import StgaError
 from ...flame.model import torso_faces
 from ...flame.quaternions import unit
+from ...flame.teeth import lip_pairs
 from ...tracking.solve import lid_fractions
 from .outlines import TOLERANCE_FRACTION, clear_of
 from .semantic_regions import (
@@ -80,6 +82,10 @@ LID_STRETCH = 1.8
 """Factor by which these lengthen a lid's triangle at least."""
 CLOSED_FRACTION = 0.6
 """Weight of these expressions at which tracked eyes count as closed."""
+OPEN_MOUTH_M = 0.012
+"""Distance between the lips at which the mouth counts as open."""
+OPEN_QUANTILE = 0.98
+"""Quantile of that distance over a take's timesteps: tracking may miss a few."""
 MIN_SQUARED_AREA = 1e-28
 """Squared area in m⁴ below which a triangle has none."""
 NECK_LEVELS = (-1.4, -1.2, -1.0, -0.8)
@@ -301,6 +307,25 @@ class Surface:
             if (weights[:, columns] @ fractions).max() < CLOSED_FRACTION:
                 found |= lid
         return found
+
+    @cached_property
+    def shut_mouth(self) -> np.ndarray:
+        """(F,) bool: the mouth of a take of few cameras that does not open it. None where the head
+        model does not tell the lips."""
+        none = np.zeros(len(self.capture.faces), bool)
+        if self.capture.flame is None or not self.has_few_cameras:
+            return none
+        try:
+            upper, lower = lip_pairs(self.capture.flame.model)
+        except StgaError:
+            return none
+        timesteps = list(views_by_timestep(self.capture.views["train"]))
+        gaps = []
+        for timestep in evenly_spread(timesteps, FACING_TIMESTEPS):
+            mesh = np.asarray(self.capture.mesh(timestep))
+            gaps.append(np.linalg.norm(mesh[upper] - mesh[lower], axis=1).max())
+        is_shut = np.quantile(gaps, OPEN_QUANTILE) < OPEN_MOUTH_M
+        return self.regions.within(Region.MOUTH) if is_shut else none
 
     @cached_property
     def _lids(self) -> dict[str, np.ndarray]:
