@@ -271,6 +271,8 @@ def figures_of_training():
     yield f"times {strain.STRAIN_GAIN:g}, clipped at ±{strain.MAX_STRAIN:g}"
     yield f"both stretches at −{strain.MIN_COMPRESSION} from above"
     yield f"to {strain.RANGE_MARGIN} times the range"
+    yield f"by less than {1000 * surface.OPEN_MOUTH_M:g} mm"
+    yield f"in {percent(surface.OPEN_QUANTILE)} of the timesteps"
 
 
 def figures_of_priors():
