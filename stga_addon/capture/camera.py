@@ -87,7 +87,7 @@ class Camera:
         return flat * [self.fl_x, self.fl_y] + [self.cx, self.cy], depth
 
     def at_depth_one(self, pixels: np.ndarray) -> np.ndarray:
-        """Where the rays of pixels (N, 2) are 1 m before the camera: (N, 2) in its own axes."""
+        """Where the rays of pixels (N, 2) are 1 m in front of the camera: (N, 2) in its axes."""
         return (pixels - [self.cx, self.cy]) / [self.fl_x, self.fl_y]
 
     def unproject(self, pixels: np.ndarray, depth: np.ndarray) -> np.ndarray:

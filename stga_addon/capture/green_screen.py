@@ -1,4 +1,4 @@
-"""The light that a green or blue screen throws on the person before it."""
+"""The light that a green or blue screen throws on the person in front."""
 
 import numpy as np
 
@@ -19,7 +19,7 @@ MIN_SCREEN_LEVELS = 40
 
 
 def without_spill(image: np.ndarray, mask: np.ndarray) -> np.ndarray:
-    """Image (H, W, 3) uint8 without the light of a green or blue screen on the person before it,
+    """Image (H, W, 3) uint8 without the light of a green or blue screen on the person in front,
     (H, W) uint8 coverage, near the outline; pixels that show some of the screen stay."""
     import cv2
 

@@ -195,7 +195,7 @@ def _key(owner: Any, path: str, values: Mapping[int, Sequence[float]]) -> None:
 
 
 def _room(middle: Vector) -> None:
-    """A floor, a wall, things behind the head and one before it."""
+    """A floor, a wall, things behind the head and one in front."""
     floor = [(-3, -3, -0.75), (3, -3, -0.75), (3, 1.6, -0.75), (-3, 1.6, -0.75)]
     wall = [(-3, 1.6, -0.75), (3, 1.6, -0.75), (3, 1.6, 3), (-3, 1.6, 3)]
     for name, corners, color in (

@@ -215,8 +215,8 @@ def reduced(image: np.ndarray, size: tuple[int, ...]) -> np.ndarray:
 
 
 def inside(camera: Camera, pixels: np.ndarray, depth: np.ndarray) -> np.ndarray:
-    """(N,) bool: pixels (N, 2) in the image, a pixel from its border, at a depth (N,) before the
-    camera."""
+    """(N,) bool: pixels (N, 2) in the image, a pixel from its border, at a depth (N,) in front
+    of the camera."""
     within = (pixels > 1) & (pixels < [camera.width - 1, camera.height - 1])
     return within.all(1) & (depth > 0)
 

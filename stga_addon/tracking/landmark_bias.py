@@ -16,8 +16,8 @@ from .fit import pose_from_one_camera
 BIAS_FILE = Path(__file__).parent / "networks/landmark_bias.npz"
 """Azimuths (A,) and elevations (E,) in degrees; `offset_m`, the networks' offsets (A, E, N, 2) in
 meters at the head's distance, to the right and down in an image whose camera is upright at
-TABLE_DISTANCE_M before the head; `nearness_m2`, by how much they grow for each 1/m by which the
-camera is nearer. Made by `development/landmark_bias.py`."""
+TABLE_DISTANCE_M in front of the head; `nearness_m2`, by how much they grow for each 1/m by which
+the camera is nearer. Made by `development/landmark_bias.py`."""
 TABLE_DISTANCE_M = 1.2
 """Distance of the cameras of `offset_m`. From farther away, offsets are the same."""
 MIN_DISTANCE_M = 0.3

@@ -5,8 +5,8 @@ person (by a network, or by the difference from a clean plate) and the tracked h
 OpenCV's GrabCut (Rother et al. 2004), which finds the outline in between. In a band along it,
 coverage is that fraction of the way from the backdrop's color around the pixel to the person's that
 the pixel's color lies at; where both colors are alike or uneven, it is that of the cut. Hair that
-stands off the head, before an even backdrop, has a wider band: the backdrop is seen between its
-strands. A guided filter (He et al. 2013) then draws the band to the edges of the image.
+stands off the head, in front of an even backdrop, has a wider band: the backdrop is seen between
+its strands. A guided filter (He et al. 2013) then draws the band to the edges of the image.
 """
 
 import math
@@ -64,7 +64,7 @@ OPAQUE_HAIR_FRACTION = 0.9
 is a little nearer to a bright backdrop."""
 EVEN_COLORS_WEIGHT = 4.0
 """Weight of the variance of both sides' colors, beside SIMILAR_COLORS_LEVELS, in the confidence of
-coverage by color: before a room and in dyed hair, a pixel's color is no evidence."""
+coverage by color: in front of a room and in dyed hair, a pixel's color is no evidence."""
 NEIGHBORHOOD_FRACTIONS = (0.03, 0.12)
 """Standard deviations of the neighborhoods that colors are means of, as fractions of the head's
 size."""

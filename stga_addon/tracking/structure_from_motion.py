@@ -73,7 +73,7 @@ class Structure:
     points      how many points were found
     on_head     how many of them lie on the face
     error_px    mean reprojection error
-    masked      whether only the person was looked at, who turned before a room that does not
+    masked      whether only the person was looked at, who turned in front of a room that does not
     """
 
     timesteps: np.ndarray

@@ -46,7 +46,7 @@ HELD_OUT = 3
 MASK_MARGIN = 0.01
 """Margin around the mask, whose edge is compared as well, as a fraction of the image's height."""
 DEPTHS_M = tuple(np.linspace(-0.12, 0.06, 19).tolist())
-"""Depths along a ray that are tried, from the mesh's beside it: a chest is before the neck."""
+"""Depths along a ray that are tried, from the mesh's beside it: a chest is in front of the neck."""
 DEPTH_TIMESTEPS = 8
 """Timesteps at which depths are compared."""
 NEIGHBORS = 25
@@ -102,7 +102,7 @@ class TorsoShot:
     heads: Mapping[int, np.ndarray]
 
     def shows(self, number: int, at: np.ndarray) -> np.ndarray:
-        """(N,) bool: points (N, 3) in the camera's image, not behind or before the head."""
+        """(N,) bool: points (N, 3) in the camera's image, not behind or in front of the head."""
         camera = self.views[number].levels[EVIDENCE_LEVEL].camera
         head = self.heads[number]
         pixels, depth = camera.project(at)

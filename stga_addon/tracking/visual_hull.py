@@ -22,7 +22,7 @@ MARGIN_M = 0.35
 """Distance around the tracked head, in meters, within which hair and shoulders are sought."""
 MIN_AGREEING_FRACTION = 0.85
 """Least fraction of the images that show a cell in which it must lie in the matte: a matte misses
-dark hair before a dark wall in some."""
+dark hair in front of a dark wall in some."""
 MIN_SHOWING = 3
 """Number of images that must show a cell to tell anything of it."""
 SIDE_PX = 256

@@ -13,7 +13,7 @@ from .shots import Calibrated, Shot
 from .sources import natural_order
 
 FACE_KEYS = ("expression", "exp_path", "mesh_path", "flame_path")
-"""Keys of each frame of NeRFace, IMavatar and INSTA: a head that moves before one camera."""
+"""Keys of each frame of NeRFace, IMavatar and INSTA: a head that moves in front of one camera."""
 MARKS = b'"frames"', b'"transform_matrix"'
 """Keys that every transforms file has."""
 HEAD_BYTES = 1 << 16

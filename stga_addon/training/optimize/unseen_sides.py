@@ -201,7 +201,7 @@ def _hanging_hair(
     surface: Surface, color: np.ndarray, well_visible: np.ndarray, hair: np.ndarray
 ) -> np.ndarray:
     """(F,) bool: triangles of a face, below the brows, whose observed color is nearer to that of
-    long hair, triangles (M,), than to that of skin: hair hangs before them. None where hair is
+    long hair, triangles (M,), than to that of skin: hair hangs in front of it. None where hair is
     short."""
     skin = well_visible & surface.regions.face
     if not surface.has_long_hair or not len(hair) or not skin.any():
