@@ -89,6 +89,12 @@ def lip_pairs(model: FlameModel) -> tuple[np.ndarray, np.ndarray]:
     return sides if heights[0] > heights[1] else sides[::-1]
 
 
+def lip_gap_m(lips: tuple[np.ndarray, np.ndarray], mesh: np.ndarray) -> float:
+    """Largest distance between lips, the vertices of `lip_pairs`, in a mesh (V, 3) in meters."""
+    upper, lower = lips
+    return float(np.linalg.norm(mesh[upper] - mesh[lower], axis=1).max())
+
+
 def teeth_faces(first: int) -> np.ndarray:
     """(168, 3) int32 triangles of the teeth, whose vertices start at id `first`."""
     start = {name: first + row * TEETH_PER_ROW for row, name in enumerate(TEETH_ROWS)}

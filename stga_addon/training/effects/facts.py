@@ -17,7 +17,7 @@ from ...flame.model import JOINTS
 from ...flame.parts import PARTS
 from ...flame.quaternions import unit
 from ...flame.sequence import joint_angles
-from ...flame.teeth import lip_pairs
+from ...flame.teeth import lip_gap_m, lip_pairs
 from ..settings import TrainingSettings
 from . import evidence
 from .evidence import CameraColors, Evidence
@@ -179,11 +179,11 @@ class CaptureFacts:
     def lip_gap_mm(self) -> float:
         """How far the lips part at most, beyond their distance in the neutral mesh."""
         assert self.capture.flame is not None
-        upper, lower = lip_pairs(self.capture.flame.model)
+        lips = lip_pairs(self.capture.flame.model)
         pose = self.sampled.expression_mesh
         zero_pose = self.settings.selection.zero_pose
         meshes = [self.capture.neutral, *(pose(t, zero_pose) for t in self.sampled_timesteps)]
-        gaps = [float(np.linalg.norm(mesh[upper] - mesh[lower], axis=1).max()) for mesh in meshes]
+        gaps = [lip_gap_m(lips, mesh) for mesh in meshes]
         return 1000 * (max(gaps) - gaps[0])
 
     @property

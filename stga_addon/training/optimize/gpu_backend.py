@@ -145,7 +145,7 @@ class GpuBackend:
         )
 
     def _splats_by_triangle(self, name: str) -> Any:
-        """Those of each triangle of which a driven offset is trained."""
+        """Lists of the splats on each triangle; empty where this driven offset is not trained."""
         face = self._fixed["face"]
         is_trained = self._frames.is_trained(OFFSETS[name])
         starts, rows = rows_by_triangle(

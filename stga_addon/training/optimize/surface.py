@@ -25,7 +25,7 @@ from ...capture.visual_hull import FEW_CAMERAS, voxel_size
 from ...errors import StgaError
 from ...flame.model import torso_faces
 from ...flame.quaternions import unit
-from ...flame.teeth import lip_pairs
+from ...flame.teeth import lip_gap_m, lip_pairs
 from ...tracking.solve import lid_fractions
 from .outlines import TOLERANCE_FRACTION, clear_of
 from .semantic_regions import (
@@ -85,7 +85,7 @@ CLOSED_FRACTION = 0.6
 OPEN_MOUTH_M = 0.012
 """Distance between the lips at which the mouth counts as open."""
 OPEN_QUANTILE = 0.98
-"""Quantile of that distance over a take's timesteps: tracking may miss a few."""
+"""Quantile of that distance over a take's timesteps, a few of which may be tracked wrongly."""
 MIN_SQUARED_AREA = 1e-28
 """Squared area in m⁴ below which a triangle has none."""
 NECK_LEVELS = (-1.4, -1.2, -1.0, -0.8)
@@ -310,20 +310,20 @@ class Surface:
 
     @cached_property
     def shut_mouth(self) -> np.ndarray:
-        """(F,) bool: the mouth of a take of few cameras that does not open it. None where the head
-        model does not tell the lips."""
+        """(F,) bool: the mouth of a take of few cameras that does not open it. None where the lips
+        of the head model are not known."""
         none = np.zeros(len(self.capture.faces), bool)
         if self.capture.flame is None or not self.has_few_cameras:
             return none
         try:
-            upper, lower = lip_pairs(self.capture.flame.model)
+            lips = lip_pairs(self.capture.flame.model)
         except StgaError:
             return none
         timesteps = list(views_by_timestep(self.capture.views["train"]))
-        gaps = []
-        for timestep in evenly_spread(timesteps, FACING_TIMESTEPS):
-            mesh = np.asarray(self.capture.mesh(timestep))
-            gaps.append(np.linalg.norm(mesh[upper] - mesh[lower], axis=1).max())
+        gaps = [
+            lip_gap_m(lips, np.asarray(self.capture.mesh(timestep)))
+            for timestep in evenly_spread(timesteps, FACING_TIMESTEPS)
+        ]
         is_shut = np.quantile(gaps, OPEN_QUANTILE) < OPEN_MOUTH_M
         return self.regions.within(Region.MOUTH) if is_shut else none
 
